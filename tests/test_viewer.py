@@ -1,9 +1,12 @@
 """The viewer without a browser: its session, its loop, its pictures, its door, and its command."""
 
 import itertools
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import urljoin
 
 import cv2
 import numpy as np
@@ -33,6 +36,7 @@ from mien.viewer.faces import (
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
 from mien.viewer.loop import STILL_SECONDS, DrawingLoop
 from mien.viewer.session import Clip, Session, centre_of
+from mien.viewer.work import Worker
 from toy_workspace import write_toy_workspace
 from web_case import drawn_head, faces_of
 
@@ -217,15 +221,49 @@ def test_the_loop_wakes_for_what_plays() -> None:
     assert stage.loop.step() == pytest.approx(0.7)
 
 
-def test_a_failure_in_the_thread_ends_the_loop_and_is_kept() -> None:
-    def fail(view: View, full: bool) -> int:
+def test_a_picture_that_fails_concerns_its_client_alone() -> None:
+    failures: list[Exception] = []
+
+    def draw(view: View, full: bool) -> int:
+        if view.width == 13:
+            raise ArithmeticError("a bug")
+        return view.width
+
+    stage = Stage()
+    stage.loop = DrawingLoop(draw, clock=lambda: stage.now, failed=failures.append)
+    stage.add(1)
+    stage.add(2)
+    stage.look(1, 13)
+    stage.look(2, 14)
+    assert [stage.loop.step() for _ in range(2)] == [0, 0]
+    assert stage.shown == [(2, 14, False)]
+    assert [str(failure) for failure in failures] == ["a bug"]
+    stage.now += STILL_SECONDS
+    assert [stage.loop.step() for _ in range(2)] == [0, None], "what failed is not tried again"
+    stage.look(1, 15)
+    assert stage.loop.step() == 0
+    assert stage.shown[-1][:2] == (1, 15)
+
+
+def test_a_picture_that_cannot_be_shown_concerns_its_client_alone() -> None:
+    def show(picture: int, full: bool) -> None:
+        raise ConnectionError("the browser is gone")
+
+    failures: list[Exception] = []
+    stage = Stage()
+    stage.loop = DrawingLoop(stage.draw, failed=failures.append)
+    stage.loop.add(1, show)
+    stage.look(1, 13)
+    assert stage.loop.step() == 0
+    assert len(failures) == 1
+
+
+def test_a_failure_that_concerns_all_ends_the_loop_and_is_kept() -> None:
+    def fail(now: float) -> float:
         raise ArithmeticError("a bug")
 
-    loop = DrawingLoop(fail)
-    loop.add(1, lambda picture, full: None)
+    loop = DrawingLoop(lambda view, full: 0, fail)
     loop.start()
-    assert loop.running
-    loop.look(1, View(np.eye(4), 0.5, 10, 10))
     loop.wait(10.0)
     assert not loop.running
     assert isinstance(loop.error, ArithmeticError)
@@ -240,6 +278,48 @@ def test_the_loop_stops() -> None:
     assert loop.error is None
 
 
+# Slow work.
+
+
+def test_a_worker_bounds_what_waits() -> None:
+    begun, go_on, done, failures = threading.Event(), threading.Event(), [], []
+
+    def slow() -> None:
+        begun.set()
+        go_on.wait()
+        done.append("slow")
+
+    worker = Worker("test", failures.append, most=2)
+    assert worker.ask("a", slow)
+    assert begun.wait(10)
+    assert worker.ask("b", lambda: done.append("old"))
+    assert worker.ask("b", lambda: done.append("new")), "the newest of a kind wins"
+    assert worker.ask("c", lambda: done.append(1 // 0))
+    assert not worker.ask("d", lambda: done.append("too much"))
+    go_on.set()
+    while len(failures) < 1:
+        time.sleep(0.001)
+    assert done == ["slow", "new"]
+    assert isinstance(failures[0], ZeroDivisionError)
+    worker.stop()
+    assert not worker.ask("e", lambda: done.append("stopped"))
+
+
+def test_a_worker_without_a_queue_takes_nothing_while_it_works() -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow() -> None:
+        begun.set()
+        go_on.wait()
+
+    worker = Worker("test", print, most=0)
+    assert worker.ask(1, slow)
+    assert begun.wait(10)
+    assert not worker.ask(2, slow)
+    go_on.set()
+    worker.stop()
+
+
 # The session.
 
 
@@ -251,6 +331,18 @@ def test_sliders_change_the_face_within_bounds(session: Session) -> None:
     assert session.face.expression[index] == 0.5
     session.set_expression("jawOpen", 7.0)
     assert session.face.expression[index] == session.avatar.portable.expression_bounds[index, 1]
+    for wrong in (float("nan"), float("inf"), -float("inf")):
+        with pytest.raises(UserError, match=f"jawOpen {wrong}: is not finite"):
+            session.set_expression("jawOpen", wrong)
+        with pytest.raises(UserError, match="is not finite"):
+            session.set_joint(session.avatar.joint_names[0], 1, wrong)
+    for asked, told in (
+        ({"background": "purple"}, "background 'purple': there is none; give one of white, grey, black"),
+        ({"surface": "inside"}, "surface 'inside': there is none"),
+        ({"height": 10**300}, "give 1 to 2048 pixels"),
+    ):
+        with pytest.raises(UserError, match=told):
+            session.show(**asked)
     session.set_joint(session.avatar.joint_names[0], 1, 0.25)
     assert session.face.joints[0, 1] == 0.25
     assert session.face.expression[index] > 0
@@ -451,11 +543,16 @@ def test_a_turntable_keeps_its_distance(session: Session) -> None:
 )
 def test_loopback(host: str, is_one: bool) -> None:
     assert is_loopback(host) is is_one
-    assert (Door.of(host).token is None) is is_one
+    assert Door.of(host).token is not None
+    if is_one:
+        assert Door.of(host, with_token=False).token is None
+    else:
+        with pytest.raises(UserError, match=f"--no-token: other machines can reach --host {host}"):
+            Door.of(host, with_token=False)
 
 
-def test_on_loopback_strange_hosts_and_origins_are_refused() -> None:
-    door = Door.of("127.0.0.1")
+def test_without_a_token_strange_hosts_and_origins_are_refused() -> None:
+    door = Door.of("127.0.0.1", with_token=False)
     assert door.answer("/", {"Host": "127.0.0.1:80"}) is None
     assert door.answer("/", {"Host": "localhost:80", "Origin": "http://localhost:80"}) is None
     for headers in (
@@ -464,14 +561,32 @@ def test_on_loopback_strange_hosts_and_origins_are_refused() -> None:
         {"Host": "127.0.0.1:80", "Origin": "http://evil.example"},
         {"Host": "127.0.0.1:80", "Origin": "http://127.0.0.1:81"},
         {"Host": "127.0.0.1:80", "Origin": "null"},
+        {"Host": "127.0.0.1:80", "Origin": "http://["},
+        {"Host": "127.0.0.1:80", "Origin": "http://[v1.\udc80]"},
         {"Host": "[::1"},
     ):
         answer = door.answer("/", headers)
         assert answer is not None, headers
         assert answer.status == 403
+        assert answer.body.isascii() or "\udc80" not in answer.body
 
 
-def test_beyond_loopback_a_token_becomes_a_cookie() -> None:
+def test_a_proxy_with_a_path_of_its_own() -> None:
+    """The redirect and the cookie stay below that path, and other hosts are fine with the token."""
+    door = Door.of("127.0.0.1")
+    there = {"Host": "me.example", "Origin": "https://me.example"}
+    first = door.answer(f"/?token={door.token}", there)
+    assert first is not None
+    assert urljoin("https://me.example/mien/?token=x", first.headers["Location"]) == "https://me.example/mien/index.html"
+    assert "Path" not in first.headers["Set-Cookie"]
+    assert door.answer("/index.html", {**there, "Cookie": door.cookie}) is None
+    lost = door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie})
+    assert lost is not None
+    assert "page of https://me.example, and its Host is 127.0.0.1:80" in lost.body
+    assert "let the proxy pass on the browser's Host header" in lost.body
+
+
+def test_a_token_becomes_a_cookie() -> None:
     door = Door.of("0.0.0.0")
     assert door.token is not None
     assert len(door.token) >= 20
@@ -479,7 +594,7 @@ def test_beyond_loopback_a_token_becomes_a_cookie() -> None:
     here = {"Host": "me.example:80"}
     first = door.answer(f"/?token={door.token}", here)
     assert first is not None
-    assert (first.status, first.headers["Location"]) == (303, "/")
+    assert (first.status, first.headers["Location"]) == (303, "index.html")
     cookie = first.headers["Set-Cookie"]
     assert "HttpOnly" in cookie
     assert "SameSite=Strict" in cookie
@@ -524,6 +639,9 @@ def test_mistakes_are_told_in_one_line(
     assert "no run 'x'" in complaint(capsys, workspace, "--run", "x")
     assert "from 1 to 65535" in complaint(capsys, workspace, "--port", "65536")
     assert "gone.csv: no such file" in complaint(capsys, workspace, "--play", "gone.csv")
+    assert "--no-token: other machines can reach --host 0.0.0.0" in complaint(
+        capsys, str(file), "--host", "0.0.0.0", "--no-token"
+    )
     assert "--host nowhere.invalid: is no address of this machine" in complaint(
         capsys, workspace, "--host", "nowhere.invalid"
     )

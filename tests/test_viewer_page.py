@@ -89,7 +89,7 @@ class Client:
 def connect(serving: Serving, **headers: str) -> Any:
     return websockets.connect(
         f"ws://127.0.0.1:{serving.port}", subprotocols=[websockets.Subprotocol(PROTOCOL)], max_size=None,
-        additional_headers=headers,
+        additional_headers={"Cookie": serving.door.cookie, **headers},
     )  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def test_two_clients_see_their_own_views_and_one_may_vanish(serving: Serving, se
             await Client(third).picture(64)
 
     asyncio.run(talk())
-    assert serving.loop.error is None
+    assert (serving.loop.error, serving.failures) == (None, [])
     until(lambda: not serving._server.get_clients())
 
 
@@ -172,13 +172,17 @@ def test_moving_pictures_are_smaller_and_still_ones_full(session: Session) -> No
 
 
 def test_strangers_get_nothing(serving: Serving) -> None:
-    assert request(serving.port)[0] == 200
-    status, headers, content = request(serving.port, Host="rebound.example")
-    assert status == 403
-    assert b"private" in content
-    for origin in ("http://evil.example", "null"):
+    cookie = serving.door.cookie
+    status, headers, _ = request(serving.port, Cookie=cookie)
+    assert status == 200
+    for origin in ("http://evil.example", "null", "http://[", "http://[::1", "//", "http://\u2100.example"):
+        status, refused, content = request(serving.port, Cookie=cookie, Origin=origin.encode().decode("latin-1"))
+        assert (status, b"its Host is 127.0.0.1" in content) == (403, True), origin
         with pytest.raises(websockets.InvalidStatus, match="403"):
-            asyncio.run(open_and_close(serving, Origin=origin))
+            asyncio.run(open_and_close(serving, Origin=origin.encode().decode("latin-1")))
+        for given in (headers, refused):
+            assert given["X-Frame-Options"] == "DENY"
+            assert given["Content-Security-Policy"] == "frame-ancestors 'none'"
     asyncio.run(open_and_close(serving, Origin=f"http://127.0.0.1:{serving.port}"))
 
 
@@ -187,20 +191,34 @@ async def open_and_close(serving: Serving, **headers: str) -> None:
         pass
 
 
-def test_beyond_loopback_nothing_goes_without_the_token(session: Session) -> None:
-    door = Door.of("0.0.0.0")
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_nothing_goes_without_the_token(session: Session, host: str) -> None:
+    """Other users of this machine can reach loopback, too."""
+    door = Door.of(host)
     running = Serving(session, door, 0, "drawn")
     try:
         assert f"?token={door.token}" in running.address
-        assert request(running.port)[0] == 403
+        status, _, content = request(running.port)
+        assert (status, b"the whole address that mien printed" in content) == (403, True)
         assert request(running.port, "/index.html?token=guess")[0] == 403
         with pytest.raises(websockets.InvalidStatus, match="403"):
-            asyncio.run(open_and_close(running))
+            asyncio.run(open_and_close(running, Cookie="none=1"))
         status, headers, _ = request(running.port, f"/?token={door.token}")
-        assert status == 303
+        assert (status, headers["Location"]) == (303, "index.html")
         cookie = headers["Set-Cookie"].partition(";")[0]
         assert request(running.port, Cookie=cookie)[0] == 200
         asyncio.run(open_and_close(running, Cookie=cookie))
+    finally:
+        running.stop()
+
+
+def test_without_a_token_only_loopback_is_answered(session: Session) -> None:
+    running = Serving(session, Door.of("127.0.0.1", with_token=False), 0, "drawn")
+    try:
+        assert "token" not in running.address
+        assert request(running.port)[0] == 200
+        status, _, content = request(running.port, Host="rebound.example")
+        assert (status, b"Host is rebound.example" in content, b"--no-token" in content) == (403, True, True)
     finally:
         running.stop()
 
@@ -232,6 +250,7 @@ def test_nothing_is_left_after_the_end(session: Session, capfd: pytest.CaptureFi
     assert after <= before
     with pytest.raises(OSError):  # noqa: PT011
         request(running.port)
+    assert running.failures == []
     assert capfd.readouterr().out == ""
 
 
@@ -248,7 +267,7 @@ def test_signals_end_the_command(number: signal.Signals, code: int, tmp_path: Pa
             line = process.stderr.readline()
             assert line.startswith("Open http://127.0.0.1:")
             port = int(line.split(":")[2].partition("/")[0])
-            assert request(port)[0] == 200
+            assert request(port, line.split()[1].partition(str(port))[2])[0] == 303
             with socket.create_connection(("127.0.0.1", port)) as vanished:
                 vanished.sendall(b"GET / HT")
             time.sleep(0.5)
@@ -312,7 +331,7 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
         name for name, slider in serving._panel._sliders.items() if slider.visible and name[0] != name[0].upper()
     }
     assert {name for name in visible if name in session.avatar.expression_names} == {"mouthSmileLeft"}
-    assert serving.loop.error is None
+    assert (serving.loop.error, serving.failures) == (None, [])
 
 
 def read(path: Path) -> np.ndarray:

@@ -44,7 +44,13 @@ class Command:
 
         if self.add is not None:
             from mien.commands.stages.face_models import add_face_model_file
+            from mien.face.cache import cache_is_kept
 
+            if not cache_is_kept():
+                raise UserError(
+                    f"--add {self.add}: there is no folder to keep it in (no home folder, or it cannot be written to); "
+                    "set MIEN_CACHE to a folder"
+                )
             add_face_model_file(self.add, self.name, self.shareable, renew=True)
         if self.bake is not None:
             load_face_model(self.bake)

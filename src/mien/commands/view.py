@@ -27,7 +27,10 @@ class Command:
     follow: bool = False
     """Show the .mien file anew each time it changes."""
     host: str = _LOOPBACK
-    """Address to listen on. Beyond loopback, for example 0.0.0.0, browsers need the token in the printed address."""
+    """Address to listen on (default: this machine alone). 0.0.0.0 stands for all addresses of this machine."""
+    token: bool = True
+    """By default, browsers need the token in the printed address. With --no-token, every user of this machine can use
+    the viewer, but not the camera."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -43,4 +46,4 @@ class Command:
         """Load the avatar, and show it until Ctrl-C."""
         from mien.commands.stages.viewing import Place, run_viewing_stage
 
-        run_viewing_stage(self.avatar, self.run_name, self.play, Place(self.host, self.port), self.follow)
+        run_viewing_stage(self.avatar, self.run_name, self.play, Place(self.host, self.port, self.token), self.follow)

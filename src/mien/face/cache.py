@@ -19,15 +19,27 @@ def cache_folder() -> Path:
     face models yet and cannot be written, for example because there is no home folder, a temporary folder is used and a
     message says so. It is deleted when this process ends.
     """
+    obstacle = _obstacle()
+    wanted = _wanted_folder()
+    return wanted if wanted is not None and obstacle is None else _temporary_folder(str(obstacle))
+
+
+def cache_is_kept() -> bool:
+    """Whether the files of the cache folder stay for other commands. Those of a temporary folder are deleted."""
+    return _obstacle() is None
+
+
+def _obstacle() -> str | None:
+    """Why the wanted folder cannot be used. None if it can."""
     wanted = _wanted_folder()
     if wanted is None:
-        return _temporary_folder("there is no home folder")
+        return "there is no home folder"
     if not (wanted / "face_models").is_dir():
         try:
             check_writable(wanted, folder=True)
         except UserError:
-            return _temporary_folder(f"{wanted} cannot be written to")
-    return wanted
+            return f"{wanted} cannot be written to"
+    return None
 
 
 @lru_cache(maxsize=1)

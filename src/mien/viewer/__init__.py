@@ -1,6 +1,7 @@
 """The viewer: an avatar in a browser, drawn by mien's own renderer on the processor.
 
-Session, pictures and the loop that draws know nothing of the browser. Only `server.py` and `panel.py` call viser.
+Session, pictures and the loop that draws know nothing of the browser. Only
+`server.py`, `panel.py` and `messages.py` call viser.
 """
 
 from typing import TYPE_CHECKING

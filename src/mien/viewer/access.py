@@ -1,8 +1,8 @@
 """Who may use the viewer: checks of every request, before anything of it is answered.
 
-Any page in a browser may open a connection to any address, so a server on loopback is not private by itself. Requests
-therefore need the host that they were sent to, and the origin of that same host. Beyond loopback they also need a
-token, which the printed address has; the first request turns it into a cookie.
+A server on loopback is not private by itself: any page in a browser may open a connection to it, and so may every
+other user of the machine. Requests therefore need a token, which the printed address has; the first request turns it
+into a cookie. They also need the origin of the host that they were sent to.
 """
 
 import hmac
@@ -14,8 +14,31 @@ from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qsl, urlsplit
 
+from mien.errors import UserError
+from mien.terminal import printable
+
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
-_FORBIDDEN = "This viewer is private. Open the whole address that mien printed, with its token.\n"
+HEADERS: Mapping[str, str] = {
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+"""Headers of every answer: no page of another origin may show the viewer in a frame, and none is told its address."""
+_PAGE = "index.html"
+"""Where the first request is sent on, relative to its address. The name keeps a proxy's sub-path: viser's page connects
+to its own address without the last slash, and proxies answer that with a redirect, which no WebSocket follows."""
+_NO_TOKEN = "This viewer is private. Open the whole address that mien printed, with its token.\n"
+_STRANGE_ORIGIN = (
+    "This viewer answers only pages of its own: the request came from a page of {origin}, and its Host is {host}. "
+    "Behind a proxy, let the proxy pass on the browser's Host header.\n"
+)
+_STRANGE_HOST = (
+    "This viewer runs without a token, so it answers only as localhost, and the request's Host is {host}. Open the "
+    "address that mien printed. Behind a proxy, start mien without --no-token.\n"
+)
+_MOST_SHOWN = 100
+"""Number of characters of a header that an answer repeats."""
 
 
 def is_loopback(host: str) -> bool:
@@ -44,12 +67,18 @@ class Door:
     host: str
     """The host that it listens on."""
     token: str | None
-    """What requests beyond loopback need. None on loopback."""
+    """What requests need. None for a viewer on loopback that every user of this machine may open."""
 
     @staticmethod
-    def of(host: str) -> "Door":
-        """The door of a host, with a new random token if it is not loopback."""
-        return Door(host, None if is_loopback(host) else secrets.token_urlsafe(18))
+    def of(host: str, with_token: bool = True) -> "Door":
+        """The door of a host, with a new random token.
+
+        Raises:
+            UserError: there is to be no token, but other machines can reach the host.
+        """
+        if not with_token and not is_loopback(host):
+            raise UserError(f"--no-token: other machines can reach --host {host}; leave --no-token out")
+        return Door(host, secrets.token_urlsafe(18) if with_token else None)
 
     def answer(self, path: str, headers: Mapping[str, str]) -> Answer | None:
         """None if a request may go on, or what to answer instead.
@@ -61,17 +90,19 @@ class Door:
         given = {name.lower(): value for name, value in headers.items()}
         host = given.get("host", "")
         origin = given.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return _refusal()
+        if origin is not None and _place_of(origin) != host:
+            return _refusal(_STRANGE_ORIGIN.format(origin=_shown(origin), host=_shown(host)))
         if self.token is None:
-            return None if _name_of(host) in (*LOOPBACK_NAMES, self.host) else _refusal()
+            known = _name_of(host) in (*LOOPBACK_NAMES, self.host)
+            return None if known else _refusal(_STRANGE_HOST.format(host=_shown(host)))
         asked = dict(parse_qsl(path.partition("?")[2])).get("token")
         if asked is not None:
             if not _same(asked, self.token):
-                return _refusal()
-            cookie = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-            return Answer(HTTPStatus.SEE_OTHER, {"Location": "/", "Set-Cookie": cookie})
-        return None if _same(self._token_in(given.get("cookie", "")), self.token) else _refusal()
+                return _refusal(_NO_TOKEN)
+            # Without a path, the cookie is for the folder of the address, which may be a proxy's sub-path.
+            cookie = f"{self.cookie}; HttpOnly; SameSite=Strict"
+            return Answer(HTTPStatus.SEE_OTHER, {"Location": _PAGE, "Set-Cookie": cookie})
+        return None if _same(self._token_in(given.get("cookie", "")), self.token) else _refusal(_NO_TOKEN)
 
     def address(self, host: str, port: int) -> str:
         """The address that people open."""
@@ -79,20 +110,33 @@ class Door:
         return f"http://{shown}:{port}/" + (f"?token={self.token}" if self.token else "")
 
     @property
-    def _cookie(self) -> str:
+    def cookie(self) -> str:
+        """The cookie of a browser that may use the viewer, NAME=VALUE."""
+        return f"{self._cookie_name}={self.token}"
+
+    @property
+    def _cookie_name(self) -> str:
         # Cookies are the same for all ports of a host, so each viewer has its own name.
         return f"mien_{self.token[:6] if self.token else ''}"
 
     def _token_in(self, cookies: str) -> str:
         try:
-            found = SimpleCookie(cookies).get(self._cookie)
+            found = SimpleCookie(cookies).get(self._cookie_name)
         except CookieError:
             return ""
         return found.value if found is not None else ""
 
 
-def _refusal() -> Answer:
-    return Answer(HTTPStatus.FORBIDDEN, {"Content-Type": "text/plain; charset=utf-8"}, _FORBIDDEN)
+def _refusal(words: str) -> Answer:
+    return Answer(HTTPStatus.FORBIDDEN, {"Content-Type": "text/plain; charset=utf-8"}, words)
+
+
+def _place_of(origin: str) -> str | None:
+    """The host and port in an Origin header. None if it is no address."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None
 
 
 def _name_of(host: str) -> str:
@@ -101,6 +145,11 @@ def _name_of(host: str) -> str:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return ""
+
+
+def _shown(header: str) -> str:
+    """A header as an answer repeats it."""
+    return printable(header[:_MOST_SHOWN]) or "missing"
 
 
 def _same(given: str, token: str) -> bool:

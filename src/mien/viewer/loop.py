@@ -45,6 +45,7 @@ class DrawingLoop:
         draw: Callable[[View, bool], Any],
         advance: Callable[[float], float | None] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        failed: Callable[[Exception], None] = lambda error: None,
     ) -> None:
         """Make a loop that is not running yet.
 
@@ -53,8 +54,10 @@ class DrawingLoop:
             advance: Is called before each picture with the time. It changes what plays, and returns when it wants to be
                 called again, or None.
             clock: Returns the time in seconds.
+            failed: Is called if a picture cannot be drawn or shown. Its client gets none until something changes, and
+                the others get theirs.
         """
-        self._draw, self._advance, self._clock = draw, advance, clock
+        self._draw, self._advance, self._clock, self._failed = draw, advance, clock, failed
         self._clients: dict[int, _Client] = {}
         self._changed = threading.Condition()
         self._stopping = False
@@ -64,10 +67,10 @@ class DrawingLoop:
         self.pictures = 0
         """Number of pictures so far."""
         self.error: BaseException | None = None
-        """What ended the loop, if it was not `stop`."""
+        """What ended the loop, if it was not `stop`: a failure that concerns all clients."""
 
     def add(self, client: int, show: Callable[[Any, bool], None]) -> None:
-        """Draw for one more client. `show` takes a picture and whether it is a full one; it may raise nothing."""
+        """Draw for one more client. `show` takes a picture and whether it is a full one."""
         with self._changed:
             self._clients[client] = _Client(show)
 
@@ -106,6 +109,16 @@ class DrawingLoop:
             key, client, full = due
             view, wanted = client.view, client.wanted
         assert view is not None
+        try:
+            self._serve(key, client, view, wanted, full)
+        except Exception as error:  # noqa: BLE001
+            with self._changed:
+                client.drawn, client.is_full = wanted, True
+            self._failed(error)
+        return 0.0
+
+    def _serve(self, key: int, client: _Client, view: View, wanted: int, full: bool) -> None:
+        """Draw and show a picture for a client."""
         began = self._clock()
         picture = self._draw(view, full)
         ended = self._clock()
@@ -116,7 +129,6 @@ class DrawingLoop:
             there = self._clients.get(key) is client
         if there:
             client.show(picture, full)
-        return 0.0
 
     def _next(self, now: float) -> tuple[int, _Client, bool] | None:
         """The client to draw for, and whether its picture has full size: requests first, then full pictures."""

@@ -1,6 +1,5 @@
 """The controls beside the picture, in viser's words. All browsers share them."""
 
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from mien.viewer.faces import grouped, matches, presets_for, readable
 from mien.viewer.files import Stopped, screenshot, video
 from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Session, centre_of
+from mien.viewer.work import Worker
 
 MAX_ANGLE = 0.5
 """Largest angle of a joint's slider, in radians."""
@@ -23,6 +23,11 @@ _STEP = 0.01
 _AXES = ("nod", "turn", "tilt")
 _NOTHING = "none"
 _LEAST_HEIGHT, _MOST_HEIGHT = 128, 1080
+_MOST_STILLS = 8
+"""Number of browsers whose screenshots may wait."""
+_MOST_PARTS = 16
+"""Number of messages that a browser may not have taken yet when one more file is made for it. A file has a message for
+each MiB."""
 _FOLLOW_SECONDS = 0.25
 """Time between two moves of the sliders while a motion plays, in seconds."""
 
@@ -36,6 +41,7 @@ class Panel:
         session: Session,
         title: str,
         view_of: Callable[..., View],
+        failed: Callable[[Exception], None],
         camera: CameraSwitch | None = None,
     ) -> None:
         """Add the controls to a server.
@@ -45,6 +51,7 @@ class Panel:
             session: What the controls change.
             title: Name of the avatar, for people and for the files that are saved.
             view_of: Returns the view of a client.
+            failed: Is called with an exception of slow work, which is a bug.
             camera: What lets the avatar follow a camera, if there is one.
         """
         self._server, self._session, self._view_of = server, session, view_of
@@ -53,7 +60,9 @@ class Panel:
         self._time: viser.GuiSliderHandle[int] | None = None
         self._report: viser.GuiMarkdownHandle | None = None
         self._followed_at, self._stopping = 0.0, False
-        self._recording = threading.Lock()
+        self._stills = Worker("mien-stills", failed, _MOST_STILLS)
+        self._videos = Worker("mien-videos", failed, most=0)
+        self._motions, self._switching = Worker("mien-motions", failed), Worker("mien-camera", failed)
         about = session.avatar.portable.about
         count = len(session.avatar.portable.baked.attributes.opacity_logits)
         server.gui.add_markdown(f"**{_plain(self._title)}**: {count:,} Gaussians, {_plain(about.method)}")
@@ -69,8 +78,10 @@ class Panel:
         self._add_files()
 
     def stop(self) -> None:
-        """Stop a video that is being written."""
+        """Stop a video that is being written, and drop the work that waits."""
         self._stopping = True
+        for worker in (self._stills, self._videos, self._motions, self._switching):
+            worker.stop()
 
     def follow(self) -> None:
         """Move the sliders to the face that is shown, now and then while a motion plays or a camera is followed."""
@@ -103,17 +114,20 @@ class Panel:
             inset = gui.add_checkbox("Camera picture in the corner", session.with_camera)
             self._report = gui.add_markdown("")
 
-        @follow.on_update
-        def _(event: Any) -> None:
+        def switch(client: viser.ClientHandle | None) -> None:
             try:
                 if follow.value:
                     camera.start()
                 else:
                     camera.stop()
             except UserError as error:
-                self._complain(event.client, str(error))
+                self._complain(client, str(error))
                 follow.value = False
             self.move_sliders()
+
+        @follow.on_update
+        async def _(event: Any) -> None:
+            self._switching.ask("camera", lambda: switch(event.client))
 
         @learn.on_click
         async def _(event: Any) -> None:
@@ -132,19 +146,24 @@ class Panel:
             filmed = gui.add_checkbox("Filmed frame beside it", False)
         before = [_NOTHING]
 
-        @chosen.on_update
-        def _(event: Any) -> None:
-            if chosen.value == before[0]:
+        def choose(name: str, client: viser.ClientHandle | None) -> None:
+            if name == before[0]:
                 return
             try:
-                session.choose(None if chosen.value == _NOTHING else chosen.value)
+                session.choose(None if name == _NOTHING else name)
             except UserError as error:
-                self._complain(event.client, str(error))
-                chosen.value = before[0]
+                self._complain(client, str(error))
+                if chosen.value == name:
+                    chosen.value = before[0]
                 return
-            before[0] = chosen.value
+            before[0] = name
             timeline.max = max(1, len(session.clip.motion) - 1) if session.clip else 1
             self.move_sliders()
+
+        @chosen.on_update
+        async def _(event: Any) -> None:
+            name = chosen.value
+            self._motions.ask("motion", lambda: choose(name, event.client))
 
         @play.on_click
         async def _(event: Any) -> None:
@@ -277,36 +296,49 @@ class Panel:
             moving = gui.add_button("Video", hint="The whole motion from here; without a motion, once around the head")
 
         @still.on_click
-        def _(event: Any) -> None:
-            if event.client is not None:
-                content = screenshot(session, self._view_of(event.client.camera))
-                event.client.send_file_download(f"{self._title}.png", content, save_immediately=True)
+        async def _(event: Any) -> None:
+            client = event.client
+            if client is not None and not self._stills.ask(client.client_id, lambda: self._photograph(client)):
+                self._complain(client, "Other pictures are being drawn; try again in a moment.")
 
         @moving.on_click
-        def _(event: Any) -> None:
-            if event.client is not None:
-                self._record(event.client)
+        async def _(event: Any) -> None:
+            client = event.client
+            if client is not None and not self._videos.ask(client.client_id, lambda: self._record(client)):
+                self._complain(client, "A video is being written; wait for it.")
+
+    def _photograph(self, client: viser.ClientHandle) -> None:
+        """Draw a screenshot and send it."""
+        if self._can_send(client):
+            content = screenshot(self._session, self._view_of(client.camera))
+            client.send_file_download(f"{self._title}.png", content, save_immediately=True)
 
     def _record(self, client: viser.ClientHandle) -> None:
-        """Write a video in this thread, and send it. A second one has to wait."""
-        if not self._recording.acquire(blocking=False):
-            self._complain(client, "A video is being written; wait for it.")
-            return
+        """Write a video and send it."""
 
         def go_on() -> bool:
             return not self._stopping and client.client_id in self._server.get_clients()
 
+        if not self._can_send(client):
+            return
+        note = client.add_notification("Video", "It is being written ...", loading=True, with_close_button=False)
         try:
-            note = client.add_notification("Video", "It is being written ...", loading=True, with_close_button=False)
             content = video(self._session, self._view_of(client.camera), centre_of(self._session.avatar), go_on)
-            note.remove()
             client.send_file_download(f"{self._title}.mp4", content, save_immediately=True)
         except Stopped:
             pass
         except UserError as error:
             self._complain(client, str(error))
         finally:
-            self._recording.release()
+            note.remove()
+
+    def _can_send(self, client: viser.ClientHandle) -> bool:
+        """Whether a client has taken the files before. What it has not taken yet stays in memory."""
+        waiting = client._websock_connection.get_message_buffer().message_from_id
+        if len(waiting) > _MOST_PARTS:
+            self._complain(client, "The last file is still on its way; wait for it.")
+            return False
+        return True
 
     def _complain(self, client: viser.ClientHandle | None, message: str) -> None:
         if client is not None:

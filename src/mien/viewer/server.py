@@ -7,29 +7,39 @@ import io
 import logging
 import math
 import socket
+import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import numpy as np
 import viser
 import viser.transforms
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from mien.errors import UserError
-from mien.viewer.access import Door
+from mien.terminal import tell
+from mien.viewer.access import HEADERS, Door
 from mien.viewer.drawing import View
 from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
+from mien.viewer.messages import MOST_BYTES, Gate
 from mien.viewer.panel import Panel, filmed_from
 from mien.viewer.session import Session, centre_of
 
 _MOVING_QUALITY, _STILL_QUALITY = 75, 92
 """JPEG qualities of pictures of half size and of full size, 1 to 100."""
-_MOST_FIELD = math.pi - 0.01
-"""Largest field of view of a browser, in radians."""
+_MOST_BROWSERS = 32
+"""Number of browsers that may be connected at a time. Each costs memory, and time of the others."""
+_MOST_TOLD = 10
+"""Number of failures that are told; a browser could cause the same one again and again."""
+_TRY_AGAIN_LATER = 1013
+"""Code with which a WebSocket closes."""
+_CLOSE_SECONDS = 1.0
+"""Time that a browser has to answer when its connection is closed, in seconds."""
 _WATCH_SECONDS = 0.5
 
 
@@ -68,10 +78,15 @@ class Serving:
     def __init__(self, session: Session, door: Door, port: int, title: str, camera: CameraSwitch | None = None) -> None:
         """Start the server; the arguments are those of `serve`."""
         self._camera = camera
+        self.door = door
+        self.failures: list[str] = []
+        """What could not be done for a browser. Each is a bug, and the viewer goes on."""
+        self._failing = threading.Lock()
+        gate = Gate()
         chosen = _free_port(door.host, port)
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
-        with _quiet(), _guarded(door):
+        with _quiet(), _guarded(door, gate):
             self._server = viser.ViserServer(host=door.host, port=chosen, label="mien", verbose=False)
         try:
             self.port = self._server.get_port()
@@ -80,8 +95,10 @@ class Serving:
             _check_guard(door.host, self.port)
             # viser could pass this server on through a machine of its makers.
             self._server.request_share_url = lambda verbose=True: None
+            self._server.get_event_loop().set_exception_handler(self._task_failed)
             self._session = session
             self._show(title)
+            gate.open(self._server.gui)
         except BaseException:
             with _quiet():
                 self._server.stop()
@@ -116,14 +133,26 @@ class Serving:
         server.initial_camera.look_at = centre_of(session.avatar)
         server.initial_camera.up = up
         server.initial_camera.fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
-        self.loop = DrawingLoop(session.picture, session.advance)
+        self.loop = DrawingLoop(session.picture, session.advance, failed=self._failed)
         session.changed = self.loop.change
-        self._panel = Panel(server, session, title, view_of, self._camera)
+        self._panel = Panel(server, session, title, view_of, self._failed, self._camera)
         self.loop.start()
         # A browser may leave while its picture is drawn; viser would warn about that.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         server.on_client_connect(self._welcome)
         server.on_client_disconnect(self._forget)
+
+    def _failed(self, error: BaseException) -> None:
+        """Tell that something could not be done for a browser, and go on for the others."""
+        with self._failing:
+            self.failures.append(f"{type(error).__name__}: {error}")
+            if len(self.failures) <= _MOST_TOLD:
+                tell(f"A browser's request failed, which is a bug in mien, and the viewer goes on ({self.failures[-1]})")
+
+    def _task_failed(self, loop: Any, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if isinstance(error, Exception):
+            self._failed(error)
 
     async def _welcome(self, client: viser.ClientHandle) -> None:
         words = client.gui.add_markdown("", order=0.5)
@@ -163,13 +192,7 @@ def view_of(camera: viser.CameraHandle) -> View:
 
 def is_possible(view: View) -> bool:
     """Whether a picture of a view can be drawn. A hidden browser window has no size."""
-    return bool(
-        np.isfinite(view.viewmat).all()
-        and np.abs(view.viewmat).max() < 1e6
-        and 0 < view.field < _MOST_FIELD
-        and view.width > 0
-        and view.height > 0
-    )
+    return view.width > 0 and view.height > 0
 
 
 def _free_port(host: str, port: int) -> int:
@@ -207,27 +230,71 @@ def _quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _guarded(door: Door) -> Iterator[None]:
-    """Let servers that start inside ask the door about each request. viser has no place for that."""
+def _guarded(door: Door, gate: Gate) -> Iterator[None]:
+    """Let servers that start inside ask the door about each request, and the gate about each message.
+
+    viser has no place for that.
+    """
     module: Any = websockets.asyncio.server
     start = module.serve
 
-    def guarded(*arguments: Any, process_request: Callable[[Any, Request], Any], **named: Any) -> Any:
-        def process(connection: Any, request: Request) -> Any:
-            answer = door.answer(request.path, dict(request.headers.raw_items()))
-            if answer is None:
-                return process_request(connection, request)
-            body = answer.body.encode()
-            headers = Headers({**answer.headers, "Content-Length": str(len(body))})
-            return Response(answer.status.value, answer.status.phrase, headers, body)
+    class Connection(ServerConnection):
+        """A connection of a browser, from which only checked messages come."""
 
-        return start(*arguments, process_request=process, **named)
+        async def recv(self, decode: bool | None = None) -> Any:
+            while True:
+                message = gate.checked(await super().recv(decode))
+                if message is not None:
+                    return message
+
+    def guarded(
+        handler: Callable[[Any], Awaitable[None]],
+        *arguments: Any,
+        process_request: Callable[[Any, Request], Response | None],
+        **named: Any,
+    ) -> Any:
+        def process(connection: Any, request: Request) -> Response | None:
+            response = _refused(door, request) or process_request(connection, request)
+            if response is not None:
+                response.headers.update(HEADERS)
+            return response
+
+        named |= {"create_connection": Connection, "max_size": MOST_BYTES, "close_timeout": _CLOSE_SECONDS}
+        return start(_at_most(_MOST_BROWSERS, handler), *arguments, process_request=process, **named)
 
     module.serve = guarded
     try:
         yield
     finally:
         module.serve = start
+
+
+def _refused(door: Door, request: Request) -> Response | None:
+    """What the door answers to a request, or None if it may go on."""
+    answer = door.answer(request.path, dict(request.headers.raw_items()))
+    if answer is None:
+        return None
+    body = answer.body.encode()
+    headers = Headers({**answer.headers, "Content-Length": str(len(body))})
+    return Response(answer.status.value, answer.status.phrase, headers, body)
+
+
+def _at_most(most: int, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
+    """A handler of connections that closes those beyond a number at once."""
+    connected = 0
+
+    async def handle(connection: Any) -> None:
+        nonlocal connected
+        if connected >= most:
+            await connection.close(_TRY_AGAIN_LATER, "too many browsers look at this viewer")
+            return
+        connected += 1
+        try:
+            await handler(connection)
+        finally:
+            connected -= 1
+
+    return handle
 
 
 def _check_guard(host: str, port: int) -> None:

@@ -3,19 +3,32 @@
 Methods may be called from any thread. A `version` counts the changes.
 """
 
+import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from mien import runtime
+from mien.errors import UserError
 from mien.export import Motion
 from mien.runtime import Face
 from mien.runtime.filmed import within_filmed_inputs
-from mien.viewer.drawing import Look, Mesh, View, beside, draw, in_corner, words_about_view
+from mien.viewer.drawing import (
+    BACKGROUNDS,
+    MAX_SIDE,
+    Look,
+    Mesh,
+    Surface,
+    View,
+    beside,
+    draw,
+    in_corner,
+    words_about_view,
+)
 from mien.viewer.faces import preset_expression, random_expression
 
 DEFAULT_HEIGHT = 512
@@ -111,7 +124,12 @@ class Session:
             self._change()
 
     def set_expression(self, name: str, value: float) -> None:
-        """Set one expression, within the bounds of the face model. What plays is paused."""
+        """Set one expression, within the bounds of the face model. What plays is paused.
+
+        Raises:
+            UserError: the value is not finite.
+        """
+        _check_finite(name, value)
         index = self.avatar.expression_names.index(name)
         low, high = self.avatar.portable.expression_bounds[index]
         with self._lock:
@@ -120,7 +138,12 @@ class Session:
             self._take(replace(self._face, expression=expression))
 
     def set_joint(self, name: str, axis: int, angle: float) -> None:
-        """Set one component of a joint's axis-angle vector, in radians. What plays is paused."""
+        """Set one component of a joint's axis-angle vector, in radians. What plays is paused.
+
+        Raises:
+            UserError: the angle is not finite.
+        """
+        _check_finite(name, angle)
         with self._lock:
             joints = self._face.joints.copy()
             joints[self.avatar.joint_names.index(name), axis] = angle
@@ -212,7 +235,12 @@ class Session:
         return drawn
 
     def show(self, **changes: Any) -> None:
-        """Change `look` (fields of `Look`), `height`, `side_by_side` or `with_camera`."""
+        """Change `look` (fields of `Look`), `height`, `side_by_side` or `with_camera`.
+
+        Raises:
+            UserError: there is no such surface or background, or the height is not 1 to 2048.
+        """
+        _check_look(changes)
         with self._lock:
             self.height = int(changes.pop("height", self.height))
             self.side_by_side = bool(changes.pop("side_by_side", self.side_by_side))
@@ -269,6 +297,19 @@ class Session:
     def _change(self) -> None:
         self._version += 1
         self.changed()
+
+
+def _check_finite(name: str, value: float) -> None:
+    if not math.isfinite(value):
+        raise UserError(f"{name} {value}: is not finite; give a number")
+
+
+def _check_look(changes: Mapping[str, Any]) -> None:
+    for name, known in (("surface", get_args(Surface)), ("background", tuple(BACKGROUNDS))):
+        if name in changes and changes[name] not in known:
+            raise UserError(f"{name} {changes[name]!r}: there is none; give one of {', '.join(known)}")
+    if not 1 <= changes.get("height", DEFAULT_HEIGHT) <= MAX_SIDE:
+        raise UserError(f"height {changes['height']}: give 1 to {MAX_SIDE} pixels")
 
 
 def centre_of(avatar: runtime.Avatar) -> Float32[np.ndarray, " 3"]:

@@ -19,7 +19,7 @@ from mien.driving import Driver, drive, keep_to_filmed, read_recording, read_tra
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from mien.face import FaceModel
-from mien.face.cache import cache_folder
+from mien.face.cache import cache_folder, cache_is_kept
 from mien.pictures import side_by_side
 from mien.progress import say, track_progress
 from mien.storage import file_digest
@@ -60,7 +60,8 @@ def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[s
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
     tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
     names = sorted(tracked, key=lambda name: (len(name), name))
-    say(f"{video}: tracked in {workspace.root}, kept for the next time")
+    kept = "kept for the next time" if cache_is_kept() else "for this command only; set MIEN_CACHE to keep it"
+    say(f"{video}: tracked in {workspace.root}, {kept}")
     return workspace, names
 
 

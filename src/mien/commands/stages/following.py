@@ -79,7 +79,7 @@ def _wait(
         say(f"Open {address} in a browser, and look into the camera for a second with a relaxed face; Ctrl-C ends")
 
     if options.place is not None:
-        door = Door.of(options.place.host)
+        door = Door.of(options.place.host, options.place.token)
         serve(session, door, options.place.port, viewed.portable.about.name, ready, switch)
         return
     say("Look into the camera for a second with a relaxed face; Ctrl-C ends")

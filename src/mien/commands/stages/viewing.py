@@ -52,16 +52,18 @@ class Place:
     host: str
     port: int
     """0 means a free one."""
+    token: bool = True
+    """Whether browsers need a token."""
 
 
 def run_viewing_stage(avatar: Path, run: str | None, play: str | None, place: Place, follow: bool = False) -> None:
     """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes."""
+    door = Door.of(place.host, place.token)
     viewed = open_viewed(avatar, run)
     clips = {name: _clip_of(viewed, folder, name) for name, folder in viewed.sequences.items()}
     if play is not None:
         clips[Path(play).name] = _clip_of(viewed, Path(play), None)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
-    door = Door.of(place.host)
 
     def ready(address: str) -> None:
         say(f"Open {address} in a browser; Ctrl-C ends the viewer")
@@ -75,8 +77,11 @@ def run_viewing_stage(avatar: Path, run: str | None, play: str | None, place: Pl
 
 
 def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwitch | None:
-    """The switch of this machine's first camera, if it has one. Browsers of other machines must not turn it on."""
-    if not devices() or not is_loopback(place.host) or os.environ.get(PARENT) is not None:
+    """The switch of this machine's first camera, if it has one.
+
+    Other machines must not turn it on, nor other users of this one.
+    """
+    if not devices() or not is_loopback(place.host) or not place.token or os.environ.get(PARENT) is not None:
         return None
     return switch_of(session, viewed, camera_named("camera", None), FollowOptions())
 
