@@ -92,11 +92,12 @@ fuzz-native: setup
 	$(BIN)/ninja --quiet -C $(SANITIZED)
 	$(BIN)/python tests/fuzzing/native_calls.py $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
 
-# Mutated files of every format and odd command lines, for MINUTES, then native calls; findings go to out/fuzz/findings.jsonl.
+# Mutated files of every format and odd command lines, for MINUTES, messages to a viewer, native calls; findings go to out/fuzz/findings.jsonl.
 MINUTES ?= 10
 fuzz: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
 	  --lines 300 --heavy 10 --findings out/fuzz/findings.jsonl
+	PYTHONPATH=tests $(BIN)/python -m fuzzing.viewer_messages --count 200 --seed $(SEED)
 	$(MAKE) fuzz-native
 
 # Commands that are killed at random moments and run again, until there are KILLS kills; findings go to out/fuzz/kills.jsonl.

@@ -10,6 +10,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mien.cli import main
+from mien.commands.stages import driving
 from mien.errors import UserError
 from mien.face import available_face_models, cache, load_face_model, loading
 from small_face_model import make_small_face_model
@@ -147,4 +149,29 @@ def test_without_a_home_folder_models_are_baked_for_this_process(home, bakes, mo
     (folder,) = tmp_path.glob("mien-cache-*")
     assert loading._is_baked("small", loading._SOURCES["small"])
     assert str(folder) in said
+    cache._temporary_folder.cache_clear()
+
+
+def test_without_a_home_folder_nothing_is_promised(monkeypatch, tmp_path, capsys):
+    """A driver's tracking is not kept for the next time then, and a face model that is added would be lost."""
+    for name in ("MIEN_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    cache._temporary_folder.cache_clear()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(driving, "run_capture_stage", lambda *_: None)
+    monkeypatch.setattr(driving, "run_tracking_stage", lambda *_, **__: {"clip": None})
+    (tmp_path / "clip.mp4").write_bytes(b"a video")
+    monkeypatch.setenv("HOME", "/proc/nowhere")
+    assert not cache.cache_is_kept()
+    driving._tracked_video(tmp_path / "clip.mp4", "small")
+    said = capsys.readouterr().err
+    assert "next time" not in said
+    assert "for this command only; set MIEN_CACHE to keep it" in said
+    (tmp_path / "model.npz").write_bytes(b"a model")
+    assert main(["face-models", "--add", str(tmp_path / "model.npz")]) == 2
+    assert "there is no folder to keep it in" in capsys.readouterr().err
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
+    assert cache.cache_is_kept()
+    driving._tracked_video(tmp_path / "clip.mp4", "small")
+    assert "kept for the next time" in capsys.readouterr().err
     cache._temporary_folder.cache_clear()

@@ -577,7 +577,9 @@ def test_a_proxy_with_a_path_of_its_own() -> None:
     there = {"Host": "me.example", "Origin": "https://me.example"}
     first = door.answer(f"/?token={door.token}", there)
     assert first is not None
-    assert urljoin("https://me.example/mien/?token=x", first.headers["Location"]) == "https://me.example/mien/index.html"
+    assert (
+        urljoin("https://me.example/mien/?token=x", first.headers["Location"]) == "https://me.example/mien/index.html"
+    )
     assert "Path" not in first.headers["Set-Cookie"]
     assert door.answer("/index.html", {**there, "Cookie": door.cookie}) is None
     lost = door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie})

@@ -1,6 +1,7 @@
 """The viewer's server: real connections, two clients, clients that vanish, the door, and a real browser."""
 
 import asyncio
+import contextlib
 import http.client
 import json
 import os
@@ -332,6 +333,53 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
     }
     assert {name for name in visible if name in session.avatar.expression_names} == {"mouthSmileLeft"}
     assert (serving.loop.error, serving.failures) == (None, [])
+
+
+@contextlib.contextmanager
+def proxied(port: int, folder: str) -> Iterator[int]:
+    """Pass requests below a folder on to a port, without the folder's name, as nginx does. Yield the proxy's port."""
+
+    async def pipe(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(1 << 16):
+                writer.write(data)
+                await writer.drain()
+        writer.close()
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError):
+            head = await reader.readuntil(b"\r\n\r\n")
+            if not head.startswith(b"GET /%s/" % folder.encode()):
+                writer.write(b"HTTP/1.1 301 Moved\r\nLocation: /%s/\r\nContent-Length: 0\r\n\r\n" % folder.encode())
+                writer.close()
+                return
+            inner, onward = await asyncio.open_connection("127.0.0.1", port)
+            onward.write(head.replace(b"/%s/" % folder.encode(), b"/", 1))
+            await asyncio.gather(pipe(inner, writer), pipe(reader, onward))
+
+    loop = asyncio.new_event_loop()
+    server = loop.run_until_complete(asyncio.start_server(answer, "127.0.0.1", 0))
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    try:
+        yield server.sockets[0].getsockname()[1]
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        server.close()
+        loop.close()
+
+
+@pytest.mark.slow
+def test_a_browser_behind_a_proxy_with_a_path_of_its_own(serving: Serving, tmp_path: Path) -> None:
+    chromium()
+    node()
+    shot = tmp_path / "shot.png"
+    with proxied(serving.port, "deep/mien") as port:
+        address = f"http://127.0.0.1:{port}/deep/mien/?token={serving.door.token}"
+        told = browse(address, [{"see": "Expressions"}, {"wait": 3000}, {"screenshot": str(shot)}])
+    assert told["errors"] == []
+    assert 0.1 < (read(shot)[350:, :700] < 250).any(-1).mean() < 0.9, "a head over white"
 
 
 def read(path: Path) -> np.ndarray:

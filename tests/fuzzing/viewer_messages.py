@@ -276,7 +276,11 @@ async def _attack(viewer: Viewer, dice: Random, count: int, figures: Figures) ->
     last = ""
     while figures.messages < count:
         if connection is None:
-            connection = await viewer.connect()
+            try:
+                connection = await viewer.connect()
+            except OSError as error:
+                figures.findings.append(f"nobody could connect before message {figures.messages} ({error}): {last}")
+                return
             figures.connections += 1
             controls, seen = await look(connection)
             if not seen:

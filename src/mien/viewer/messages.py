@@ -20,12 +20,16 @@ MOST_TEXT = 100
 """Number of characters of a text that are kept."""
 _MOST_DISTANCE = 1e5
 """Largest distance of a camera along an axis, in metres."""
+_MOST_ROTATION = 2.0
+"""Largest component of a quaternion, which is normalised. The inverse is its least length."""
 _LEAST_FIELD, _MOST_FIELD = 0.01, math.pi - 0.01
 """Fields of view of a browser, in radians."""
 _MOST_SIDE = 1 << 14
 """Largest side of a browser's canvas, in pixels."""
 
 _Triple = tuple[float, float, float]
+Plain = bool | int | float | str
+"""Values of controls."""
 
 
 class _Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage"):
@@ -41,7 +45,7 @@ class _Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage"):
 
 
 class _Value(msgspec.Struct):
-    value: bool | int | float | str
+    value: Plain
 
 
 class _Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage"):
@@ -81,7 +85,7 @@ class Gate:
         return {"type": "GuiUpdateMessage", "uuid": update.uuid, "updates": {"value": value}}
 
 
-def checked_value(control: Any, value: bool | float | str) -> bool | float | str | None:
+def checked_value(control: Any, value: Plain) -> Plain | None:
     """The value that a control takes, clamped, or None if it takes no such value."""
     if isinstance(control, viser.GuiButtonHandle):
         return True
@@ -99,14 +103,16 @@ def checked_value(control: Any, value: bool | float | str) -> bool | float | str
 
 
 def _checked_camera(camera: _Camera) -> dict[str, Any] | None:
-    """The message of a camera, or None if nothing can be seen from there. A hidden window has no size, which is fine."""
+    """The message of a camera, or None if nothing can be seen from there. A hidden window has no size."""
     rotation = np.array(camera.wxyz)
     places = np.array((camera.position, camera.look_at, camera.up_direction))
     numbers = np.array((camera.fov, camera.near, camera.far, camera.image_height, camera.image_width))
     if not all(np.isfinite(values).all() for values in (rotation, places, numbers)):
         return None
+    if np.abs(rotation).max() > _MOST_ROTATION:
+        return None
     length = float(np.linalg.norm(rotation))
-    if not (0.5 < length < 2 and np.abs(places).max() <= _MOST_DISTANCE):
+    if not (length > 1 / _MOST_ROTATION and np.abs(places).max() <= _MOST_DISTANCE):
         return None
     return {
         "type": "ViewerCameraMessage",

@@ -290,7 +290,7 @@ class Panel:
             self._session.show(**{name: handle.value})
 
     def _add_files(self) -> None:
-        gui, session = self._server.gui, self._session
+        gui = self._server.gui
         with gui.add_folder("Save", expand_by_default=False):
             still = gui.add_button("Screenshot")
             moving = gui.add_button("Video", hint="The whole motion from here; without a motion, once around the head")

@@ -80,7 +80,7 @@ class Serving:
         self._camera = camera
         self.door = door
         self.failures: list[str] = []
-        """What could not be done for a browser. Each is a bug, and the viewer goes on."""
+        """The first failures of requests of browsers. Each is a bug, and the viewer goes on."""
         self._failing = threading.Lock()
         gate = Gate()
         chosen = _free_port(door.host, port)
@@ -144,10 +144,11 @@ class Serving:
 
     def _failed(self, error: BaseException) -> None:
         """Tell that something could not be done for a browser, and go on for the others."""
+        words = f"{type(error).__name__}: {error}"
         with self._failing:
-            self.failures.append(f"{type(error).__name__}: {error}")
-            if len(self.failures) <= _MOST_TOLD:
-                tell(f"A browser's request failed, which is a bug in mien, and the viewer goes on ({self.failures[-1]})")
+            if len(self.failures) < _MOST_TOLD:
+                self.failures.append(words)
+                tell(f"A browser's request failed, which is a bug in mien, and the viewer goes on ({words})")
 
     def _task_failed(self, loop: Any, context: dict[str, Any]) -> None:
         error = context.get("exception")

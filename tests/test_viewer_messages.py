@@ -1,0 +1,299 @@
+"""Messages of browsers to the viewer: every value is checked and clamped, and nobody can end the viewer for others."""
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser")
+
+import msgspec
+import viser
+import websockets
+import zstandard
+
+from mien import runtime
+from mien.viewer import panel
+from mien.viewer.access import Door
+from mien.viewer.messages import MOST_TEXT, Gate
+from mien.viewer.server import _MOST_BROWSERS, Serving
+from mien.viewer.session import Session
+from test_viewer import clip_of
+from test_viewer_page import Client, connect, until
+from web_case import drawn_head
+
+SECONDS = 400
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 0.5], "fov": 0.4, "near": 0.01, "far": 100,
+    "image_height": 64, "image_width": 96, "look_at": [0, 0, 1], "up_direction": [0, -1, 0],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def avatar() -> runtime.Avatar:
+    return runtime.Avatar(drawn_head(2000))
+
+
+@pytest.fixture
+def serving(avatar: runtime.Avatar) -> Iterator[Serving]:
+    session = Session(avatar, None, {"clip": lambda: clip_of(avatar)})
+    running = Serving(session, Door.of("127.0.0.1"), 0, "drawn")
+    yield running
+    running.stop()
+
+
+def control(serving: Serving, label: str) -> Any:
+    """The handle of a control, by its label."""
+    handles = serving._server.gui._gui_input_handle_from_uuid.values()
+    return next(handle for handle in handles if handle.label == label)  # type: ignore[attr-defined]
+
+
+def update(serving: Serving, label: str, value: object, name: str = "value") -> bytes:
+    message = {"type": "GuiUpdateMessage", "uuid": control(serving, label)._impl.uuid, "updates": {name: value}}
+    return msgspec.msgpack.encode(message)
+
+
+def passed(serving: Serving, label: str, value: object, name: str = "value") -> object:
+    """The value of a control that the gate lets through, or None."""
+    gate = Gate()
+    gate.open(serving._server.gui)
+    message = gate.checked(update(serving, label, value, name))
+    return None if message is None else msgspec.msgpack.decode(message)["updates"]["value"]
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "expected"),
+    [
+        ("jaw open", 0.25, 0.25),
+        ("jaw open", 1, 1.0),
+        ("jaw open", 1e300, float(np.float32(1.2))),
+        ("jaw open", -5, 0.0),
+        ("jaw open", math.nan, None),
+        ("jaw open", math.inf, None),
+        ("jaw open", "0.5", None),
+        ("jaw open", True, None),
+        ("jaw open", [0.5], None),
+        ("jaw open", {"a": 1}, None),
+        ("Frame", 1e300, 1),
+        ("Frame", 0.7, 0),
+        ("Height in pixels", 1e300, 1080),
+        ("Height in pixels", -(2**63), 128),
+        ("Height in pixels", 2**64 - 1, 1080),
+        ("Background", "grey", "grey"),
+        ("Background", "purple", None),
+        ("Background", 1, None),
+        ("Motion", "clip", "clip"),
+        ("Motion", "../clip", None),
+        ("Filmed frame beside it", True, True),
+        ("Filmed frame beside it", 1, None),
+        ("Search", "smile left", "smile left"),
+        ("Search", "x" * 50_000, "x" * MOST_TEXT),
+        ("Search", 5, None),
+        ("Random face", {"no": "value"}, None),
+        ("Random face", "anything", True),
+    ],
+)
+def test_values_are_checked_and_clamped(serving: Serving, label: str, value: object, expected: object) -> None:
+    value_passed = passed(serving, label, value)
+    assert (value_passed, type(value_passed)) == (expected, type(expected))
+
+
+def test_only_values_of_controls_pass(serving: Serving) -> None:
+    for name in ("visible", "props", "removed", "update_cb", "__class__", "label"):
+        assert passed(serving, "jaw open", 0.5, name) is None
+    gate = Gate()
+    good = update(serving, "jaw open", 0.5)
+    assert gate.checked(good) is None, "it is not open yet"
+    gate.open(serving._server.gui)
+    assert gate.checked(good) is not None
+    strange = {"type": "GuiUpdateMessage", "uuid": "none", "updates": {"value": 0.5}}
+    for message in (
+        msgspec.msgpack.encode(strange), b"", "text", good[:-1], good + b"\x00", b"\x91" * 60_000,
+        b"\xdd\xff\xff\xff\xff", b"\x81\xa4type\xa4none", b"\xa3\xff\xfe\xfd",
+    ):  # fmt: skip
+        assert gate.checked(message) is None, message[:40]
+    for kind in viser._messages.Message._subclass_from_type_string():
+        message = {**strange, **CAMERA, "uuid": control(serving, "Play")._impl.uuid, "type": kind}
+        known = kind in ("GuiUpdateMessage", "ViewerCameraMessage")
+        assert (gate.checked(msgspec.msgpack.encode(message)) is not None) is known, kind
+
+
+def test_cameras_are_checked_and_clamped() -> None:
+    def camera(**changes: object) -> dict[str, Any] | None:
+        message = Gate().checked(msgspec.msgpack.encode({**CAMERA, **changes}))
+        return None if message is None else msgspec.msgpack.decode(message)
+
+    plain = camera()
+    assert plain == {**CAMERA, "near": pytest.approx(0.01)}
+    for changes in (
+        {"wxyz": [0, 0, 0, 0]}, {"wxyz": [1, 0, 0]}, {"wxyz": [math.nan, 0, 0, 1]}, {"position": [1e300, 0, 0]},
+        {"position": [math.inf, 0, 0]}, {"look_at": [0, math.nan, 0]}, {"up_direction": "up"}, {"fov": math.nan},
+        {"image_width": math.inf}, {"fov": None}, {"wxyz": [1e300, 0, 0, 0]},
+    ):  # fmt: skip
+        assert camera(**changes) is None, changes
+    for name, value, expected in (
+        ("image_width", 1e300, 1 << 14), ("image_height", -1, 0), ("image_height", 700.5, 700), ("fov", 1e-300, 0.01),
+        ("fov", 9, math.pi - 0.01), ("far", 1e300, 1e5),
+    ):  # fmt: skip
+        clamped = camera(**{name: value})
+        assert clamped is not None
+        assert clamped[name] == expected, name
+
+
+def test_one_browser_cannot_end_the_viewer_for_others(serving: Serving) -> None:
+    session, gui = serving._session, serving._server.gui
+    joint = serving._panel._sliders[f"{session.avatar.joint_names[0]}_x"].label
+    messages = [update(serving, joint, value) for value in (math.nan, math.inf, -math.inf)]
+    messages += [update(serving, "Background", "purple"), update(serving, "Search", "x" * 60_000)]
+    messages += [update(serving, label, 1e300) for label in ("Height in pixels", "Frame", "jaw open")]
+    known = {"source_component_uuid": control(serving, "Search")._impl.uuid, "transfer_uuid": "t"}
+    start = {"filename": "x", "mime_type": "x", "part_count": 9, "size_bytes": 9}
+    messages.append(msgspec.msgpack.encode({"type": "FileTransferStartUpload", **known, **start}))
+    part = {"type": "FileTransferPart", **known, "part_index": 0, "content": b"x" * 1000}
+    messages.append(msgspec.msgpack.encode(part))
+
+    async def talk() -> None:
+        async with connect(serving) as hostile, connect(serving) as other:
+            await Client(hostile).look(session, 96, 64)
+            await Client(other).look(session, 96, 64)
+            for message in messages:
+                await hostile.send(message)
+            await hostile.send(update(serving, "Background", "grey"))
+            await hostile.send("text")
+            await hostile.send(update(serving, "Search", "x" * 100_000))
+            with pytest.raises(websockets.ConnectionClosed, match="1009"):
+                await Client(hostile).picture(9999)
+            async with connect(serving) as fresh:
+                for client in (Client(fresh), Client(other)):
+                    await client.look(session, 50, 100)
+                    picture = await client.picture(100)
+                    assert np.abs(picture[0, 0].astype(int) - 128).max() < 5, "what was right counts"
+
+    asyncio.run(talk())
+    assert np.isfinite(session.face.joints).all()
+    assert session.height == 1080
+    assert control(serving, "Search").value == "x" * MOST_TEXT
+    assert gui._current_file_upload_states == {}
+    assert (serving.loop.error, serving.failures) == (None, [])
+
+
+def test_queued_screenshots_are_dropped(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken, go_on = [], threading.Event()
+
+    def slow(*arguments: object) -> bytes:
+        taken.append(arguments)
+        go_on.wait(10)
+        return b"x" * 100
+
+    monkeypatch.setattr(panel, "screenshot", slow)
+
+    async def talk() -> None:
+        async with connect(serving) as connection:
+            await Client(connection).look(serving._session, 96, 64)
+            await Client(connection).picture(64)
+            for _ in range(300):
+                await connection.send(update(serving, "Screenshot", True))
+            await Client(connection).look(serving._session, 48, 32)
+            await Client(connection).picture(32)
+
+    asyncio.run(talk())
+    until(lambda: len(taken) == 1)
+    threading.Timer(0.2, go_on.set).start()
+    serving.stop()
+    assert len(taken) == 1
+
+
+def test_files_wait_until_a_browser_takes_them(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a browser does not take stays in memory, so no more is made for it."""
+    monkeypatch.setattr(panel, "_MOST_PARTS", -1)
+    monkeypatch.setattr(panel, "screenshot", lambda *_: pytest.fail("a picture was drawn"))
+
+    async def talk() -> None:
+        async with connect(serving) as connection:
+            client = Client(connection)
+            await client.look(serving._session, 96, 64)
+            await client.picture(64)
+            await connection.send(update(serving, "Screenshot", True))
+            while b"still on its way" not in await told(connection):
+                pass
+
+    asyncio.run(talk())
+    assert serving.failures == []
+
+
+async def told(connection: Any) -> bytes:
+    content = await asyncio.wait_for(connection.recv(), 60)
+    packed = content[16 : 16 + int.from_bytes(content[8:16], "little")]
+    return zstandard.ZstdDecompressor().decompress(packed)
+
+
+def test_a_failure_is_told_and_the_viewer_goes_on(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*arguments: object) -> None:
+        raise ArithmeticError("a bug")
+
+    monkeypatch.setattr(serving._session, "set_expression", fail)
+    monkeypatch.setattr(panel, "screenshot", fail)
+
+    async def talk() -> None:
+        async with connect(serving) as connection:
+            client = Client(connection)
+            await client.look(serving._session, 96, 64)
+            await client.picture(64)
+            await connection.send(update(serving, "jaw open", 0.5))
+            await connection.send(update(serving, "Screenshot", True))
+            await client.look(serving._session, 48, 32)
+            await client.picture(32)
+
+    asyncio.run(talk())
+    until(lambda: len(serving.failures) == 2)
+    assert capsys.readouterr().err.count("which is a bug in mien, and the viewer goes on (ArithmeticError: a bug)") == 2
+
+
+def test_there_are_only_so_many_browsers(serving: Serving) -> None:
+    async def talk() -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            there = [await stack.enter_async_context(connect(serving)) for _ in range(_MOST_BROWSERS)]
+            async with connect(serving) as one_more:
+                with pytest.raises(websockets.ConnectionClosed, match="too many browsers"):
+                    await one_more.recv()
+            await there[0].close()
+            while not await gets_a_picture(serving):
+                await asyncio.sleep(0.05)
+
+    asyncio.run(talk())
+
+
+async def gets_a_picture(serving: Serving) -> bool:
+    with contextlib.suppress(websockets.ConnectionClosed):
+        async with connect(serving) as connection:
+            await Client(connection).look(serving._session, 96, 64)
+            await Client(connection).picture(64)
+            return True
+    return False
+
+
+@pytest.mark.slow
+def test_hostile_messages_do_no_harm() -> None:
+    """A real viewer and a real WebSocket client; tests/fuzzing/viewer_messages.py does the same at length."""
+    result = subprocess.run(
+        [sys.executable, "-m", "fuzzing.viewer_messages", "--count", "30", "--seed", "1"],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert json.loads(result.stdout)["messages"] == 30
