@@ -168,7 +168,8 @@ def test_a_browser_can_watch_a_training(tmp_path: Path) -> None:
                 assert time.monotonic() - began < PATIENCE_SECONDS
                 assert process.poll() is None, line
             address = line.split()[1]
-            assert urllib.request.urlopen(address, timeout=30).status == 200
+            browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+            assert browser.open(address, timeout=30).status == 200
             assert list(tmp_path.glob("mien-view-*/training.mien"))
             process.send_signal(signal.SIGINT)
             _, told = process.communicate(timeout=PATIENCE_SECONDS)
