@@ -33,7 +33,7 @@ from web_case import drawn_head
 
 MOST_MEMORY = 2 << 30
 """Most memory that the viewer may take, in bytes."""
-MOST_SECONDS = 5.0
+MOST_SECONDS = 10.0
 """Longest time from SIGTERM to the end of the process, in seconds."""
 _PATIENCE_SECONDS = 60.0
 _HUGE = 20_000_000
