@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,10 +18,8 @@ from mien.capture.from_cameras import capture_cameras
 from mien.capture.head_path import choose_crops, find_head_path
 from mien.cli import main
 from mien.errors import UserError
-from mien.rotation import invert_rigid
 
 WIDTH, HEIGHT, FRAMES = 400, 300, 4
-FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 FACE = 0.26
 """Side in metres of the flat face that the cameras see."""
 
@@ -246,27 +243,6 @@ def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
     assert not path.known[1]
     crops, size = choose_crops(path, cameras, 512, whole=False)
     assert size[0] == min(crop.crop_width for crop in crops)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "remedy"),
-    [
-        (invert_rigid, "the matrices go from camera to world, so write the inverse of each viewmat"),
-        (lambda viewmat: FLIP @ viewmat, "the axes are OpenGL's, so change the signs of rows 2 and 3"),
-        (
-            lambda viewmat: invert_rigid(FLIP @ viewmat),
-            "go from camera to world with OpenGL's axes, so change the signs",
-        ),
-    ],
-)
-def test_a_mistake_in_all_matrices_is_named_with_one_remedy(mistake, remedy: str):
-    cameras = list(CAMERAS.values())[:4]
-    boxes = _boxes_of(torch.tensor([0.02, 0.03, 0.05]), cameras)
-    wrong = [replace(camera, viewmat=mistake(camera.viewmat)) for camera in cameras]
-    with pytest.raises(UserError) as error:
-        find_head_path(boxes, wrong)
-    assert "no two cameras ever see the face in the same place" in str(error.value)
-    assert remedy in str(error.value)
 
 
 def test_cameras_that_agree_under_no_mistake_are_told_to_check_their_names():

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mien.camera import Camera
 from mien.capture.calibration import CalibratedCamera, match_sources, read_calibration
+from mien.capture.calibration_check import advise_on, landmarks_at, some_timesteps, warn_of_misfit
 from mien.capture.capture import Capture
 from mien.capture.crop import Crop
 from mien.capture.faces import LANDMARKS
@@ -59,6 +60,8 @@ class _View:
     person: Person
     camera: Camera
     """The camera for the source's pictures."""
+    calibrated: CalibratedCamera
+    """The camera as it is in the calibration."""
 
 
 def capture_cameras(
@@ -118,7 +121,8 @@ def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, r
         if (path := getattr(settings, option)) is not None
     }
     job = open_job(source, replace(settings, **own), camera.camera_id, replace_others)
-    return replace(job, frames=replace(job.frames, selection=replace(job.frames.selection, offset=camera.offset)))
+    selection = replace(job.frames.selection, offset=camera.offset)
+    return replace(job, frames=replace(job.frames, selection=selection, lens=camera.lens))
 
 
 def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
@@ -177,6 +181,8 @@ def _file_of(folder: Path, camera_id: str, option: str) -> Path:
 def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, calibration: str) -> CaptureJob:
     """Return the job of the whole: the first camera's, under the sequence's name and a key over all of them."""
     content = {"recipe": RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
+    if any(camera.lens for camera in cameras):
+        content["straightened"] = True  # Captures by versions that ignored `distortion` are made again.
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     contents = hashlib.sha256("".join(job.frames.content_hash for job in jobs).encode()).hexdigest()
     frames = replace(jobs[0].frames, content_hash=contents)
@@ -203,7 +209,7 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
         survey = survey_source(job.frames, folder / camera.camera_id, landmarks)
         tell_fields(job.frames, survey)
         fitted = camera.for_pictures(*(int(side) for side in survey.picture_size))
-        views.append(_View(camera.camera_id, job, survey, choose_person(survey), fitted))
+        views.append(_View(camera.camera_id, job, survey, choose_person(survey), fitted, camera))
     _check_counts({view.camera_id: len(view.survey.timestamps) for view in views})
     return views
 
@@ -211,7 +217,7 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
 def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSettings, out: Path) -> None:
     cameras = [view.camera for view in views]
     boxes = np.stack([view.person.boxes * np.tile(view.survey.picture_size, 2) for view in views], axis=1)
-    path = find_head_path(boxes, cameras)
+    path = find_head_path(boxes, cameras, lambda: _advice(views, boxes))
     for index, pixels in disagreeing(path, boxes, cameras).items():
         if not np.isfinite(pixels):
             raise UserError(
@@ -241,6 +247,24 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
     _finish(views, whole, path, crops, layout, chunks, out)
 
 
+def _advice(views: list[_View], boxes: Float[np.ndarray, "t c 4"]) -> str:
+    """Return what to correct in a calibration that does not fit, found from landmarks in a few pictures."""
+    timesteps = some_timesteps(np.isfinite(boxes[..., 0]))
+    landmarks = np.full((len(timesteps), len(views), LANDMARKS, 2), np.nan)
+    for index, view in enumerate(views):
+        given = read_given(view.job.settings, view.job.frames).landmarks
+        if given is None:
+            landmarks[:, index] = landmarks_at(view.job.frames, boxes[:, index], timesteps)
+        else:
+            landmarks[:, index] = given[view.survey.numbers[timesteps]]
+    calibrated = [view.calibrated for view in views]
+    return advise_on(calibrated, lambda index, camera: camera.for_pictures(*_size_of(views[index])), landmarks)
+
+
+def _size_of(view: _View) -> tuple[int, int]:
+    return view.camera.width, view.camera.height
+
+
 def _agreed(person: Person, path: HeadPath, camera: int) -> Person:
     """Return the person without faces that are somewhere else than the head."""
     return replace(person, boxes=np.where(path.agrees[:, camera, None] | ~path.known[:, None], person.boxes, np.nan))
@@ -257,6 +281,11 @@ def _finish(
 ) -> None:
     calibration = tuple(_cropped(view.camera, crop) for view, crop in zip(views, crops, strict=True))
     landmarks = _joined_arrays(chunks, "landmarks")
+    warn_of_misfit(
+        [view.calibrated for view in views],
+        lambda index, camera: _cropped(camera.for_pictures(*_size_of(views[index])), crops[index]),
+        landmarks,
+    )
     _remove_astray(landmarks, path, calibration)
     quality = _quality(chunks)
     timestamps = views[0].survey.timestamps

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from mien.bounded import open_ordinary
 from mien.capture.crop import Crop, whole_picture
 from mien.capture.faces import LANDMARKS
+from mien.capture.lens import Lens
 from mien.capture.picture import decode_picture
 from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, list_images, open_source, read_image
@@ -28,8 +29,8 @@ _MAX_SHOWN = 40
 class GivenMattes:
     """Mattes of a source's frames, read once and in order."""
 
-    def __init__(self, path: Path, picture_size: tuple[int, int]) -> None:
-        self._path = path
+    def __init__(self, path: Path, picture_size: tuple[int, int], lens: Lens | None = None) -> None:
+        self._path, self._lens = path, lens
         self._size = picture_size
         self._files = list_images(path) if path.is_dir() else None
         whole = FrameSelection()
@@ -65,7 +66,7 @@ class GivenMattes:
                 f"{name}: is {matte.shape[1]}x{matte.shape[0]}, but the source's pictures are "
                 f"{self._size[0]}x{self._size[1]}; give mattes of that size"
             )
-        return crop.apply(matte)
+        return crop.apply(matte if self._lens is None else self._lens.straighten(matte))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +76,14 @@ class GivenInputs:
     plate: UInt8[np.ndarray, "h w 3"] | None = None
     mattes: GivenMattes | None = None
     landmarks: Float[np.ndarray, "n l 2"] | None = None
-    """Positions in pixels of the source's pictures, a row for each frame of the source."""
+    """Positions in pixels of the source's pictures (straightened, if a lens is known), a row for each frame."""
 
 
 def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
-    """Read and check what the user gave besides the source, before anything that takes long."""
+    """Read and check what the user gave besides the source, before anything that takes long.
+
+    It belongs to the pictures as they were filmed, so it is straightened like them.
+    """
     if settings.clean_plate is None and settings.mattes is None and settings.landmarks is None:
         return GivenInputs()
     first = next(frames.frames())
@@ -92,12 +96,14 @@ def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
                 f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, but the video's "
                 f"pictures are {width}x{height}; give a picture from the same camera in the same mode"
             )
+        plate = plate if frames.lens is None else frames.lens.straighten(plate)
     if settings.mattes is not None:
         check_mattes(settings.mattes, frames)
         GivenMattes(settings.mattes, (width, height)).check(first.number)
-        mattes = GivenMattes(settings.mattes, (width, height))
+        mattes = GivenMattes(settings.mattes, (width, height), frames.lens)
     if settings.landmarks is not None:
         landmarks = read_landmarks(settings.landmarks, frames.count())
+        landmarks = landmarks if frames.lens is None else frames.lens.straighten_points(landmarks, width, height)
     return GivenInputs(plate, mattes, landmarks)
 
 

@@ -2,17 +2,14 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.crop import Crop, whole_picture
 from mien.errors import UserError
-from mien.rotation import invert_rigid
 
 _HEAD_RADIUS = 0.24
 """Radius in metres of the sphere about the middle of the face that a crop shows: head, hair and neck."""
@@ -26,19 +23,6 @@ _OUTLIERS = 1.0
 """Percent of the timesteps at either end that may leave the crop."""
 _SQUARISH, _MOSTLY_HEAD = 1.25, 0.7
 """As in `choose_crop`: pictures that are head crops already are kept whole."""
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-"""Change between OpenCV's axes of a camera (y down, z forward) and OpenGL's (y up, z backward)."""
-_MISTAKES: tuple[tuple[Callable[[Tensor], Tensor], str], ...] = (
-    (invert_rigid, "the matrices go from camera to world, so write the inverse of each viewmat"),
-    (lambda viewmat: _FLIP @ viewmat, "the axes are OpenGL's, so change the signs of rows 2 and 3 of each viewmat"),
-    (
-        lambda viewmat: _FLIP @ invert_rigid(viewmat),
-        "the matrices go from camera to world with OpenGL's axes, so change the signs of columns 2 and 3 of each, and "
-        "write its inverse as viewmat",
-    ),
-)
-"""Usual mistakes in all matrices of a calibration: how to undo each, and its remedy."""
-
 
 @dataclass(frozen=True, eq=False)
 class HeadPath:
@@ -55,7 +39,9 @@ class HeadPath:
         return np.isfinite(self.centres[:, 0])
 
 
-def find_head_path(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> HeadPath:
+def find_head_path(
+    boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera], advise: Callable[[], str] = str
+) -> HeadPath:
     """Find the head from its face boxes by consensus: the point that most cameras agree on, then least squares.
 
     A box that is no face (the back of a head, a picture on the wall) therefore does not move the point.
@@ -63,21 +49,24 @@ def find_head_path(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera])
     Args:
         boxes: left, top, right, bottom of the face in pixels of each camera's picture. NaN where there is no face.
         cameras: the cameras, for those pictures.
+        advise: called if the cameras do not fit. It returns what to correct in all of them, or an empty text.
 
     Raises:
         UserError: no two cameras agree at any timestep, or the calibration is not in metres.
     """
-    path = _consensus(boxes, cameras)
+    path = consensus(boxes, cameras)
     if not path.known.any():
-        raise UserError(f"--calibration: no two cameras ever see the face in the same place; {_remedy(boxes, cameras)}")
-    _check_unit(path, _sides(boxes), cameras)
+        remedy = advise() or "check first that each video or folder has the name of its own camera's id, then the offsets"
+        raise UserError(f"--calibration: no two cameras ever see the face in the same place; {remedy}")
+    _check_unit(path, _sides(boxes), cameras, advise)
     return path
 
 
-def _consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> HeadPath:
+def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> HeadPath:
+    """Return the path on which most cameras agree, which is unknown throughout if they never do."""
     centres, sides = (boxes[..., :2] + boxes[..., 2:]) / 2, _sides(boxes)
     origins = np.stack([camera.position.numpy() for camera in cameras]).astype(np.float64)
-    directions = _rays(centres, cameras)
+    directions = rays_of(centres, cameras)
     best, best_cost = np.full((len(boxes), 3), np.nan), np.full(len(boxes), np.inf)
     for first, second in itertools.combinations(range(len(cameras)), 2):
         points = _nearest_point(origins[[first, second]], directions[:, [first, second]])
@@ -95,20 +84,6 @@ def _consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> 
 
 def _sides(boxes: Float[np.ndarray, "t c 4"]) -> Float[np.ndarray, "t c"]:
     return np.sqrt(np.prod(boxes[..., 2:] - boxes[..., :2], axis=-1))
-
-
-def _remedy(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> str:
-    """The likeliest mistake in a calibration whose cameras do not agree, and what to do.
-
-    The usual mistakes in all matrices are undone in turn. If most faces then agree, that was the mistake.
-    """
-    found, best, remedy = np.isfinite(boxes[..., 0]).sum(), 0.5, ""
-    for as_meant, correction in _MISTAKES:
-        meant = [replace(camera, viewmat=as_meant(camera.viewmat.double()).float()) for camera in cameras]
-        agreeing = float(_consensus(boxes, meant).agrees.sum() / max(found, 1))
-        if agreeing > best:
-            best, remedy = agreeing, correction
-    return remedy or "check first that each video or folder has the name of its own camera's id, then the offsets"
 
 
 def choose_crops(
@@ -167,12 +142,12 @@ def disagreeing(path: HeadPath, boxes: Float[np.ndarray, "t c 4"], cameras: Sequ
         seen = found[:, index]
         if seen.sum() < 0.5 * path.known.sum() or path.agrees[seen, index].mean() >= 0.5:
             continue
-        distances = np.linalg.norm(_project(path.centres[seen], camera) - centres[seen, index], axis=-1)
+        distances = np.linalg.norm(project(path.centres[seen], camera) - centres[seen, index], axis=-1)
         result[index] = float(np.median(distances))  # NaN if the head is behind the camera
     return result
 
 
-def _rays(pixels: Float[np.ndarray, "t c 2"], cameras: Sequence[Camera]) -> Float[np.ndarray, "t c 3"]:
+def rays_of(pixels: Float[np.ndarray, "t c 2"], cameras: Sequence[Camera]) -> Float[np.ndarray, "t c 3"]:
     """Directions in world space, of unit length, through pixels of each camera."""
     homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=-1)
     rays = []
@@ -209,13 +184,13 @@ def _misses(
     cameras: Sequence[Camera],
 ) -> Float[np.ndarray, "t c"]:  # fmt: skip
     """Distance of the projected point from each found face, in sides of its box; infinite where there is none."""
-    projected = np.stack([_project(points, camera) for camera in cameras], axis=1)
+    projected = np.stack([project(points, camera) for camera in cameras], axis=1)
     with np.errstate(invalid="ignore"):
         misses = np.linalg.norm(projected - centres, axis=-1) / sides
     return np.where(np.isfinite(misses), misses, np.inf)
 
 
-def _project(points: Float[np.ndarray, "*n 3"], camera: Camera) -> Float[np.ndarray, "*n 2"]:
+def project(points: Float[np.ndarray, "*n 3"], camera: Camera) -> Float[np.ndarray, "*n 2"]:
     """Pixels of points in world space; NaN behind the camera."""
     inside = points @ camera.viewmat[:3, :3].numpy().T.astype(np.float64) + camera.viewmat[:3, 3].numpy()
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -228,14 +203,16 @@ def _span(path: HeadPath, camera: Camera) -> Float[np.ndarray, " 4"]:
     centres = path.centres[path.known]
     depth = (centres @ camera.viewmat[2, :3].numpy().astype(np.float64)) + float(camera.viewmat[2, 3])
     radius = _HEAD_RADIUS * np.array([[float(camera.K[0, 0]), float(camera.K[1, 1])]]) / depth[:, None]
-    middle = _project(centres, camera)
+    middle = project(centres, camera)
     if not np.isfinite(middle).all():
         raise UserError("--calibration: the head is behind a camera; check that matrices go from world to camera")
     least = np.percentile(middle - radius, _OUTLIERS, axis=0)
     return np.concatenate([least, np.percentile(middle + radius, 100 - _OUTLIERS, axis=0)])
 
 
-def _check_unit(path: HeadPath, sides: Float[np.ndarray, "t c"], cameras: Sequence[Camera]) -> None:
+def _check_unit(
+    path: HeadPath, sides: Float[np.ndarray, "t c"], cameras: Sequence[Camera], advise: Callable[[], str]
+) -> None:
     widths = []
     for index, camera in enumerate(cameras):
         chosen = path.agrees[:, index]
@@ -244,7 +221,8 @@ def _check_unit(path: HeadPath, sides: Float[np.ndarray, "t c"], cameras: Sequen
     width = float(np.median(np.concatenate(widths)))
     least, most = _FACE_WIDTHS
     if not least <= width <= most:
+        metres = f"give positions in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
         raise UserError(
             f"--calibration: according to these cameras the face is {width:.3g} m wide, but it should be about 0.15; "
-            f"give positions in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
+            + (advise() or metres)
         )

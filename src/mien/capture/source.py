@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.capture.fields import Deinterlace
+from mien.capture.lens import Lens
 from mien.capture.picture import decode_picture
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.errors import UserError
@@ -72,6 +73,8 @@ class FrameSource:
     """Which frames of a video are deinterlaced."""
     has_field_pictures: bool = False
     """Whether the pictures are single fields of interlaced video, of half the height (HEVC)."""
+    lens: Lens | None = None
+    """Lens whose distortion is taken out of the turned pictures. None for pictures as they are."""
 
     def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
         """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0.
@@ -98,7 +101,8 @@ class FrameSource:
                 continue
             first = seconds if taken == 0 else first
             turned = partial(_turned, picture, self.quarter_turns) if self.quarter_turns else picture
-            yield SourceFrame(number, seconds - first, turned, is_deinterlaced, combs)
+            straight = partial(_straight, turned, self.lens) if self.lens else turned
+            yield SourceFrame(number, seconds - first, straight, is_deinterlaced, combs)
             taken += 1
             if taken == self.selection.max_frames:
                 break
@@ -161,6 +165,10 @@ def open_source(
 
 def _turned(picture: Callable[[], np.ndarray], quarter_turns: int) -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(np.rot90(picture(), -quarter_turns))
+
+
+def _straight(picture: Callable[[], np.ndarray], lens: Lens) -> UInt8[np.ndarray, "h w 3"]:
+    return lens.straighten(picture())
 
 
 def list_images(folder: Path) -> list[Path]:

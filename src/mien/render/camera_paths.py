@@ -1,6 +1,7 @@
 """Camera paths around a head, and camera paths in files."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,16 @@ from mien.storage import read_json, write_json
 
 FORMAT, VERSION = "mien.cameras", 1
 _WORLD_UP = (0.0, 1.0, 0.0)
+_DISTORTION = re.compile(
+    r"dist(?!ance)|fisheye|radial|tangential|coef|^([kp][1-6]|s[1-4]|tau[xy12]|d|kc|xi|rd)$", re.IGNORECASE
+)
+"""Names under which programs write the distortion of a lens."""
+_MODEL = re.compile(r"model|projection|type|lens", re.IGNORECASE)
+_OTHER_MODELS = re.compile(
+    r"fish|equidist|kannala|omni|^mei$|ucm|double.?sphere|^fov$|division|f.?theta|radial|scheimpflug|equirect|spherical",
+    re.IGNORECASE,
+)
+"""Models of lenses that are neither an ideal lens nor OpenCV's usual model."""
 
 
 def turntable(
@@ -90,6 +101,12 @@ def read_cameras(path: Path) -> list[Camera]:
         UserError: the file is missing or damaged, or a camera is incomplete, not finite, or not a rigid view.
     """
     entries = read_camera_entries(path, "give one camera for every frame")
+    for index, entry in enumerate(entries):
+        names = names_of_distortion(entry)
+        if names:
+            raise UserError(
+                f"{path}: camera {index}: has {names[0]}, but pictures are drawn as by an ideal lens; leave it out"
+            )
     return [camera_of_entry(entry, f"{path}: camera {index}") for index, entry in enumerate(entries)]
 
 
@@ -102,13 +119,37 @@ def read_camera_entries(path: Path, remedy: str) -> list[Any]:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a json file of cameras (docs/using.md)")
     try:
-        listed = read_json(path, FORMAT, VERSION).get("cameras")
+        content = read_json(path, FORMAT, VERSION)
     except UserError as error:
         # The user wrote this file, so there is no stage to run again.
         raise UserError(f"{str(error).split('; ')[0]}; write it as described in docs/using.md") from None
+    names, listed = names_of_distortion(content), content.get("cameras")
+    if names:
+        raise UserError(f"{path}: has {names[0]} for all cameras together; write it into the entry of each camera")
     if not isinstance(listed, list) or not listed:
         raise UserError(f"{path}: has no list `cameras`; {remedy}")
     return listed
+
+
+def names_of_distortion(entry: Any) -> list[str]:
+    """Return the names in a camera's entry under which the distortion of a lens is described, unless it has none."""
+    if not isinstance(entry, dict):
+        return []
+    return [
+        name
+        for name, value in entry.items()
+        if (_DISTORTION.search(re.sub(r"[^A-Za-z0-9]", "", name)) and not _is_nothing(value))
+        or (_MODEL.search(name) and isinstance(value, str) and _OTHER_MODELS.search(value))
+    ]
+
+
+def _is_nothing(value: Any) -> bool:
+    """Whether a value says that a lens does not distort: zeros, nothing, or the name of the usual model."""
+    if isinstance(value, str):
+        return not _OTHER_MODELS.search(value)
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_nothing, value))
+    return all(map(_is_nothing, value.values())) if isinstance(value, dict) else not value
 
 
 def camera_of_entry(entry: Any, where: str) -> Camera:
