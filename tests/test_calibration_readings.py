@@ -160,5 +160,7 @@ def test_the_advice_is_part_of_the_refusal(marks: Tensor) -> None:
     pixels = seen_by(RIGS["ring"], marks)
     boxes = np.concatenate([pixels.min(axis=2), pixels.max(axis=2)], axis=-1)
     calibrated = [CalibratedCamera(str(index), camera) for index, camera in enumerate(given)]
-    with pytest.raises(UserError, match="no two cameras ever .*; the matrices go from camera to world, .* agree within"):
+    with pytest.raises(
+        UserError, match="no two cameras ever .*; the matrices go from camera to world, .* agree within"
+    ):
         find_head_path(boxes, given, lambda: advise_on(calibrated, lambda _, camera: camera.camera, pixels))

@@ -11,7 +11,7 @@ import torch
 from mien.camera import Camera
 from mien.capture.calibration import read_calibration
 from mien.capture.crop import whole_picture
-from mien.capture.given import GivenMattes, read_given
+from mien.capture.given import read_given
 from mien.capture.lens import Lens
 from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, open_source
@@ -85,11 +85,11 @@ def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -
     assert abs(found_dots(next(source.frames()).picture()[..., 0]) - DOTS).max() > 4
     source = type(source)(**{**vars(source), "lens": lens})
     assert abs(found_dots(next(source.frames()).picture()[..., 1]) - DOTS).max() < 0.05
-    settings = CaptureSettings(
-        clean_plate=tmp_path / "plate.png", mattes=mattes, landmarks=tmp_path / "marks.csv"
-    )  # fmt: skip
+    settings = CaptureSettings(clean_plate=tmp_path / "plate.png", mattes=mattes, landmarks=tmp_path / "marks.csv")
     given = read_given(settings, source)
-    assert given.plate is not None and given.mattes is not None and given.landmarks is not None
+    assert given.plate is not None
+    assert given.mattes is not None
+    assert given.landmarks is not None
     assert abs(found_dots(given.plate[..., 2]) - DOTS).max() < 0.05
     assert abs(found_dots(given.mattes.matte(0, whole_picture(WIDTH, HEIGHT, WIDTH))) - DOTS).max() < 0.05
     assert abs(given.landmarks[0, : len(DOTS)] - DOTS).max() < 0.01

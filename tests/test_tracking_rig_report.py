@@ -1,6 +1,7 @@
 """The report and the overlay of a calibrated rig: cameras at the side are no failures, and a wrong matrix is named."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import torch
 from mien.camera import Camera, look_at
 from mien.capture import Capture
 from mien.face import FaceModel
+from mien.rotation import invert_rigid
 from mien.tracking import Tracking, TrackingSettings, residual_report, track, write_residual_report
 from mien.tracking.report import overlay
 from mien.tracking.report.overlay import OverlayPainter
@@ -90,3 +92,43 @@ def test_a_camera_with_a_wrong_matrix_is_named(rig: Capture, model: FaceModel, t
     assert told.count("Warning: camera") == 1
     assert f"Warning: camera {NAMES[wrong]} shows the face" in told
     assert "check its K, viewmat, id and offset" in (tmp_path / "report.html").read_text()
+
+
+def with_cameras(rig: Capture, change: Callable[[Camera], Camera]) -> Capture:
+    assert rig.calibration is not None
+    return replace(rig, calibration=tuple(map(change, rig.calibration)))
+
+
+def test_cameras_that_misfit_together_are_warned_of(
+    rig: Capture, model: FaceModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No camera and no frame stands out if all have a wrong focal length."""
+    monkeypatch.setattr("mien.capture.reading_fit._INSIDE_OUT", -math.inf)  # The small model has no nose.
+    longer = torch.tensor([[1.6], [1.6], [1.0]])
+
+    def lengthened(camera: Camera) -> Camera:
+        return replace(camera, K=torch.cat([camera.K[:, :2] * longer, camera.K[:, 2:]], 1))
+
+    capture = with_cameras(rig, lengthened)
+    told = write_residual_report(tmp_path, capture, tracked(capture, model), model)
+    assert "Warning: all cameras together see landmarks" in told
+    assert "check that K is in pixels of the whole picture" in told
+    assert "No frame stands out." not in told
+    assert "the calibration as a whole does not fit" in (tmp_path / "report.html").read_text()
+
+
+def test_a_calibration_that_fits_another_reading_is_warned_of_with_that_reading(
+    rig: Capture, model: FaceModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mien.capture.reading_fit._INSIDE_OUT", -math.inf)  # The small model has no nose.
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    world = invert_rigid(camera_at(YAWS[0]).viewmat) @ flip
+    capture = with_cameras(rig, lambda camera: replace(camera, viewmat=invert_rigid(camera.viewmat @ world)))
+    told = write_residual_report(tmp_path, capture, tracked(capture, model), model)
+    assert "Warning: all cameras together see landmarks" in told
+    assert "the matrices go from camera to world, so write the inverse of each viewmat" in told
+
+
+def test_a_rig_that_fits_is_not_warned_of(rig: Capture, model: FaceModel) -> None:
+    report = residual_report(rig, tracked(rig, model), model)
+    assert report["shared_misfit"] is None

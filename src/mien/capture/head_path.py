@@ -24,6 +24,7 @@ _OUTLIERS = 1.0
 _SQUARISH, _MOSTLY_HEAD = 1.25, 0.7
 """As in `choose_crop`: pictures that are head crops already are kept whole."""
 
+
 @dataclass(frozen=True, eq=False)
 class HeadPath:
     """The middle of the face at each timestep, and the cameras that agree on it."""
@@ -56,7 +57,8 @@ def find_head_path(
     """
     path = consensus(boxes, cameras)
     if not path.known.any():
-        remedy = advise() or "check first that each video or folder has the name of its own camera's id, then the offsets"
+        names = "check first that each video or folder has the name of its own camera's id, then the offsets"
+        remedy = advise() or names
         raise UserError(f"--calibration: no two cameras ever see the face in the same place; {remedy}")
     _check_unit(path, _sides(boxes), cameras, advise)
     return path

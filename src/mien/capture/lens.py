@@ -57,7 +57,7 @@ class Lens:
         return bool((across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0] <= 0).any())
 
     def matrix(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
-        """Return K for a picture of that size, in OpenCV's pixels: the centre of the first one is at 0, not at one half."""
+        """Return K for a picture of that size in OpenCV's pixels, where the first one's centre is at 0, not at 0.5."""
         K = self.camera.resized(width, height).K.numpy().astype(np.float64)
         K[:2, 2] -= 0.5
         return K
@@ -112,6 +112,4 @@ def _checked(lens: Lens, where: str) -> Lens:
 @lru_cache(maxsize=2)
 def _maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     K = lens.matrix(width, height)
-    return cv2.initUndistortRectifyMap(
-        K, np.array(lens.coefficients), np.eye(3), K, (width, height), cv2.CV_16SC2
-    )
+    return cv2.initUndistortRectifyMap(K, np.array(lens.coefficients), np.eye(3), K, (width, height), cv2.CV_16SC2)

@@ -63,7 +63,7 @@ def written_of(ranked: Sequence[Ranked]) -> Ranked:
 
 
 def ties_of(ranked: Sequence[Ranked]) -> list[Ranked]:
-    """Return the best reading and those that fit about as well as it, without corrections that change hardly anything."""
+    """Return the best reading and those that fit about as well, without corrections that change hardly anything."""
     best = ranked[0]
     limit = max(_TIE_FACTOR * best.share, best.share + _TIE_SHARE)
     tied = [entry for entry in ranked if np.isfinite(entry.share) and entry.share <= limit]

@@ -15,7 +15,7 @@ from mien.rotation import invert_rigid
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 """Change between OpenCV's axes of a camera (y down, z forward) and OpenGL's (y up, z backward)."""
 _MAX_NORMALISED = 20.0
-"""Focal length below which intrinsics cannot be in pixels. It is that of a picture one degree wide in picture widths."""
+"""Largest number of K below which it cannot be in pixels. In picture widths, it is three degrees of view."""
 _OTHER_SIZE = 0.15
 """Relative distance of a principal point from the middle at which intrinsics may be for another size of pictures."""
 _OFF = 0.05
@@ -120,7 +120,7 @@ def _from_below(change: _Change) -> _Change:
 
 
 def _other_sizes(cameras: Sequence[Camera]) -> list[float]:
-    """Return factors by which K may be too small, usual ones first, if principal points miss the middles of pictures."""
+    """Return factors by which K may be too small, usual ones first, if principal points are far from the middle."""
     across = float(np.median([camera.width / (2 * max(float(camera.K[0, 2]), 1e-6)) for camera in cameras]))
     down = float(np.median([camera.height / (2 * max(float(camera.K[1, 2]), 1e-6)) for camera in cameras]))
     if abs(np.log(across)) < _OTHER_SIZE:

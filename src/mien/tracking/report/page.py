@@ -29,6 +29,10 @@ _FOCAL_FROM = {
     "given": "as given",
     "assumed": "assumed, because faces hardly determine it (head turns are more exact if --tracking.focal gives it)",
 }
+_CHECK_ALL = (
+    "check that K is in pixels of the whole picture, that viewmat goes from world to camera with OpenCV axes and "
+    "metres, the distortion of the lenses, and the offsets"
+)
 _BY_PIXELS = "The face was fitted to landmarks, then to pixels (schedule `{}`), which correct the detector's errors."
 _WAYS = {
     "landmarks": "The face was fitted to landmarks alone (schedule `landmarks`). Pixels were not used.",
@@ -100,10 +104,18 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
             found.append(("odd", f"Warning: camera {name} shows the face {row['misplaced_px']:.0f} px from where the "
                                  f"tracked head is (the other cameras: {row['others_misplaced_px']:.1f} px); check its "
                                  "K, viewmat, id and offset in the calibration."))  # fmt: skip
+    misfit = report["shared_misfit"]
+    if misfit is not None:
+        found.append(("odd", f"Warning: all cameras together see landmarks {misfit['residual_px']:.1f} px "
+                             f"({100 * misfit['residual_share']:.1f} % of the face) from the tracked head, so the "
+                             "calibration as a whole does not fit; "
+                             f"{misfit['advice'] or _CHECK_ALL}; then capture and track again."))  # fmt: skip
     if report["flagged_frames"]:
         flagged = report["flagged_frames"]
         stand_out = "1 frame stands" if len(flagged) == 1 else f"{len(flagged)} frames stand"
         found.append(("odd", f"{stand_out} out and should be checked: {name_runs(flagged)}."))
+    elif misfit is not None:
+        found.append(("odd", "No frame stands out from the others, because all of them fit badly."))
     else:
         found.append(("", "No frame stands out."))
     if report["frames_without_face"]:

@@ -16,7 +16,13 @@ from mien.tracking.landmarks import BROWS, LEFT_EYELIDS, LEFT_IRIS, LIPS, NOSE, 
 from mien.tracking.report.contact_sheet import worst_of_runs
 from mien.tracking.report.overlay import frontal_camera
 from mien.tracking.report.page import findings, write_report_page
-from mien.tracking.report.rig import cameras_that_do_not_fit, front_residuals, misplacements, seen_from_front
+from mien.tracking.report.rig import (
+    cameras_that_do_not_fit,
+    front_residuals,
+    misplacements,
+    seen_from_front,
+    shared_misfit,
+)
 from mien.tracking.tracking import Tracking
 
 if TYPE_CHECKING:
@@ -46,7 +52,7 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
     constant. With several cameras, jitter, irises, depth, pitch and yaw are those of the most frontal camera. Residuals
     and distances are those of pictures from the front, since landmarks of a face from the side are partly guessed.
     `cameras` has the residuals of each camera in all its pictures, how many of them are `from_front`, and
-    `misplaced_px` (`misplacements`).
+    `misplaced_px` (`misplacements`). `shared_misfit` says how badly all cameras together fit, or is None.
     """
     valid, frontal = tracking.valid, frontal_camera(tracking)
     marks = _landmarks(face_model, tracking)
@@ -66,6 +72,7 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
         "residual_px": _summary(front_residuals(tracking)),
         "residual_colors": None if tracking.pixel_residuals is None else _summary(tracking.pixel_residuals),
         "cameras": _of_cameras(capture, tracking, face_model),
+        "shared_misfit": shared_misfit(capture, tracking),
         "frontal_camera": capture.camera_ids[frontal],
         "mesh_distance_px": {name: float(distance[:, list(group)].median()) for name, group in _GROUPS.items()},
         "jitter": {

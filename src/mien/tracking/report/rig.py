@@ -7,6 +7,8 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
+from mien.capture.reading_fit import advice_of, is_wrong, rank_readings
+from mien.capture.readings import readings_of
 from mien.face import FaceModel
 from mien.render.mesh import vertex_normals
 from mien.rotation import matrix_from_axis_angle
@@ -18,6 +20,9 @@ degrees. The detector guesses the far half of such a face."""
 _FACTOR, _SHARE = 3.0, 0.01
 """A camera does not fit if it misplaces the face this many times as far as the others do, and in addition by this part
 of its picture's longer side."""
+_MISFIT, _SUSPECT = 0.02, 0.01
+"""Median distance of landmarks, as a share of the face's side, from which a calibration as a whole does not fit, and
+from which it does not if another reading of it fits far better."""
 _CHUNK = 32
 
 
@@ -78,3 +83,24 @@ def cameras_that_do_not_fit(misplaced: Float[Tensor, " c"], longer_side: int) ->
         if distance > _FACTOR * usual + _SHARE * longer_side:
             found.append((index, usual))
     return found
+
+
+def shared_misfit(capture: Capture, tracking: Tracking) -> dict[str, float | str] | None:
+    """Return how badly all cameras together fit the tracked head, and advice; None if they fit.
+
+    No camera stands out if the calibration of all of them is misread. Their residuals are then far above the noise of
+    the detector, which is 0.5 to 1 % of the face's side.
+    """
+    if capture.calibration is None or len(capture.calibration) == 1:
+        return None
+    residuals = front_residuals(tracking)
+    spans = np.ptp(np.asarray(capture.landmarks, np.float64), axis=2)
+    sides = torch.from_numpy(np.sqrt(spans.prod(axis=-1))).to(residuals)
+    share = float((residuals / sides).nanmedian())
+    if not share > _SUSPECT:
+        return None
+    ranked = rank_readings(capture.landmarks, readings_of(capture.calibration, in_source=False))
+    if not (share > _MISFIT or is_wrong(ranked)):
+        return None
+    advice = advice_of(ranked) if is_wrong(ranked) else ""
+    return {"residual_px": float(residuals.nanmedian()), "residual_share": share, "advice": advice}
