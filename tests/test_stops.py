@@ -1,5 +1,6 @@
 """SIGTERM and Ctrl-C stop work in an orderly way: once, at a moment that suits, and even if a library drops them."""
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import time
 
 import pytest
 
+from mien import stops
 from mien.stops import EXIT_TERMINATED, Put, Terminated, orderly_stops, stops_put_off
 
 KINDS = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
@@ -49,6 +51,38 @@ def test_a_stop_that_is_dropped_comes_again(number: signal.Signals, kind: type[B
     with pytest.raises(kind), orderly_stops():
         work()
     assert sys.unraisablehook is hook
+
+
+@pytest.mark.parametrize(("number", "kind"), KINDS)
+def test_an_error_that_a_library_makes_of_a_stop_is_the_stop(number: signal.Signals, kind: type[BaseException]) -> None:
+    """Found by killing `mien capture` while it imported: ImportError: initialization failed."""
+
+    def work() -> None:
+        try:
+            signal.raise_signal(number)
+        except BaseException:  # noqa: BLE001
+            raise ImportError("initialization failed") from None
+
+    with pytest.raises(kind), orderly_stops():
+        work()
+
+
+def test_a_later_signal_counts_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A library may swallow a stop. A user who stops once more is heard."""
+    monkeypatch.setattr(stops, "_DEAF_SECONDS", -1.0)
+
+    def work() -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Terminated), orderly_stops():
+        work()
+
+
+def test_errors_without_a_stop_stay_as_they_are() -> None:
+    with pytest.raises(ZeroDivisionError), orderly_stops():
+        raise ZeroDivisionError
 
 
 def test_other_errors_in_callbacks_are_reported_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -19,8 +20,10 @@ class Terminated(SystemExit):
 
 
 _KINDS: dict[int, type[BaseException]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
-_PATIENCE_SECONDS = 0.05
-"""Time after which a stop that a library has dropped is repeated, in seconds."""
+_REPEAT_SECONDS = 0.05
+"""Time after which a stop that a library has dropped is repeated."""
+_DEAF_SECONDS = 10.0
+"""Time after a stop in which signals are ignored. Later ones count, since a library may have swallowed the first."""
 
 
 class Put:
@@ -52,8 +55,9 @@ class Put:
 def orderly_stops() -> Iterator[None]:
     """Let SIGTERM and Ctrl-C raise `Terminated` and KeyboardInterrupt, so that unfinished files are removed.
 
-    Signals after the first are ignored, since they would interrupt the removal and the wait for threads in native code.
-    If the exception is raised where Python can only report it (in a callback of a library), the stop is repeated.
+    Signals soon after the first are ignored, since they would interrupt the removal and the wait for threads in native
+    code. If the exception is raised where Python can only report it (in a callback of a library), the stop is repeated.
+    If a library turns it into an error of its own (while it is imported, for example), that error becomes the stop.
     """
     if threading.current_thread() is not threading.main_thread():  # signal handlers work only there
         yield
@@ -63,29 +67,33 @@ def orderly_stops() -> Iterator[None]:
     heard = [number for number in _KINDS if number == signal.SIGTERM or before[number] == signal.default_int_handler]
     hook = sys.unraisablehook
 
-    def listen() -> None:
-        for number in heard:
-            signal.signal(number, stop)
+    asked: list[tuple[int, float]] = []
 
     def stop(number: int, frame: object) -> None:
-        for each in heard:
-            signal.signal(each, signal.SIG_IGN)
-        raise _KINDS[number]
+        now = time.monotonic()
+        if not asked or now - asked[-1][1] > _DEAF_SECONDS:
+            asked.append((number, now))
+            raise _KINDS[number]
 
     def repeat(dropped: "sys.UnraisableHookArgs") -> None:
         number = next((number for number, kind in _KINDS.items() if issubclass(dropped.exc_type, kind)), None)
         if number is None:
             hook(dropped)
             return
-        listen()
-        again = threading.Timer(_PATIENCE_SECONDS, signal.pthread_kill, [threading.get_ident(), number])
+        asked.clear()
+        again = threading.Timer(_REPEAT_SECONDS, signal.pthread_kill, [threading.get_ident(), number])
         again.daemon = True
         again.start()
 
-    listen()
+    for number in heard:
+        signal.signal(number, stop)
     sys.unraisablehook = repeat
     try:
         yield
+    except Exception as error:
+        if asked:
+            raise _KINDS[asked[-1][0]] from error
+        raise
     finally:
         sys.unraisablehook = hook
         for number in heard:
