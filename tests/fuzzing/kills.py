@@ -134,6 +134,9 @@ class Place:
             os.kill(command.pid, number or signal.SIGKILL)
         in_time = command.ended(_TO_END)
         if not in_time:
+            with contextlib.suppress(OSError), self.told.open("a") as told:
+                state = Path(f"/proc/{command.pid}/status").read_text().splitlines()[2]
+                told.write(f"hangs: {state}, {Path(f'/proc/{command.pid}/stat').read_text().split()[13:15]} ticks\n")
             with contextlib.suppress(ProcessLookupError):
                 os.kill(command.pid, signal.SIGKILL)
         code = command.code()
