@@ -11,6 +11,7 @@ import torch
 
 from mien import runtime
 from mien.driving import drive, face_of_motion, read_blendshape_json, read_live_link_face
+from mien.driving.motion import MAX_MOMENTS
 from mien.driving.sides import PAIRS
 from mien.export import write_page
 from mien.face import FaceParams, load_face_model
@@ -136,6 +137,18 @@ def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> No
         for name in ("expression", "head_rotation"):
             expected = getattr(face, name).numpy().reshape(-1)
             np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
+
+
+def test_a_page_takes_as_long_a_csv_as_python(built: Path, tmp_path: Path) -> None:
+    """A list of 500,000 rows is not spread into the arguments of a call, of which engines take some 100,000."""
+    rows = [
+        f"{at // 108000}:{at // 1800 % 60:02d}:{at // 30 % 60:02d}:{at % 30:02d},61,{at % 10 / 10}"
+        for at in range(MAX_MOMENTS)
+    ]
+    (tmp_path / "long.csv").write_text("\n".join(["Timecode,BlendshapeCount,JawOpen", *rows]))
+    found = read_by_node(built, tmp_path, tmp_path / "long.csv")
+    assert "error" not in found
+    assert (found["moments"], found["fps"]) == (MAX_MOMENTS, pytest.approx(30))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 // Reads a recording for an avatar as a page does, for tests/test_web_motion.py:
-//   node motion.mjs MIEN.JS MOTION.JS AVATAR.mien RECORDING OUT   writes fps, the arrays of the motion and the notes as json
+//   node motion.mjs MIEN.JS MOTION.JS AVATAR.mien RECORDING OUT   writes fps, the number of moments, the beginning of the
+// motion's arrays and the notes as json
 import { readFileSync, writeFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 
@@ -11,7 +12,8 @@ const avatar = readMien(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + 
 let told;
 try {
   const notes = [], motion = readSeries(readFileSync(recording, "utf8"), avatar, notes);
-  told = Object.fromEntries(Object.entries(motion).map(([name, values]) => [name, typeof values === "number" ? values : Array.from(values)]));
+  told = Object.fromEntries(Object.entries(motion).map(([name, values]) => [name, typeof values === "number" ? values : Array.from(values.subarray(0, 100_000))]));
+  told.moments = motion.head_rotation.length / 3;
   told.notes = notes;
 } catch (error) {
   told = { error: error.message };
