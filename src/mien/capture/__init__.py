@@ -9,7 +9,8 @@
 3. `parts` splits the video at cuts, and chooses for each part the person to follow (`people`) and one crop (`crop`).
 4. `process` is the second pass: it crops each frame, finds the person's landmarks, makes the matte (`matte`, `plate`),
    measures blur and light (`quality`), and writes the pictures (`frame_files`).
-5. `outcome` writes the results of all frames beside the pictures and moves the folder to its place.
+5. `outcome` writes the results of all frames beside the pictures and moves the folder to its place. `pace` measures the
+   frame rate and finds pauses.
 
 `from_cameras` runs the same steps for the videos of a rig: `calibration` reads its cameras, and `head_path` finds the
 head in their world and chooses the crops.

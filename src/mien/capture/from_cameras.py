@@ -28,7 +28,7 @@ from mien.capture.from_video import (
 )
 from mien.capture.given import read_given
 from mien.capture.head_path import HeadPath, choose_crops, disagreeing, find_head_path
-from mien.capture.outcome import frame_rate
+from mien.capture.pace import frame_rate, tell_pauses
 from mien.capture.parts import Part
 from mien.capture.people import Person, choose_person
 from mien.capture.process import Chunk, Reel, process_part
@@ -320,6 +320,7 @@ def _finish(
         "frames_without_face": int((~data.valid.any(axis=1)).sum()),
         "faces_by_camera": dict(zip(layout.camera_ids, found.tolist(), strict=True)),
         "kind_by_camera": {view.camera_id: kind_report(view.job.frames, view.survey) for view in views},
+        **tell_pauses(whole.name, timestamps),
         **quality_report(whole.name, quality, skin_colours(_joined_arrays(chunks, "quality").reshape(-1, MEASURES))),
     }
     digests = {FRAMES: _joined_arrays(chunks, "frame_digests"), MATTES: _joined_arrays(chunks, "matte_digests")}

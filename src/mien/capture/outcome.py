@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from mien.capture.faces import second_difference_jitter
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
+from mien.capture.pace import frame_rate, pace_report
 from mien.capture.parts import Part
 from mien.capture.process import Chunk
 from mien.capture.quality import quality_report, relative_quality, skin_colours
@@ -20,9 +19,6 @@ from mien.inside import remove_tree
 from mien.progress import say
 
 CAMERA_ID = "0"
-_RATE_TOLERANCE = 0.01
-_MAX_INTERVAL_RATIO = 1.5
-"""Ratio of the longest to the median time between frames from which a clip's rate is called variable."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,7 @@ def finish_part(
         "frames_with_several_faces": int(part.person.crowded.sum()),
         "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
         **kind_report(origin.frames, survey),
-        **_pace(part.name, timestamps),
+        **pace_report(part.name, timestamps),
     }
     if not valid.all():
         say(f"{part.name}: no face in {report['frames_without_face']} of {len(valid)} frames; they are left out")
@@ -93,26 +89,3 @@ def finish_part(
         path = layout.folder / name
         remove_tree(path)
     finish_capture(layout, out, data, digests, report)
-
-
-def _pace(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
-    """Return the time between frames for the report, and tell the user if it varies."""
-    if len(timestamps) < 3:
-        return {"frame_interval_ms": None, "variable_frame_rate": False}
-    intervals = 1000 * np.diff(timestamps)
-    least, usual, most = (round(float(value), 2) for value in (intervals.min(), np.median(intervals), intervals.max()))
-    is_variable = most > _MAX_INTERVAL_RATIO * usual or least * _MAX_INTERVAL_RATIO < usual
-    if is_variable:
-        say(f"{name}: frames {least:g} to {most:g} ms apart (variable rate); all are kept, each with its own time")
-    return {
-        "frame_interval_ms": {"least": least, "median": usual, "most": most},
-        "variable_frame_rate": is_variable,
-    }
-
-
-def frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
-    """Return the file's nominal rate, unless its timestamps differ from it (variable rate, dropped frames)."""
-    if len(timestamps) < 2:
-        return nominal
-    measured = float((len(timestamps) - 1) / timestamps[-1])
-    return nominal if abs(measured - nominal) <= _RATE_TOLERANCE * nominal else measured

@@ -1,6 +1,7 @@
 """Drivers: the motion of a face, with the same face at rest, from tracked sequences or from recordings."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +13,13 @@ from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.live_link_face import read_live_link_face
 from mien.driving.speech import read_speech
+from mien.driving.timing import at_moments, even_moments, rate_of
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.params import concatenate
 from mien.progress import say
-from mien.training import read_sequence
+from mien.training import Sequence, read_sequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +61,14 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
     return Driver(face, at_rest, motion.fps, None, path if is_voice else None)
 
 
-def read_tracked_driver(folders: Sequence[Path]) -> Driver:
+def read_tracked_driver(folders: Items[Path]) -> Driver:
     """Read a driver from the folders of tracked sequences of one person, one sequence after the other.
 
+    Frames of a variable rate are resampled by their times (`mien.driving.timing`).
+
     Raises:
-        UserError: no frame was tracked, the sequences were tracked with several face models, or a file is damaged.
+        UserError: no frame was tracked, the sequences were tracked with several face models, a file is damaged, or a
+            pause in a video is too long.
     """
     sequences = [read_sequence(folder) for folder in folders]
     shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}
@@ -72,12 +77,20 @@ def read_tracked_driver(folders: Sequence[Path]) -> Driver:
         raise UserError(f"{names}: were tracked with different face models; track them again")
     if not any(bool(one.tracking.valid.any()) for one in sequences):
         raise UserError(f"{names}: no frame was tracked; track again, or choose another driver")
-    face = concatenate([one.tracking.face for one in sequences])
     at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
-    places = [(one, timestep) for one in sequences for timestep in range(one.capture.timesteps)]
+    fps = rate_of(max(sequences, key=lambda one: one.capture.timesteps).capture)
+    faces: list[FaceParams] = []
+    places: list[tuple[Sequence, int]] = []
+    for one in sequences:
+        moments = even_moments(one.capture, fps)
+        shown = range(one.capture.timesteps) if moments is None else moments.nearest().tolist()
+        faces.append(one.tracking.face if moments is None else at_moments(one.tracking.face, moments))
+        places += [(one, timestep) for timestep in shown]
+        if moments is not None:
+            say(f"{one.name}: its frames have times of their own; they become {len(shown)} at {fps:.4g} a second")
 
     def picture(index: int) -> UInt8[np.ndarray, "h w 3"]:
         sequence, timestep = places[index]
         return np.asarray(sequence.capture.images[timestep, 0])
 
-    return Driver(face, at_rest, sequences[0].capture.fps, picture)
+    return Driver(concatenate(faces), at_rest, fps, picture)
