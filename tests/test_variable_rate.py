@@ -1,4 +1,4 @@
-"""Frames keep their times: the rate of a clip is that of its usual frames, and drivers move at the times of the video."""
+"""Frames keep their times: a clip has the rate of its usual frames, and drivers move at the times of their video."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_the_rate_of_a_steady_clip_is_as_before() -> None:
 
 
 def filmed_at(folder: Path, times: np.ndarray, fps: float) -> Driver:
-    """Return a driver whose head turns by a hundredth of a radian a second, and whose frames have their number as grey."""
+    """Return a driver whose head turns by 0.01 radians a second, and whose frames have their number as grey."""
     _, sequence = toy_sequence(len(times), 32)
     turned = torch.zeros(len(times), 3)
     turned[:, 1] = 0.01 * torch.from_numpy(times).float()

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.capture.camera_names import CameraFormat, camera_named, is_camera
-from mien.commands.options import check_avatar, check_driver, check_port, check_viewer, has_viewer
+from mien.commands.options import check_avatar, check_driver, check_neutral, check_port, check_viewer, has_viewer
 from mien.commands.picture import PictureOptions
 from mien.errors import UserError
 from mien.workspace import open_workspace
@@ -40,6 +40,10 @@ class Command:
     fps: float | None = None
     """Frame rate of the timecode in a .csv, in frames per second (default: the smallest usual rate above its frame
     numbers)."""
+    neutral: str | None = None
+    """The driver's face at rest, from which its motion is measured: first (its first half second), calm (its calmest
+    tenth), model (the face model's own neutral), or a video, recording, workspace or sequence folder of the driver at
+    rest. By default, it is the calmest tenth, without what is far from the face model's neutral, such as a grin."""
     camera_format: CameraFormat | None = None
     """What reads the camera: v4l2 (Linux), avfoundation (macOS) or dshow (Windows). The default is the platform's."""
     port: int = 0
@@ -59,10 +63,11 @@ class Command:
         # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
         check_driver(Path(self.by), self.sequence, self.fps)
+        check_neutral(self.neutral)
 
     def _check_camera(self) -> None:
         check_avatar(self.workspace, self.run_name)
-        for name, given in (("--sequence", self.sequence), ("--fps", self.fps)):
+        for name, given in (("--sequence", self.sequence), ("--fps", self.fps), ("--neutral", self.neutral)):
             if given is not None:
                 raise UserError(f"{name} {given}: is for recordings, and --by is a camera; leave it out")
         camera_named(self.by, self.camera_format)
@@ -84,7 +89,7 @@ class Command:
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         warn_of_white(self.picture, run_dir)
-        options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps, self.unlimited)
+        options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps, self.unlimited, self.neutral)
         run_driving_stage(run_dir, Path(self.by), self.out, options, self.picture)
 
     def _follow(self) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mien.commands.options import check_driver
+from mien.commands.options import check_driver, check_neutral
 from mien.errors import UserError
 from mien.export.usd_package import USD_ENDINGS, check_usd
 from mien.workspace import Workspace, open_workspace
@@ -48,6 +48,9 @@ class Command:
     series: str | None = None
     """A motion: the name of a sequence of the workspace, or anything that `mien drive --by` takes. A page plays it. For
     .ply, .spz and .sog, every frame becomes a file, and for USD a time sample; the head stays at the origin."""
+    neutral: str | None = None
+    """With --series, the driver's face at rest, as for `mien drive`: first, calm, model, or a video, recording,
+    workspace or sequence folder of the driver at rest."""
     every: int = 1
     """With --series, take only every n-th frame."""
     webgpu: bool = False
@@ -86,6 +89,9 @@ class Command:
             raise UserError(f"{self.out}: a page sets every expression itself; leave --set out")
         if self.every < 1 or (self.every > 1 and self.series is None):
             raise UserError(f"--every {self.every}: give 1 or more, together with --series")
+        if self.neutral is not None and self.series is None:
+            raise UserError(f"--neutral {self.neutral}: is for motions; give it together with --series")
+        check_neutral(self.neutral)
         if self.series is not None and self.series not in workspace.sequence_names():
             check_driver(Path(self.series), None)
         numbered = self.series is not None and kind in _POSES and kind not in USD_ENDINGS
@@ -144,10 +150,10 @@ class Command:
 
         if not self.workspace.is_file():
             raise UserError(f"{self.workspace}: no such file; give a workspace, or a file that `mien export` wrote")
-        if self.run_name or self.set or self.series or self.every != 1:
+        if self.run_name or self.set or self.series or self.neutral or self.every != 1:
             raise UserError(
-                f"{self.workspace}: a file holds one avatar at rest; leave --run, --set, --series and --every out, or "
-                "give its workspace"
+                f"{self.workspace}: a file holds one avatar at rest; leave --run, --set, --series, --neutral and "
+                "--every out, or give its workspace"
             )
         self._check_ending(tuple(ending for ending in _ENDINGS if ending != ".glb"), "")
         if self.out.exists() and self.out.samefile(self.workspace):
@@ -263,12 +269,15 @@ class Command:
         """The face parameters of --series for this avatar, and the motion's frames per second before --every."""
         from mien.commands.expression import with_expression
         from mien.commands.stages.driving import open_driver
-        from mien.driving import drive
+        from mien.driving import drive, facing, rest_of
+        from mien.training import run_camera
 
-        own = series in workspace.sequence_names()
-        driver = open_driver(workspace.root if own else Path(series), series if own else None, avatar.face_model)
-        bounds = avatar.face_model.expression_bounds
-        driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, with_head_pose, series)
+        own, model = series in workspace.sequence_names(), avatar.face_model
+        by = workspace.root if own else Path(series)
+        driver = open_driver(by, series if own else None, model, neutral=self.neutral)
+        camera = run_camera(workspace.run_dir(workspace.pick_run(self.run_name)))
+        person = rest_of(avatar.subject, model, facing(camera.viewmat)).face
+        driven = drive(driver.face, driver.at_rest, person, model.expression_bounds, with_head_pose, series)
         return with_expression(driven[:: self.every], avatar.face_model, self.set), driver.fps
 
     def _numbered(self, index: int) -> Path:

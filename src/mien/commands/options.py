@@ -27,6 +27,8 @@ else:
     MethodName = Literal[tuple(METHODS)]
     PresetName = Literal[tuple(PRESETS)]
 
+NEUTRALS = ("first", "calm", "model")
+"""Words that --neutral takes. Anything else is a file."""
 _MAX_PORT = 65535
 _IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
 """Options that depend on the method. `with_settings` fills them in."""
@@ -245,6 +247,28 @@ def check_viewer() -> None:
     """
     if not has_viewer():
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
+
+
+def is_tracked_sequence(folder: Path) -> bool:
+    """Whether a folder is that of one tracked sequence of a workspace."""
+    return (folder / "tracking").is_dir()
+
+
+def check_neutral(neutral: str | None) -> None:
+    """Check before any work that a driver's face at rest is a word of `NEUTRALS`, or a driver.
+
+    Raises:
+        UserError: it is neither.
+    """
+    if neutral is None or neutral in NEUTRALS:
+        return
+    if not Path(neutral).exists():
+        raise UserError(
+            f"--neutral {neutral}: no such file; give first, calm or model, or a video, recording, workspace or "
+            "sequence folder of the driver at rest"
+        )
+    if not is_tracked_sequence(Path(neutral)):
+        check_driver(Path(neutral), None)
 
 
 def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.options import check_avatar, check_driver, check_port, check_viewer
+from mien.commands.options import check_avatar, check_driver, check_neutral, check_port, check_viewer
 from mien.errors import UserError
 
 _LOOPBACK = "127.0.0.1"
@@ -22,6 +22,9 @@ class Command:
     """Name of the run (default: the only one)."""
     play: str | None = None
     """A motion to choose from, beside the workspace's own sequences: anything that `mien drive --by` takes."""
+    neutral: str | None = None
+    """The face at rest of --play and of the workspace's sequences, as for `mien drive`: first, calm, model, or a video,
+    recording, workspace or sequence folder of the driver at rest."""
     port: int = 0
     """Port of the server, from 1 to 65535. 0 means a free one."""
     follow: bool = False
@@ -40,10 +43,12 @@ class Command:
         check_port(self.port)
         if self.play is not None:
             check_driver(Path(self.play), None)
+        check_neutral(self.neutral)
         check_viewer()
 
     def run(self) -> None:
         """Load the avatar, and show it until Ctrl-C."""
-        from mien.commands.stages.viewing import Place, run_viewing_stage
+        from mien.commands.stages.viewing import Motions, Place, run_viewing_stage
 
-        run_viewing_stage(self.avatar, self.run_name, self.play, Place(self.host, self.port, self.token), self.follow)
+        motions = Motions(self.play, self.neutral)
+        run_viewing_stage(self.avatar, self.run_name, motions, Place(self.host, self.port, self.token), self.follow)

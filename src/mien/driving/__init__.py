@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from mien.driving.keeping import keep_to_filmed
     from mien.driving.live_link_face import read_live_link_face
     from mien.driving.motion import ARKIT_NAMES, Motion
+    from mien.driving.neutral import with_neutral
+    from mien.driving.rest import facing, rest_before, rest_of
     from mien.driving.transfer import drive, face_of_motion
 else:
     __getattr__, __dir__ = lazy_names(
@@ -20,6 +22,8 @@ else:
             "keeping": ["keep_to_filmed"],
             "live_link_face": ["read_live_link_face"],
             "motion": ["ARKIT_NAMES", "Motion"],
+            "neutral": ["with_neutral"],
+            "rest": ["facing", "rest_before", "rest_of"],
             "transfer": ["drive", "face_of_motion"],
         },
     )
@@ -30,9 +34,13 @@ __all__ = [
     "Motion",
     "drive",
     "face_of_motion",
+    "facing",
     "keep_to_filmed",
     "read_blendshape_json",
     "read_live_link_face",
     "read_recording",
     "read_tracked_driver",
+    "rest_before",
+    "rest_of",
+    "with_neutral",
 ]

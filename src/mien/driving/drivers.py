@@ -6,20 +6,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from mien.avatar import neutral_of
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.live_link_face import read_live_link_face
+from mien.driving.rest import facing
 from mien.driving.speech import read_speech
 from mien.driving.timing import at_moments, even_moments, rate_of
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
-from mien.face.params import concatenate
+from mien.face.params import concatenate, most_frontal_camera
 from mien.progress import say
 from mien.training import Sequence, read_sequence
+
+_TRACKED_REST = "the calmest tenth of its frames"
+_RECORDED_REST = "where its coefficients are 0, with the head's median pose"
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +33,23 @@ class Driver:
 
     face: FaceParams
     at_rest: FaceParams
-    """The driver at rest, as one timestep."""
+    """The driver at rest, as one timestep: of a tracked driver, its calmest tenth."""
     fps: float
     pictures: Callable[[int], UInt8[np.ndarray, "h w 3"]] | None
     """Returns the driver's picture at a timestep. None if there are no pictures."""
     sound: Path | None = None
     """A file whose sound belongs to the motion."""
+    found: FaceParams | None = None
+    """The timesteps in which a face was found, at the recording's own times. None if they are those of `face`."""
+    ahead: Float[Tensor, "3 3"] | None = None
+    """R_world_head of a head that looks at the camera. The identity if None."""
+    rest_is: str = _TRACKED_REST
+    """What `at_rest` is, for messages."""
+
+    @property
+    def seen(self) -> FaceParams:
+        """The timesteps in which a face was found."""
+        return self.face if self.found is None else self.found
 
 
 def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) -> Driver:
@@ -58,7 +74,7 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
     if motion.lost:
         say(f"{path}: {motion.lost} of {len(motion)} frames have no face; each repeats the frame before it")
     face, at_rest = face_of_motion(motion, face_model)
-    return Driver(face, at_rest, motion.fps, None, path if is_voice else None)
+    return Driver(face, at_rest, motion.fps, None, path if is_voice else None, rest_is=_RECORDED_REST)
 
 
 def read_tracked_driver(folders: Items[Path]) -> Driver:
@@ -77,7 +93,10 @@ def read_tracked_driver(folders: Items[Path]) -> Driver:
         raise UserError(f"{names}: were tracked with different face models; track them again")
     if not any(bool(one.tracking.valid.any()) for one in sequences):
         raise UserError(f"{names}: no frame was tracked; track again, or choose another driver")
-    at_rest = neutral_of(concatenate([one.tracking.face[one.tracking.valid] for one in sequences]))
+    found = concatenate([one.tracking.face[one.tracking.valid] for one in sequences])
+    at_rest = neutral_of(found)
+    cameras = sequences[0].tracking.cameras
+    ahead = facing(cameras[most_frontal_camera(cameras, at_rest)].viewmat)
     fps = rate_of(max(sequences, key=lambda one: one.capture.timesteps).capture)
     faces: list[FaceParams] = []
     places: list[tuple[Sequence, int]] = []
@@ -93,4 +112,4 @@ def read_tracked_driver(folders: Items[Path]) -> Driver:
         sequence, timestep = places[index]
         return np.asarray(sequence.capture.images[timestep, 0])
 
-    return Driver(concatenate(faces), at_rest, fps, picture)
+    return Driver(concatenate(faces), at_rest, fps, picture, found=found, ahead=ahead)

@@ -15,7 +15,7 @@ from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import write_video
-from mien.driving import drive
+from mien.driving import drive, rest_before
 from mien.errors import UserError
 from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion, measure_motion, transfer_figures
 from mien.evaluation.videos import labelled_row, match_sizes
@@ -79,17 +79,17 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
     valid = torch.nonzero(tracking.valid)[:, 0].tolist()
     if not valid:
         raise UserError(f"{driver_dir}: has no tracked frame; choose another driver")
-    at_rest = neutral_of(tracking.face[tracking.valid])
-    bounds = avatar.face_model.expression_bounds
-    faces = drive(tracking.face, at_rest, avatar.subject, bounds, who=str(driver_dir))
-    cameras = read_tracking(sequence_dir / "tracking").cameras
+    cameras, model = read_tracking(sequence_dir / "tracking").cameras, avatar.face_model
+    calm = neutral_of(tracking.face[tracking.valid])
+    at_rest, person = rest_before(calm, model, tracking.cameras).face, rest_before(avatar.subject, model, cameras).face
+    faces = drive(tracking.face, at_rest, person, model.expression_bounds, who=str(driver_dir))
     return Driven(
         avatar=avatar,
         camera=cameras[most_frontal_camera(cameras, avatar.subject)],
         faces=faces,
         driver=capture,
         tracking=tracking,
-        driver_camera=most_frontal_camera(tracking.cameras, at_rest),
+        driver_camera=most_frontal_camera(tracking.cameras, calm),
         by_rest=tuple(sorted(valid, key=_activity(tracking.face, at_rest).__getitem__)),
     )
 

@@ -10,12 +10,21 @@ import numpy as np
 from mien.avatar import load_avatar
 from mien.capture import CaptureSettings
 from mien.capture.sound_endings import SOUND_ENDINGS
-from mien.commands.options import check_driver
+from mien.commands.options import NEUTRALS, check_driver, check_neutral, is_tracked_sequence
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.pictures import draw, view
 from mien.commands.stages.tracking import run_tracking_stage
-from mien.driving import Driver, drive, keep_to_filmed, read_recording, read_tracked_driver
+from mien.driving import (
+    Driver,
+    drive,
+    facing,
+    keep_to_filmed,
+    read_recording,
+    read_tracked_driver,
+    rest_of,
+    with_neutral,
+)
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from mien.face import FaceModel
@@ -28,7 +37,9 @@ from mien.training.run import filmed_range, run_camera
 from mien.workspace import Workspace, open_workspace
 
 
-def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
+def open_driver(
+    by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None, neutral: str | None = None
+) -> Driver:
     """Open a driver: a workspace, a video (captured, tracked and kept in the cache), a csv, a json, or a voice.
 
     Args:
@@ -36,17 +47,27 @@ def open_driver(by: Path, sequence: str | None, face_model: FaceModel, fps: floa
         sequence: Name of a sequence of the workspace. For a video with cuts: one part instead of all parts in a row.
         face_model: The avatar's face model.
         fps: Frame rate of the timecode in a csv.
+        neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.with_neutral`).
 
     Raises:
-        UserError: `by` is none of these, or a stage fails.
+        UserError: `by` or `neutral` is none of these, or a stage fails.
     """
     check_driver(by, sequence, fps)
+    check_neutral(neutral)
+    driver = _open(by, sequence, face_model, fps)
+    other = None if neutral is None or neutral in NEUTRALS else _open(Path(neutral), None, face_model)
+    return with_neutral(driver, face_model, neutral, str(by), other)
+
+
+def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
     suffix = by.suffix.lower() if by.is_file() else ""
     if suffix in (".csv", ".json", *SOUND_ENDINGS):
         return read_recording(by, face_model, fps)
     if by.is_file():
         workspace, names = _tracked_video(by, face_model.name)
         names = names if sequence is None else [workspace.pick_sequence(sequence)]
+    elif is_tracked_sequence(by):
+        return read_tracked_driver([by])
     else:
         workspace = open_workspace(by)
         names = [workspace.pick_sequence(sequence)]
@@ -77,6 +98,8 @@ class DriveOptions:
     """Frame rate of the timecode in a csv."""
     unlimited: bool = False
     """Whether the avatar follows also beyond what was filmed."""
+    neutral: str | None = None
+    """The driver's face at rest, as `--neutral` names it."""
 
 
 def run_driving_stage(
@@ -87,12 +110,13 @@ def run_driving_stage(
     # The number of frames is known only after tracking, but a video or numbered pictures take any number.
     output = picture.plan(out, 2)
     avatar = load_avatar(run_dir)
-    driver = open_driver(by, options.sequence, avatar.face_model, options.fps)
-    bounds = avatar.face_model.expression_bounds
-    driven = drive(driver.face, driver.at_rest, avatar.subject, bounds, options.head_pose, str(by))
+    driver = open_driver(by, options.sequence, avatar.face_model, options.fps, options.neutral)
+    bounds, filmed_by = avatar.face_model.expression_bounds, run_camera(run_dir)
+    person = rest_of(avatar.subject, avatar.face_model, facing(filmed_by.viewmat)).face
+    driven = drive(driver.face, driver.at_rest, person, bounds, options.head_pose, str(by))
     if output.kind == "sequence":
         plan_output(out, len(driven), output.transparent)
-    camera = view(picture, run_camera(run_dir))
+    camera = view(picture, filmed_by)
     if not options.unlimited:
         filmed = filmed_range(run_dir, avatar)
         driven, softened = keep_to_filmed(driven, filmed, avatar.subject, bounds, camera.position)

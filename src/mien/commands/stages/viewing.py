@@ -18,7 +18,7 @@ from mien.capture.camera_names import CameraName, camera_named, devices
 from mien.capture.live_camera import LiveCamera
 from mien.commands.stages.driving import open_driver
 from mien.commands.stages.live_view import PARENT
-from mien.driving import drive, keep_to_filmed
+from mien.driving import drive, facing, keep_to_filmed, rest_of
 from mien.driving.live import Follower, FollowOptions
 from mien.errors import UserError
 from mien.export import Motion
@@ -57,13 +57,23 @@ class Place:
     """Whether browsers need a token."""
 
 
-def run_viewing_stage(avatar: Path, run: str | None, play: str | None, place: Place, follow: bool = False) -> None:
+@dataclass(frozen=True)
+class Motions:
+    """Which motions a viewer offers besides the workspace's own."""
+
+    play: str | None = None
+    """What `mien drive --by` takes."""
+    neutral: str | None = None
+    """The face at rest of all motions, as `--neutral` names it."""
+
+
+def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Place, follow: bool = False) -> None:
     """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes."""
     door = Door.of(place.host, place.token)
     viewed = open_viewed(avatar, run)
-    clips = {name: _clip_of(viewed, folder, name) for name, folder in viewed.sequences.items()}
-    if play is not None:
-        clips[Path(play).name] = _clip_of(viewed, Path(play), None)
+    clips = {name: _clip_of(viewed, folder, name, motions.neutral) for name, folder in viewed.sequences.items()}
+    if motions.play is not None:
+        clips[Path(motions.play).name] = _clip_of(viewed, Path(motions.play), None, motions.neutral)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
 
     def ready(address: str) -> None:
@@ -178,14 +188,14 @@ def _mesh_of(portable: PortableAvatar) -> Mesh | None:
     return Mesh(baked.rig, baked.faces, portable.confidence) if isinstance(baked, MeshBound) else None
 
 
-def _clip_of(viewed: Viewed, by: Path, sequence: str | None) -> Callable[[], Clip]:
+def _clip_of(viewed: Viewed, by: Path, sequence: str | None, neutral: str | None = None) -> Callable[[], Clip]:
     """Return a function that loads a motion, made for the avatar and softly within what was filmed."""
 
     def load() -> Clip:
         model, subject = viewed.person()
-        driver = open_driver(by, sequence, model)
-        face = drive(driver.face, driver.at_rest, subject, model.expression_bounds, True, str(by))
-        portable = viewed.portable
+        driver, portable = open_driver(by, sequence, model, neutral=neutral), viewed.portable
+        person = rest_of(subject, model, facing(torch.from_numpy(portable.camera.viewmat))).face
+        face = drive(driver.face, driver.at_rest, person, model.expression_bounds, True, str(by))
         if portable.filmed is not None:
             eye = position(portable.camera)
             face, _ = keep_to_filmed(face, portable.filmed, subject, model.expression_bounds, eye)

@@ -1,0 +1,192 @@
+"""A driver who never rests keeps its expression, and a driver who does is transferred as before."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mien.avatar import neutral_of
+from mien.capture import write_capture
+from mien.commands.options import check_neutral
+from mien.commands.stages.driving import open_driver
+from mien.driving import drive, facing, rest_of, with_neutral
+from mien.driving.drivers import Driver
+from mien.driving.rest import EXPRESSION, GAZE, HEAD, kept_share
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.tracking import Scoring, write_scoring, write_tracking
+from small_face_model import make_small_face_model
+from test_motion import row, write_csv
+from toy_scene import toy_face_model, toy_sequence
+
+NAMES = (
+    "jawOpen", "browInnerUp", "browOuterUpLeft", "browOuterUpRight", "mouthSmileLeft", "mouthSmileRight",
+    "eyeBlinkLeft", "other",
+)  # fmt: skip
+FRAMES = 100
+
+
+def model() -> FaceModel:
+    """A small face model with names of ARKit; its joints are only named here."""
+    small = make_small_face_model()
+    return replace(small, expression_names=NAMES[: small.expression_basis.shape[0]])
+
+
+def talking(held: dict[str, float], head: float = 0.0, eyes: float = 0.0) -> FaceParams:
+    """Return a person who talks a little around what is held throughout. Angles to the left are in degrees."""
+    random, given = np.random.default_rng(0), model()
+    expression = 0.1 * random.uniform(size=(FRAMES, len(given.expression_names)))
+    for name, value in held.items():
+        expression[:, given.expression_names.index(name)] += value
+    expression[:5] *= 0.9
+    joints = torch.zeros(FRAMES, len(given.free_joint_names), 3)
+    for index, name in enumerate(given.free_joint_names):
+        if "eye" in name:
+            joints[:, index, 1] = np.radians(eyes)
+    rotation = torch.zeros(FRAMES, 3)
+    rotation[:, 1] = np.radians(head)
+    rotation[:, 0] = 0.02 * torch.sin(torch.arange(FRAMES) / 9)
+    return FaceParams(
+        given.neutral().identity, torch.from_numpy(expression).float(), joints, rotation,
+        torch.zeros(FRAMES, 3), given.neutral().vertex_offsets,
+    )  # fmt: skip
+
+
+def driver_of(face: FaceParams) -> Driver:
+    return Driver(face, neutral_of(face), 25.0, None)
+
+
+def driven(face: FaceParams, neutral: str | None = None) -> FaceParams:
+    """Return what an avatar does whose own face at rest is the model's."""
+    driver = with_neutral(driver_of(face), model(), neutral, "clip")
+    return drive(driver.face, driver.at_rest, model().neutral())
+
+
+@pytest.mark.parametrize(
+    ("held", "name"),
+    [
+        ({"jawOpen": 0.6}, "jawOpen"),
+        ({"browInnerUp": 0.8, "browOuterUpLeft": 0.7}, "browInnerUp"),
+        ({"mouthSmileLeft": 0.7, "mouthSmileRight": 0.7}, "mouthSmileLeft"),
+    ],
+)
+def test_what_is_held_throughout_reaches_the_avatar(
+    held: dict[str, float], name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An open mouth, raised brows and a grin that never end are motion. The default says so, and calm is as before."""
+    face = talking(held)
+    index = NAMES.index(name)
+    torch.testing.assert_close(driven(face).expression[:, index], face.expression[:, index])
+    told = capsys.readouterr().err
+    assert "clip: its face at rest is the calmest tenth of its frames" in told
+    assert f"clip: it never rests ({name} 0." in told
+    assert "--neutral calm" in told
+    assert driven(face, "calm").expression[:, index].mean() < 0.1
+    torch.testing.assert_close(driven(face, "model").expression[:, index], face.expression[:, index])
+
+
+def test_a_head_turned_throughout_turns_the_avatar() -> None:
+    face = talking({}, head=55)
+    turned = driven(face).head_rotation
+    torch.testing.assert_close(turned, face.head_rotation, atol=1e-5, rtol=0)
+    assert driven(face, "calm").head_rotation.abs().max() < 0.05
+    torch.testing.assert_close(driven(face, "model").head_rotation, face.head_rotation, atol=1e-5, rtol=0)
+
+
+def test_a_gaze_aside_throughout_reaches_the_avatar() -> None:
+    face = talking({}, eyes=26)
+    torch.testing.assert_close(driven(face).joints, face.joints, atol=1e-5, rtol=0)
+    assert driven(face, "calm").joints.abs().max() < 1e-5
+
+
+def test_eyes_that_make_up_for_a_turned_head_move_with_it() -> None:
+    """A head that counts as turned looks into the camera still, and does not look aside."""
+    face = talking({}, head=60, eyes=-50)
+    torch.testing.assert_close(driven(face).joints, face.joints, atol=1e-5, rtol=0)
+
+
+def test_who_rests_is_transferred_as_before() -> None:
+    """Within the limits not a bit changes: small habits, a camera aside, and eyes that look into it."""
+    for face in (talking({"browInnerUp": 0.2}, head=-25, eyes=24), talking({"jawOpen": 0.15}, eyes=10), talking({})):
+        calm = neutral_of(face)
+        rest = rest_of(calm, model())
+        assert rest.moved == ()
+        for name, tensor in calm.tensors().items():
+            assert torch.equal(getattr(rest.face, name), tensor), name
+
+
+def test_motion_grows_without_a_jump() -> None:
+    for limits in (EXPRESSION, HEAD, GAZE):
+        sizes = torch.linspace(0, 2 * limits[1], 2001)
+        moved = sizes * (1 - kept_share(sizes, limits))
+        assert (moved.diff() >= 0).all()
+        assert moved.diff().max() < 0.01
+        assert (moved[sizes <= limits[0]] == 0).all()
+        torch.testing.assert_close(moved[sizes >= limits[1]], sizes[sizes >= limits[1]])
+
+
+def test_what_counts_as_ahead_is_the_camera_of_any_world() -> None:
+    """A calibrated world may have any axes. Who looks into the camera rests there."""
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = matrix_from_axis_angle(torch.tensor([0.4, 2.2, -0.8]))
+    ahead = facing(viewmat)
+    calm = replace(neutral_of(talking({})), head_rotation=axis_angle_from_matrix(ahead)[None])
+    assert rest_of(calm, model(), ahead).moved == ()
+    aside = ahead @ matrix_from_axis_angle(torch.tensor([0.0, 1.0, 0.0]))
+    rest = rest_of(replace(calm, head_rotation=axis_angle_from_matrix(aside)[None]), model(), ahead)
+    torch.testing.assert_close(matrix_from_axis_angle(rest.face.head_rotation)[0], ahead, atol=1e-5, rtol=0)
+    assert rest.moved == ("the head 57 degrees aside",)
+
+
+def test_an_avatar_that_never_rests_still_follows_itself() -> None:
+    """Driver and avatar of one clip have one face at rest, so the avatar does what was filmed."""
+    face = talking({"jawOpen": 0.7}, head=50)
+    rest = rest_of(neutral_of(face), model()).face
+    own = drive(face, rest, rest)
+    for name, tensor in face.tensors().items():
+        torch.testing.assert_close(getattr(own, name), tensor, atol=1e-5, rtol=1e-5)
+
+
+def tracked(folder: Path, first: float, then: float) -> Path:
+    """Write a tracked sequence of 30 frames. Its first expression has two values, before and after frame 15."""
+    _, sequence = toy_sequence(30, 32)
+    expression = torch.zeros_like(sequence.tracking.face.expression)
+    expression[:15, 0], expression[15:, 0] = first, then
+    write_capture(folder / "capture", sequence.capture)
+    write_tracking(
+        folder / "tracking",
+        replace(sequence.tracking, face=replace(sequence.tracking.face, expression=expression)),
+    )
+    crops = np.tile(np.array([4, 4, 20, 20], np.int64), (30, 1, 1))
+    write_scoring(folder / "scoring", Scoring(sequence.capture.mattes, crops))
+    return folder
+
+
+def test_the_option_of_every_command(tmp_path: Path) -> None:
+    workspace, other = tmp_path / "w", tmp_path / "other"
+    tracked(workspace / "sequences" / "clip", 0.7, 0.5)
+    still = tracked(other / "sequences" / "still", 0.1, 0.1)
+    for neutral, expected in (
+        (None, 0.5 / 3), ("first", 0.7), ("calm", 0.5), ("model", 0.0), (str(other), 0.1), (str(still), 0.1),
+    ):  # fmt: skip
+        driver = open_driver(workspace, None, toy_face_model(), neutral=neutral)
+        assert float(driver.at_rest.expression[0, 0]) == pytest.approx(expected, abs=1e-6), neutral
+    with pytest.raises(UserError, match=r"--neutral rest: no such file; give first, calm or model"):
+        check_neutral("rest")
+    by = write_csv(tmp_path / "a.csv", *(row(f"0:00:00:{index:02d}.0", JawOpen=0.5) for index in range(3)))
+    with pytest.raises(UserError, match="was tracked with another face model"):
+        open_driver(by, None, model(), neutral=str(still))
+
+
+def test_a_recording_with_a_turned_head(tmp_path: Path) -> None:
+    """The zero of a recording's coefficients is the recorder's neutral; its head may be turned throughout."""
+    by = write_csv(
+        tmp_path / "a.csv", *(row(f"0:00:00:{index:02d}.0", JawOpen=0.5, HeadYaw=0.9) for index in range(30))
+    )
+    for neutral, jaw, turn in ((None, 0.0, 0.0), ("calm", 0.5, 0.9), ("first", 0.5, 0.9), ("model", 0.0, 0.0)):
+        rest = open_driver(by, None, model(), neutral=neutral).at_rest
+        assert float(rest.expression[0, NAMES.index("jawOpen")]) == pytest.approx(jaw), neutral
+        assert float(rest.head_rotation.norm()) == pytest.approx(turn, abs=1e-5), neutral
