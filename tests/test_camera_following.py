@@ -243,6 +243,25 @@ def test_the_avatar_rests_while_it_learns_and_goes_to_rest_without_a_face(landma
     assert one.state == "learning"
 
 
+def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
+    """A mouth that is open, and a head that is aside, from the first frame on reach the avatar."""
+    fit, one, rested = LandmarkFit(MODEL, MODEL.neutral()), follower(), follower()
+    coefficients = np.zeros(len(fit.names))
+    turn = matrix_from_axis_angle(torch.tensor([[0.0, 0.85, 0.0]], dtype=torch.float64))[0].numpy()
+    place = np.array([0.0, 0.0, -0.7])
+    quiet = fit.pixels(np.eye(3), place, coefficients, SIZE, SIZE)
+    coefficients[fit.names.index("jawOpen")] = 0.8
+    open_mouth = fit.pixels(np.eye(3), place, coefficients, SIZE, SIZE)
+    faces = [(one(open_mouth, SIZE, SIZE, index / FPS), rested(quiet, SIZE, SIZE, index / FPS)) for index in range(75)]
+    assert one.state == "following"
+    assert faces[-1][0].expression[column("jawOpen")] > 0.6
+    assert abs(faces[-1][1].expression[column("jawOpen")]) < 0.05
+    aside = follower()
+    turned = fit.pixels(turn, place, 0 * coefficients, SIZE, SIZE)
+    last = [aside(turned, SIZE, SIZE, index / FPS) for index in range(75)][-1]
+    np.testing.assert_allclose(last.head_rotation, [0, 0.85, 0], atol=0.1)
+
+
 def test_head_pose_can_be_left_out_and_limits_hold(landmarks: list[np.ndarray]) -> None:
     inputs = len(MODEL.expression_names) + 3 * len(MODEL.free_joint_names)
     zeros = np.zeros(inputs, np.float32)

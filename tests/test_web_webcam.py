@@ -325,6 +325,16 @@ def test_the_button_takes_another_neutral_face(built: Path) -> None:
     assert abs(told[-1]["scores"]["mouthsmileleft"]) < 1e-2
 
 
+def test_a_mouth_that_is_open_at_first_is_not_neutral(built: Path) -> None:
+    """An open mouth and a head far aside in the first second are motion; raised brows may be how one looks at rest."""
+    held = {"jawOpen": 0.7, "browInnerUp": 0.6}
+    turn = Rotation.from_rotvec([0, 0.9, 0])
+    pictures = [found(i / 30, held, turn.as_rotvec()) for i in range(90)]
+    last = followed(built, False, pictures)["readings"][-1]
+    assert last["scores"] == pytest.approx({"jawopen": 0.7, "browinnerup": 0}, abs=1e-3)
+    np.testing.assert_allclose(np.reshape(last["turn"], (3, 3)), turn.as_matrix(), atol=1e-2)
+
+
 def test_pictures_without_a_face_say_nothing(built: Path) -> None:
     lost = {"scores": None, "matrix": None, "milliseconds": 2000, "work": 1}
     assert followed(built, True, [*second_at_rest(), lost])["readings"][-1] is None

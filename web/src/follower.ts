@@ -2,6 +2,7 @@
 
 import { OneEuro, type Smoothing } from "./one_euro";
 import { axisAngle, multiplied, rotationMatrix, transposed } from "./rigid";
+import { headAtRest, keptShare } from "./transfer";
 
 /** What the detector says about a picture. */
 export interface Found {
@@ -38,6 +39,12 @@ const CENTIMETRE = 0.01;
 const CLOSED = 0.75;
 /** They leave 0.35 to 0.5 of the tremble, and add 4 to 40 ms (docs/history/2026-11-23-webcam.md). Units: 1, radians, metres. */
 const SCORES: Smoothing = { rest: 1, follow: 8 }, TURNS: Smoothing = { rest: 0.5, follow: 16 }, SHIFTS: Smoothing = { rest: 0.5, follow: 128 };
+
+/**
+ * Limits of scores in the neutral face: up to the first they belong to the person, from the second on they are an expression.
+ * At rest, the detector reads up to 0.2 for jaws and mouths of seven filmed people, but up to 0.8 for brows, eyes and squints.
+ */
+const MOUTH = [0.3, 0.6], OTHERS = [0.8, 0.95];
 
 interface Raw {
   scores: Map<string, number>;
@@ -90,8 +97,8 @@ export class Follower {
     // Medians, so that a blink does not count.
     const middle = (of: (row: Raw) => number) => rows.map(of).sort((a, b) => a - b)[rows.length >> 1];
     this.neutral = {
-      scores: new Map([...raw.scores.keys()].map((name) => [name, middle((row) => row.scores.get(name) ?? 0)])),
-      back: transposed(rotationMatrix([0, 1, 2].map((k) => middle((row) => row.turn[k])), 0)),
+      scores: new Map([...raw.scores.keys()].map((name) => [name, atRest(name, middle((row) => row.scores.get(name) ?? 0))])),
+      back: transposed(rotationMatrix(headAtRest([0, 1, 2].map((k) => middle((row) => row.turn[k]))), 0)),
       place: [0, 1, 2].map((k) => middle((row) => row.place[k])),
     };
   }
@@ -116,6 +123,11 @@ export class Follower {
     });
     return { scores, turn: rotationMatrix([turn[0], side * turn[1], side * turn[2]], 0), shift: [side * x, y, z], milliseconds, work };
   }
+}
+
+/** The score of a neutral face: as it is in the calibration, unless it is far from 0. */
+function atRest(name: string, score: number): number {
+  return score * keptShare(score, /^(jaw|mouth)/.test(name) ? MOUTH : OTHERS);
 }
 
 /** A score relative to that of the neutral face, so that the strongest expression has 1. */

@@ -6,7 +6,7 @@ import { AvatarError } from "./format";
 import { multiplied, rotationMatrix, transposed } from "./rigid";
 import { readCsv } from "./series_csv";
 import { readJson } from "./series_json";
-import { transfer } from "./transfer";
+import { headAtRest, transfer } from "./transfer";
 
 /** What a recording says about one timestep. */
 export interface Row {
@@ -88,7 +88,7 @@ function between(a: Row, b: Row, share: number): Row {
 function transferred(rows: Row[], fps: number, avatar: Avatar): Motion {
   const { neutral } = avatar, count = rows.length;
   const middle = [0, 1, 2].map((axis) => rows.map((row) => row.head[axis]).sort((a, b) => a - b)[(count - 1) >> 1]);
-  const back = transposed(rotationMatrix(middle, 0));
+  const back = transposed(rotationMatrix(headAtRest(middle), 0));
   const motion: Motion = {
     expression: new Float32Array(count * neutral.expression.length), joints: new Float32Array(count * neutral.joints.length),
     head_rotation: new Float32Array(3 * count), head_translation: new Float32Array(3 * count), fps,

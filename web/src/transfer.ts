@@ -9,6 +9,20 @@ const LOOK_ANGLE = Math.PI / 6;
 /** Pitch that eyes come near but do not exceed, up and down, in radians: beyond it, the lids would cover the iris. */
 const MOST_UP = (14 * Math.PI) / 180, MOST_DOWN = (18 * Math.PI) / 180;
 
+/** Limits of a turn of the head at rest, in radians: up to the first it is at rest, from the second on it is motion (src/mien/driving/rest.py). */
+const HEAD = [0.524, 0.785];
+
+/** The part of a size that belongs to a person at rest: 1 up to the first limit, 0 from the second on. */
+export function keptShare(size: number, [first, second]: readonly number[]): number {
+  return Math.min(Math.max((second - size) / (second - first), 0), 1);
+}
+
+/** The axis-angle vector of a head at rest: as it mostly is, unless it is far from facing the camera. */
+export function headAtRest(usual: readonly number[]): number[] {
+  const share = keptShare(Math.hypot(...usual), HEAD);
+  return usual.map((angle) => share * angle);
+}
+
 /**
  * Fills `face` with a driver's face.
  * @param scores Coefficients by the names of ARKit in lower case; missing names are 0, as the driver at rest.

@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from mien.avatar import as_array
 from mien.driving.keeping import keep_to_filmed
 from mien.driving.live.landmark_fit import Fitted, LandmarkFit
 from mien.driving.live.one_euro import OneEuro
+from mien.driving.rest import HEAD, kept_share, rest_of
 from mien.driving.transfer import drive
 from mien.face import FaceModel, FaceParams
 from mien.runtime import Face, Filmed
@@ -71,6 +72,9 @@ class Follower:
         """
         self._options = options or FollowOptions()
         self._model, self._person = model, person
+        # The avatar's head stays where it was filmed: which camera it faced is not known here.
+        ahead = replace(person, head_rotation=torch.zeros_like(person.head_rotation))
+        self._at_rest = replace(rest_of(ahead, model).face, head_rotation=person.head_rotation)
         self._filmed = None if self._options.unlimited else filmed
         self._eye = torch.from_numpy(np.asarray(eye, np.float32))
         self._fit = LandmarkFit(model, person)
@@ -141,6 +145,10 @@ class Follower:
         middle = poses[len(poses) // 2].rotation
         turns = axis_angle_from_matrix(np.stack([middle.T @ pose.rotation for pose in poses]))
         rotation = middle @ matrix_from_axis_angle(np.median(turns, axis=0)[None])[0]
+        # A head far aside from the camera is turned, not at rest.
+        away = axis_angle_from_matrix(rotation[None])
+        share = float(kept_share(torch.tensor(np.linalg.norm(away)), HEAD))
+        rotation = rotation if share == 1 else matrix_from_axis_angle(share * away)[0]
         self._rest = _Pose(rotation, np.median([pose.translation for pose in poses], axis=0))
         self._learning.clear()
         self._smoothing = self._new_smoothing()
@@ -171,7 +179,7 @@ class Follower:
         driver = self._fit.face_of(self._values[:3], self._values[3:6], self._values[6:])
         at_rest = self._fit.face_of(still, still, np.zeros(len(self._fit.names)))
         bounds = self._model.expression_bounds
-        face = drive(driver, at_rest, self._person, bounds, self._options.head_pose)
+        face = drive(driver, at_rest, self._at_rest, bounds, self._options.head_pose)
         if self._filmed is not None:
             face, _ = keep_to_filmed(face, self._filmed, self._person, bounds, self._eye)
         return Face(

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from mien.driving.rest import kept_share
 from mien.face import FaceModel, FaceParams
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import TrackingSettings
@@ -27,6 +28,14 @@ _WIDE_OUTLIER = 40.0
 _FOCAL = 1.5
 """Focal length of an unknown camera as a multiple of the longer side, as in `TrackingSettings.focal`."""
 _TRUE_STEPS, _FIRST_STEPS = 2, 12
+_LIMITS = (
+    ((0.4, 0.7), ("jaw", "brow", "mouthSmile", "mouthPucker", "mouthFunnel")),
+    ((0.35, 0.5), ("left_eye", "right_eye")),
+)
+"""Limits of `kept_share` for coefficients, and for angles of eyes in radians, of the face at rest. They are wider than
+those of a tracking, because the person's shape is unknown: at rest, the fit sees up to 0.34 and 0.24 in seven filmed
+people. For lids and lips it sees up to 0.9, so their part is always taken as shape.
+"""
 _NEAR, _FAR = 0.1, 10.0
 """Bounds of the distance of a head, in metres."""
 
@@ -81,6 +90,7 @@ class LandmarkFit:
         self._rigid[list(NOSE + EYE_CORNERS)] = 1.0
         self._rigid *= settings.independent_landmarks / self._rigid.sum()
         self._sigma = settings.landmark_sigma
+        self._held = np.zeros(count)
         self._last: Fitted | None = None
 
     def forget(self) -> None:
@@ -107,15 +117,18 @@ class LandmarkFit:
     def learn_rest(self, seen: list[Float[np.ndarray, "l 2"]], width: int, height: int) -> None:
         """Take what landmarks of a person at rest leave over as the shape of this person's face.
 
-        Each landmark moves across the line of sight by the median of its distances, so that a blink does not count.
+        Each landmark moves across the line of sight by the median of its distances, so that a blink does not count. An
+        expression that is far from rest, such as an open mouth, is no shape.
         """
+        self._bias, self._held = np.zeros_like(self._rest), np.zeros_like(self._held)
+        self._held = self._expression_in(seen, width, height)
         focal, size = _FOCAL * max(width, height), np.array((0.5 * width, 0.5 * height))
         self._bias = np.zeros_like(self._rest)
         for _ in range(2):
             offsets = []
             for landmarks in seen:
                 centred = landmarks - size
-                start = self._facing(centred, focal)
+                start = replace(self._facing(centred, focal), coefficients=self._held)
                 pose = self._descend(start, centred, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
                 points = self._points(pose)
                 turned = points @ pose.rotation.T + pose.translation
@@ -125,10 +138,23 @@ class LandmarkFit:
             self._bias = self._bias + np.median(offsets, axis=0)
         self.forget()
 
+    def _expression_in(self, seen: list[Float[np.ndarray, "l 2"]], width: int, height: int) -> Float[np.ndarray, " k"]:
+        """The part of the median expression that is no shape of the person, as far as an unknown person shows it."""
+        fits = []
+        for landmarks in seen:
+            self.forget()
+            fits.append(self(landmarks, width, height).coefficients)
+        middle = torch.from_numpy(np.median(fits, axis=0))
+        moved = torch.zeros_like(middle)
+        for limits, starts in _LIMITS:
+            ours = torch.tensor([name.startswith(starts) for name in self.names])
+            moved = torch.where(ours, middle * (1 - kept_share(middle.abs(), limits)), moved)
+        return moved.numpy()
+
     def rest_pose(self, landmarks: Float[np.ndarray, "l 2"], width: int, height: int) -> Fitted:
         """The head pose alone in a frame in which the person is at rest."""
         centred, focal = landmarks - (0.5 * width, 0.5 * height), _FOCAL * max(width, height)
-        start = self._facing(centred, focal)
+        start = replace(self._facing(centred, focal), coefficients=self._held)
         return self._descend(start, centred, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
 
     def pixels(
