@@ -256,6 +256,9 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
     assert one.state == "following"
     assert faces[-1][0].expression[column("jawOpen")] > 0.6
     assert abs(faces[-1][1].expression[column("jawOpen")]) < 0.05
+    one.recalibrate()
+    asked = [one(open_mouth, SIZE, SIZE, 3 + index / FPS) for index in range(75)][-1]
+    assert asked.expression[column("jawOpen")] < 0.1, "who asks for it has this face as the one at rest"
     aside = follower()
     turned = fit.pixels(turn, place, 0 * coefficients, SIZE, SIZE)
     last = [aside(turned, SIZE, SIZE, index / FPS) for index in range(75)][-1]

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.driving import drive, face_of_motion, read_blendshape_json, read_live_link_face
+from mien.driving import drive, face_of_motion, read_blendshape_json, read_live_link_face, rest_of
 from mien.driving.motion import MAX_MOMENTS
 from mien.driving.sides import PAIRS
 from mien.export import write_page
@@ -46,7 +46,7 @@ def driven_by_python(recording: Path) -> tuple[float, FaceParams]:
         *(torch.from_numpy(array)[None] for array in (near.expression, near.joints)),
         *(torch.from_numpy(array)[None] for array in (near.head_rotation, near.head_translation)),
     )
-    return motion.fps, drive(face, rest, neutral, model.expression_bounds)
+    return motion.fps, drive(face, rest_of(rest, model).face, neutral, model.expression_bounds)
 
 
 def recordings(folder: Path) -> list[Path]:

@@ -63,14 +63,17 @@ export class Follower {
   mirrored = true;
   private neutral: Neutral | null = null;
   private gathered: { since: number; rows: Raw[] } | null = { since: NaN, rows: [] };
+  /** Whether the person asked for the neutral face, which is then taken as it is. */
+  private asked = false;
   private filters = new Map<string, OneEuro>();
 
   get calibrating(): boolean {
     return this.gathered !== null;
   }
 
-  /** Takes the face of the next second as the neutral one. */
+  /** Takes the face of the next second as the neutral one, whatever it shows. */
   calibrate(): void {
+    this.asked = true;
     this.gathered = { since: NaN, rows: [] };
   }
 
@@ -96,9 +99,11 @@ export class Follower {
     this.gathered = null;
     // Medians, so that a blink does not count.
     const middle = (of: (row: Raw) => number) => rows.map(of).sort((a, b) => a - b)[rows.length >> 1];
+    const turn = [0, 1, 2].map((k) => middle((row) => row.turn[k]));
+    const rest = (name: string, score: number) => (this.asked ? score : atRest(name, score));
     this.neutral = {
-      scores: new Map([...raw.scores.keys()].map((name) => [name, atRest(name, middle((row) => row.scores.get(name) ?? 0))])),
-      back: transposed(rotationMatrix(headAtRest([0, 1, 2].map((k) => middle((row) => row.turn[k]))), 0)),
+      scores: new Map([...raw.scores.keys()].map((name) => [name, rest(name, middle((row) => row.scores.get(name) ?? 0))])),
+      back: transposed(rotationMatrix(this.asked ? turn : headAtRest(turn), 0)),
       place: [0, 1, 2].map((k) => middle((row) => row.place[k])),
     };
   }

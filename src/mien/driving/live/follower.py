@@ -85,7 +85,7 @@ class Follower:
         self._values = np.zeros(6 + len(self._fit.names))
         self._driven_at = 0.0
         self._smoothing = self._new_smoothing()
-        self._must_learn = False
+        self._must_learn = self._asked = False
         self.state: State = "waiting"
         self.error = float("nan")
         """Weighted root mean square distance in pixels between landmarks and their fit in the last frame."""
@@ -101,7 +101,7 @@ class Follower:
         return dict(zip(self._fit.names, self._values[6:].tolist(), strict=True))
 
     def recalibrate(self) -> None:
-        """Learn the face at rest anew from the next second."""
+        """Learn the face at rest anew from the next second, whatever it shows: the person asks for it."""
         with self._lock:
             self._must_learn = True
 
@@ -116,7 +116,7 @@ class Follower:
         """
         with self._lock:
             if self._must_learn:
-                self._must_learn, self._rest = False, None
+                self._must_learn, self._asked, self._rest = False, True, None
                 self._learning.clear()
         if landmarks is None:
             self._without_face(seconds)
@@ -140,15 +140,15 @@ class Follower:
         seen = [one for _, one in self._learning]
         # A handful of frames says as much as all of them, and a picture must not wait.
         seen = seen[:: max(1, len(seen) // _LEAST_FRAMES)]
-        self._fit.learn_rest(seen, width, height)
+        self._fit.learn_rest(seen, width, height, self._asked)
         poses = [self._fit.rest_pose(one, width, height) for one in seen]
         middle = poses[len(poses) // 2].rotation
         turns = axis_angle_from_matrix(np.stack([middle.T @ pose.rotation for pose in poses]))
         rotation = middle @ matrix_from_axis_angle(np.median(turns, axis=0)[None])[0]
-        # A head far aside from the camera is turned, not at rest.
+        # A head far aside from the camera is turned, not at rest, unless the person says that it is.
         away = axis_angle_from_matrix(rotation[None])
         share = float(kept_share(torch.tensor(np.linalg.norm(away)), HEAD))
-        rotation = rotation if share == 1 else matrix_from_axis_angle(share * away)[0]
+        rotation = rotation if share == 1 or self._asked else matrix_from_axis_angle(share * away)[0]
         self._rest = _Pose(rotation, np.median([pose.translation for pose in poses], axis=0))
         self._learning.clear()
         self._smoothing = self._new_smoothing()

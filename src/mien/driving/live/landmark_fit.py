@@ -114,14 +114,15 @@ class LandmarkFit:
             self._last = self._descend(self._last, centred, focal, self._weights, _OUTLIER, _TRUE_STEPS)
         return self._last
 
-    def learn_rest(self, seen: list[Float[np.ndarray, "l 2"]], width: int, height: int) -> None:
+    def learn_rest(self, seen: list[Float[np.ndarray, "l 2"]], width: int, height: int, as_it_is: bool = False) -> None:
         """Take what landmarks of a person at rest leave over as the shape of this person's face.
 
         Each landmark moves across the line of sight by the median of its distances, so that a blink does not count. An
-        expression that is far from rest, such as an open mouth, is no shape.
+        expression that is far from rest, such as an open mouth, is no shape, unless the face is taken `as_it_is`.
         """
         self._bias, self._held = np.zeros_like(self._rest), np.zeros_like(self._held)
-        self._held = self._expression_in(seen, width, height)
+        if not as_it_is:
+            self._held = self._expression_in(seen, width, height)
         focal, size = _FOCAL * max(width, height), np.array((0.5 * width, 0.5 * height))
         self._bias = np.zeros_like(self._rest)
         for _ in range(2):
