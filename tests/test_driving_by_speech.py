@@ -1,5 +1,6 @@
 """A voice drives an avatar: silence, loudness, high and low sounds, and the sound in the video."""
 
+import contextlib
 import wave
 from pathlib import Path
 
@@ -166,3 +167,49 @@ def test_the_command_writes_a_talking_avatar(
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--sequence", "a", "--out", str(out)]) == 2
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice)]) == 2
     assert "needs --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rate", [0, 1, 3, 999, 2_000_000, 2**31 - 1])
+def test_odd_rates_are_refused(rate: int, tmp_path: Path) -> None:
+    path = write_wav(tmp_path / "a.wav", np.zeros(100))
+    data = bytearray(path.read_bytes())
+    data[24:28] = rate.to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=r"a\.wav: ") as error:
+        read_sound(path)
+    assert "convert it to .wav" in str(error.value)
+
+
+def write_mp3(path: Path, layout: str, seconds: float) -> bytes:
+    samples = np.sin(np.arange(int(seconds * 48_000)) * 0.05).astype(np.float32)
+    with av.open(str(path), "w", format="mp3", options={"write_xing": "0", "id3v2_version": "0"}) as container:
+        stream = container.add_stream("libmp3lame", rate=48_000, layout=layout)
+        rows = np.ascontiguousarray(np.tile(samples, (2 if layout == "stereo" else 1, 1)))
+        frame = av.AudioFrame.from_ndarray(rows, format="fltp", layout=layout)
+        frame.sample_rate = 48_000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path.read_bytes()
+
+
+def test_sound_that_changes_its_channels_is_read_to_its_end(tmp_path: Path) -> None:
+    """Recorders append, and streams switch from one channel to two."""
+    path = tmp_path / "a.mp3"
+    one, two = write_mp3(path, "mono", 0.5), write_mp3(path, "stereo", 0.7)
+    for content in (one + two, two + one, one + two + one):
+        path.write_bytes(content)
+        samples = read_sound(path)
+        assert len(samples) > 1.1 * RATE
+        assert np.abs(samples[-RATE // 4 : -RATE // 8]).max() > 0.3
+
+
+def test_a_damaged_mp3_is_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp3"
+    content, random = write_mp3(path, "stereo", 0.5), np.random.default_rng(0)
+    for _ in range(60):
+        data = bytearray(content)
+        for place in random.integers(0, len(data), 20):
+            data[place] = random.integers(0, 256)
+        path.write_bytes(data[: random.integers(1, len(data))])
+        with contextlib.suppress(UserError):
+            assert np.isfinite(read_sound(path)).all()

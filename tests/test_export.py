@@ -9,12 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mien.camera import camera_from_fov
+from mien.cli import main
 from mien.errors import UserError
 from mien.export import in_world, read_ply, write_ply
 from mien.export.ply import property_names
 from mien.gaussians import Gaussians
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle, rigid_transform
+from toy_workspace import write_toy_workspace
 
 
 def _gaussians(n: int, coefficients: int, seed: int = 0) -> Gaussians:
@@ -164,3 +166,28 @@ def test_nan_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="1 of 3 Gaussians"):
         write_ply(tmp_path / "a.ply", gaussians)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_ply_can_have_coefficients_of_degree_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Some programs expect 248 bytes for each Gaussian. The colours stay the same."""
+    write_toy_workspace(tmp_path / "W")
+    line = ["export", str(tmp_path / "W"), "--out"]
+    assert main([*line, str(tmp_path / "own.ply")]) == 0
+    assert main([*line, str(tmp_path / "me.mien")]) == 0
+    assert main([*line, str(tmp_path / "padded.ply"), "--sh", "3"]) == 0
+    assert main([*line, str(tmp_path / "s.ply"), "--series", "clip", "--sh", "3"]) == 0
+    assert main(["export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "file.ply"), "--sh", "3"]) == 0
+    own = read_ply(tmp_path / "own.ply")
+    for path in (tmp_path / "padded.ply", tmp_path / "s_000000.ply", tmp_path / "file.ply"):
+        data = path.read_bytes()
+        assert len(data) - data.index(b"end_header\n") - len(b"end_header\n") == 248 * len(own)
+        assert read_ply(path).sh.shape == (len(own), 16, 3)
+    padded = read_ply(tmp_path / "padded.ply")
+    assert torch.equal(padded.sh[:, : own.sh.shape[1]], own.sh)
+    assert not padded.sh[:, own.sh.shape[1] :].any()
+    assert torch.equal(padded.means, own.means)
+    capsys.readouterr()
+    assert main([*line, str(tmp_path / "a.spz"), "--sh", "3"]) == 2
+    assert "only a .ply has a degree to choose; leave --sh out" in capsys.readouterr().err
+    with pytest.raises(UserError, match="--sh 1: the avatar has degree 3; give 3 or more, or leave it out"):
+        write_ply(tmp_path / "b.ply", padded, 1)

@@ -4,13 +4,15 @@ Everything here is plain Python, because options and paths are checked before an
 """
 
 import errno
+import io
 import json
 import math
 import os
 import stat
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 MAX_SIDE = 8192
 """Largest width or height of a picture in pixels, of those that are read and of those that are rendered."""
@@ -23,6 +25,17 @@ _MAX_DEPTH = 50
 is shown or compared."""
 _MAX_SHOWN = 40
 """Most characters of a name or number that a message shows."""
+_COSTS = {"[": 64, "{": 232, ",": 40}
+"""Bytes that Python takes for a list, an object, and a further entry with its number or text, about."""
+_MAX_PARSED_BYTES = 1 << 30
+"""Most memory that the content of a json text may take, in bytes. Empty lists take twenty times their text."""
+_ARCHIVE_END, _ARCHIVE_END_SIZE = b"PK\x05\x06", 22
+_END_OF_LARGE_ARCHIVE = b"PK\x06\x07"
+"""Marker of archives with more than 65,534 members, or of 4 GB and more."""
+_MAX_COMMENT_BYTES = 65535
+_MAX_DIRECTORY_BYTES = 1 << 20
+"""Largest list of members at the end of an archive, in bytes. Each member takes about 50."""
+_PLAIN_MEMBERS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class NotOrdinaryError(ValueError):
@@ -40,8 +53,10 @@ def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False,
 
     Raises:
         ValueError: the text is not json, or it holds a number or a name that is refused, or lists that are nested too
-            deep.
+            deep, or it would take too much memory.
     """
+    if sum(cost * text.count(sign) for sign, cost in _COSTS.items()) > _MAX_PARSED_BYTES:
+        raise ValueError("it holds too many lists, objects or numbers")
     hooks: dict[str, Any] = {} if any_size else {"parse_int": _whole_number, "parse_float": _finite_number}
     if not constants:
         hooks["parse_constant"] = _refuse_constant
@@ -82,6 +97,51 @@ def open_ordinary(path: Path) -> IO[bytes]:
         OSError: it is missing or cannot be read.
     """
     return os.fdopen(open_handle(path, os.O_RDONLY, follow_link=True), "rb")
+
+
+def short_lines(file: io.TextIOWrapper, most: int) -> Iterator[str]:
+    """The lines of a text, for readers of csv, which hold a line in memory many times over.
+
+    Raises:
+        ValueError: a line has `most` characters or more.
+    """
+    while line := file.readline(most):
+        if len(line) == most:
+            raise ValueError(f"a line has more than {most:,} characters")
+        yield line
+
+
+def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
+    """Open a zip archive whose list of members is of moderate size. Its members are checked by `open_member`.
+
+    Raises:
+        ValueError: the list is missing or too long.
+        zipfile.BadZipFile: the archive is damaged.
+    """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - _MAX_COMMENT_BYTES - _ARCHIVE_END_SIZE))
+    tail = file.read()
+    place = tail.rfind(_ARCHIVE_END)
+    if place < 0 or len(tail) < place + _ARCHIVE_END_SIZE:
+        raise ValueError("its end is missing: copy it again")
+    directory = int.from_bytes(tail[place + 12 : place + 16], "little")
+    if directory > _MAX_DIRECTORY_BYTES or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE_ARCHIVE):
+        raise ValueError("it has far more members than such a file")
+    return zipfile.ZipFile(file)
+
+
+def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> zipfile.ZipExtFile:
+    """Open a member of an archive for reading.
+
+    Raises:
+        ValueError: it is encrypted, or compressed in a way that Python may lack.
+    """
+    if member.compress_type not in _PLAIN_MEMBERS:
+        raise ValueError("is compressed in an unusual way")
+    try:
+        return cast(zipfile.ZipExtFile, archive.open(member))
+    except (RuntimeError, NotImplementedError) as error:
+        raise ValueError(f"cannot be unpacked ({str(error)[:_MAX_SHOWN]})") from None
 
 
 def open_handle(path: Path, flags: int, *, follow_link: bool) -> int:
@@ -126,8 +186,8 @@ def _refuse_constant(name: str) -> float:
 def _object_of_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
+        seen: set[str] = set()
+        twice = next(name for name, _ in pairs if name in seen or seen.add(name))
         raise ValueError(f"it holds {twice[:_MAX_SHOWN]!r} twice")
     return content
 

@@ -3,7 +3,7 @@
 import { enliven } from "./alive";
 import type { Motion } from "./avatar";
 import { addTurning, fit } from "./controls";
-import { AvatarError, readAny } from "./format";
+import { AvatarError, readAll, readAny } from "./format";
 import { Viewer } from "./viewer";
 import type { BackendName } from "./webgpu";
 
@@ -94,7 +94,7 @@ export class MienAvatar extends HTMLElement {
     try {
       const answer = await fetch(this.src, { signal: loading.signal });
       if (!answer.ok) throw new AvatarError(`cannot be fetched: the server answers ${answer.status}`);
-      const { avatar, motion } = await readAny(new Uint8Array(await answer.arrayBuffer()));
+      const { avatar, motion } = await readAny(new Uint8Array(await readAll(answer.body!)));
       const named = this.getAttribute("backend") as BackendName | null;
       const backend = named && named !== "webgl2" ? await webgpu(named) : undefined;
       if (loading.signal.aborted) return;

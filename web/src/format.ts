@@ -11,6 +11,14 @@ export class AvatarError extends Error {}
 
 const VERSIONS = [1, 2, 3, 4, 5, 6];
 const BEYOND = "is damaged: an array lies beyond its end";
+const DAMAGED = "is damaged: its header cannot be";
+/** Most bytes of an avatar: a small file may unpack to gigabytes. */
+const MOST_BYTES = 1 << 27;
+/** Most bytes of the json text; it becomes many times as large. */
+const MOST_TEXT = 1 << 23;
+
+const isWhole = (value: unknown, most: number): value is number => Number.isSafeInteger(value) && (value as number) >= 0 && (value as number) <= most;
+const areNumbers = (values: unknown): values is number[] => Array.isArray(values) && values.every((value) => Number.isFinite(value));
 
 /** The avatar in a .mien file. The checksum is not checked: that is the work of `mien`. */
 export function readMien(file: ArrayBuffer): Avatar {
@@ -21,11 +29,13 @@ export function readMien(file: ArrayBuffer): Avatar {
     throw new AvatarError(`has version ${told.version} of the format; this page reads ${VERSIONS.join(", ")}`);
   }
   const start = 8 + Number(new DataView(file).getBigUint64(0, true));
+  let left = file.byteLength - start;
   const tensor = (name: string): Numbers => {
     const entry = header[name] as { dtype: string; data_offsets: [number, number] } | undefined;
     if (!entry) throw new AvatarError(`is damaged: there is no array ${name}`);
-    const [from, to] = entry.data_offsets;
-    if (start + to > file.byteLength) throw new AvatarError(BEYOND);
+    const [from, to] = Array.isArray(entry.data_offsets) ? entry.data_offsets : [];
+    // Arrays share no bytes: together, they are as large as the file.
+    if (!isWhole(to, file.byteLength - start) || !isWhole(from, to) || (to - from) % 4 || (left -= to - from) < 0) throw new AvatarError(BEYOND);
     const bytes = file.slice(start + from, start + to);
     return entry.dtype === "I32" ? new Int32Array(bytes) : new Float32Array(bytes);
   };
@@ -34,7 +44,7 @@ export function readMien(file: ArrayBuffer): Avatar {
 
 function safetensorsHeader(file: ArrayBuffer): { [key: string]: Tree } {
   const size = file.byteLength >= 8 ? Number(new DataView(file).getBigUint64(0, true)) : Infinity;
-  if (8 + size > file.byteLength) throw new AvatarError("is not a .mien file");
+  if (8 + size > file.byteLength || size > MOST_TEXT) throw new AvatarError("is not a .mien file");
   return parse(new TextDecoder().decode(new Uint8Array(file, 8, size))) as { [key: string]: Tree };
 }
 
@@ -53,15 +63,44 @@ interface PackedTensor {
  * a json text (uint32), that text, and the arrays as integers of 8 or 16 bits.
  */
 export async function readPacked(packed: Uint8Array): Promise<{ avatar: Avatar; motion: Motion | null }> {
-  const stream = new Blob([packed as BlobPart]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const file = await new Response(stream).arrayBuffer();
-  const size = new DataView(file).getUint32(0, true);
+  const file = await readAll(new Blob([packed as BlobPart]).stream().pipeThrough(new DecompressionStream("gzip")));
+  const size = file.byteLength >= 4 ? new DataView(file).getUint32(0, true) : Infinity;
+  if (4 + size > file.byteLength || size > MOST_TEXT) throw new AvatarError(DAMAGED);
   const told = parse(new TextDecoder().decode(new Uint8Array(file, 4, size))) as { [key: string]: Tree };
   if (told.format !== "mien.packed" || told.version !== 1) throw new AvatarError("was written by another version of mien");
-  const tensors = told.tensors as unknown as { [name: string]: PackedTensor };
-  const tensor = (name: string) => unpack(file, 4 + size, tensors[name]);
+  const tensors = (told.tensors ?? {}) as unknown as { [name: string]: PackedTensor };
+  let left = file.byteLength;
+  const tensor = (name: string) => {
+    const entry = tensors[name], count = entry && countOf(entry);
+    if (!entry || !isWhole(count, file.byteLength)) throw new AvatarError(DAMAGED);
+    // Arrays share no bytes: together, they are as large as the file.
+    if ((left -= (count * entry.bits) / 8) < 0) throw new AvatarError(BEYOND);
+    return unpack(file, 4 + size, entry, count);
+  };
   const content = restored(told.content, tensor) as unknown as { avatar: Avatar; motion: Motion | null };
   return { avatar: checked(content.avatar), motion: content.motion };
+}
+
+/** The bytes of a stream. One that goes beyond MOST_BYTES is left there. */
+export async function readAll(stream: ReadableStream<Uint8Array>): Promise<ArrayBuffer> {
+  const parts: Uint8Array[] = [], reader = stream.getReader();
+  for (let size = 0; ; ) {
+    const { done, value } = await reader.read();
+    if (done) return new Blob(parts as BlobPart[]).arrayBuffer();
+    if ((size += value.length) > MOST_BYTES) {
+      await reader.cancel();
+      throw new AvatarError(`is larger than ${MOST_BYTES >> 20} MB`);
+    }
+    parts.push(value);
+  }
+}
+
+/** The number of values of an array whose entry can be; else NaN. */
+function countOf({ shape, bits, middle, step, at, integers }: PackedTensor): number {
+  if (!areNumbers(shape) || !shape.every((side) => isWhole(side, MOST_BYTES)) || ![8, 16, 32].includes(bits) || !isWhole(at, MOST_BYTES)) return NaN;
+  const count = shape.reduce((product, side) => product * side, 1);
+  const grouped = areNumbers(middle) && areNumbers(step) && middle.length === step.length && count % Math.max(middle.length, 1) === 0;
+  return bits === 32 || integers || grouped ? count : NaN;
 }
 
 /** An avatar in either form, told apart by its first bytes. */
@@ -71,8 +110,7 @@ export async function readAny(file: Uint8Array): Promise<{ avatar: Avatar; motio
 }
 
 /** value = middle + integer * step, with one middle and step for each index of the first axis or for each column. */
-function unpack(file: ArrayBuffer, start: number, tensor: PackedTensor): Numbers {
-  const count = tensor.shape.reduce((product, size) => product * size, 1);
+function unpack(file: ArrayBuffer, start: number, tensor: PackedTensor, count: number): Numbers {
   const from = start + tensor.at;
   if (from + (count * tensor.bits) / 8 > file.byteLength) throw new AvatarError(BEYOND);
   if (tensor.bits === 32) {
@@ -109,6 +147,7 @@ function restored(node: Tree, tensor: (name: string) => Numbers): unknown {
   if (Array.isArray(node)) return node.map((item) => restored(item, tensor));
   if (node === null || typeof node !== "object") return node;
   if (typeof node.tensor === "string") return tensor(node.tensor);
+  if ("length" in node) throw new AvatarError(DAMAGED); // it would be taken for a list, and be gone through without end
   return Object.fromEntries(Object.entries(node).map(([key, item]) => [key, restored(item, tensor)]));
 }
 

@@ -62,9 +62,11 @@ def read_calibration(path: Path) -> list[CalibratedCamera]:
     entries = read_camera_entries(path, "give one entry for every camera")
     found = [_calibrated_camera(entry, f"{path}: camera {index}") for index, entry in enumerate(entries)]
     ids = [camera.camera_id for camera in found]
+    seen: set[str] = set()
     for camera_id in ids:
-        if ids.count(camera_id) > 1:
+        if camera_id in seen:
             raise UserError(f"{path}: two cameras have the id {camera_id!r}; give every camera its own")
+        seen.add(camera_id)
     return found
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.bounded import open_ordinary
+from mien.bounded import open_ordinary, short_lines
 from mien.capture.crop import Crop, whole_picture
 from mien.capture.faces import LANDMARKS
 from mien.capture.lens import Lens
@@ -22,6 +22,9 @@ from mien.limits import MAX_NUMBER
 from mien.storage import read_arrays
 from mien.terminal import counted
 
+_MAX_LINE = 2 * LANDMARKS * 64
+"""Most characters of a csv line: more than a number of any precision takes."""
+_SPARE_BYTES = 1 << 20
 _MAX_SHOWN = 40
 """Characters of a csv cell that a message shows."""
 
@@ -119,6 +122,7 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
         UserError: the file is missing, damaged or of another shape.
     """
     if path.suffix == ".safetensors":
+        _check_size(path, source_frames)
         landmarks = read_arrays(path).get("landmarks")
         if landmarks is None:
             raise UserError(f"{path}: has no array `landmarks`; write one of [{source_frames}, {LANDMARKS}, 2] pixels")
@@ -135,12 +139,23 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
     if landmarks.dtype.kind not in "iuf":
         raise UserError(f"{path}: `landmarks` is {landmarks.dtype}; write numbers, pixels, as float32")
     landmarks = landmarks.astype(np.float64)
-    if (np.abs(landmarks) > MAX_NUMBER).any():
+    if any((np.abs(frame) > MAX_NUMBER).any() for frame in landmarks):
         raise UserError(
             f"{path}: has numbers that are infinite or beyond {MAX_NUMBER:g} pixels; write nan where there is no face"
         )
     landmarks[~np.isfinite(landmarks).all(axis=(1, 2))] = np.nan
     return landmarks
+
+
+def _check_size(path: Path, frames: int) -> None:
+    """Refuse a file that is far larger than the landmarks of a number of frames, before it is read."""
+    most = _SPARE_BYTES + 2 * frames * LANDMARKS * 2 * np.dtype(np.float64).itemsize
+    size = path.stat().st_size if path.is_file() else 0
+    if size > most:
+        raise UserError(
+            f"{path}: has {size:,} bytes, and landmarks of {counted(frames, 'frame')} have at most {most:,}; write "
+            "`landmarks` alone, as float32"
+        )
 
 
 def _read_csv(path: Path, most: int) -> np.ndarray:
@@ -151,7 +166,7 @@ def _read_csv(path: Path, most: int) -> np.ndarray:
     rows: list[np.ndarray] = []
     try:
         with io.TextIOWrapper(open_ordinary(path), encoding="utf-8", newline="") as file:
-            for number, line in enumerate(csv.reader(file), 1):
+            for number, line in enumerate(csv.reader(short_lines(file, _MAX_LINE)), 1):
                 if number == 1 and any(_is_name(cell) for cell in line):
                     continue
                 if len(line) not in (0, 2 * LANDMARKS):

@@ -1,5 +1,6 @@
 """The sound of a file: read as samples, and written beside the pictures of a video."""
 
+import contextlib
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -8,7 +9,7 @@ import av
 import av.error
 import numpy as np
 from av.audio.resampler import AudioResampler
-from av.container import OutputContainer
+from av.container import InputContainer, OutputContainer
 from jaxtyping import Float32
 
 from mien.capture.video_file import open_sound
@@ -17,6 +18,8 @@ from mien.errors import UserError
 RATE = 16_000
 """Samples a second of `read_sound`."""
 _MOST_SECONDS = 3600.0
+_LEAST_RATE, _MOST_RATE = 1_000, 768_000
+"""Bounds of the samples a second of a file."""
 _WRITTEN_RATE = 48_000
 _WRITTEN_BITS = 160_000
 
@@ -63,20 +66,48 @@ def _packets(stream: "av.AudioStream", path: Path, samples: int) -> Iterator[av.
 
 def _resampled(path: Path, sample: str, layout: str | None, rate: int) -> Iterator[av.AudioFrame]:
     """The decoded sound. Damaged parts after the beginning are left out."""
-    count, resampler = 0, AudioResampler(format=sample, layout=layout, rate=rate)
+    count = 0
     with open_sound(path) as (container, stream):
-        decoded = container.decode(stream)
-        while True:
-            try:
-                frame = next(decoded, None)
-            except (av.error.FFmpegError, OSError):
-                break
-            for piece in resampler.resample(frame):
-                count += piece.samples
-                if count > _MOST_SECONDS * rate:
-                    raise UserError(f"{path}: is longer than an hour; cut it into shorter files")
-                yield piece
-            if frame is None:
-                break
+        for piece in _converted(path, _decoded(container, stream), sample, layout, rate):
+            count += piece.samples
+            if count > _MOST_SECONDS * rate:
+                raise UserError(f"{path}: is longer than an hour; cut it into shorter files")
+            yield piece
     if count == 0:
         raise UserError(f"{path}: no sound of it can be decoded; convert it to .wav or record it again")
+
+
+def _decoded(container: InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame]:
+    """The frames up to the first that cannot be decoded."""
+    with contextlib.suppress(av.error.FFmpegError, OSError):
+        yield from container.decode(stream)
+
+
+def _converted(
+    path: Path, frames: Iterator[av.AudioFrame], sample: str, layout: str | None, rate: int
+) -> Iterator[av.AudioFrame]:
+    """The frames in another format. The first one whose rate or channels differ from those before begins anew.
+
+    Raises:
+        UserError: the rate is one that no sound has, or the frames cannot be converted.
+    """
+    resampler, kind = None, None
+    try:
+        for frame in frames:
+            if not _LEAST_RATE <= frame.sample_rate <= _MOST_RATE:
+                raise UserError(
+                    f"{path}: has {frame.sample_rate:,} samples a second, not {_LEAST_RATE:,} to {_MOST_RATE:,}; "
+                    "convert it to .wav or record it again"
+                )
+            found = (frame.sample_rate, frame.layout.name, frame.format.name)
+            if resampler is None or found != kind:
+                if resampler is not None:
+                    yield from resampler.resample(None)
+                resampler, kind = AudioResampler(format=sample, layout=layout, rate=rate), found
+            yield from resampler.resample(frame)
+        if resampler is not None:
+            yield from resampler.resample(None)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise UserError(
+            f"{path}: its sound cannot be converted ({error}); convert it to .wav or record it again"
+        ) from None

@@ -53,6 +53,9 @@ class Command:
     workspace or sequence folder of the driver at rest."""
     every: int = 1
     """With --series, take only every n-th frame."""
+    sh: Literal[0, 1, 2, 3] | None = None
+    """For .ply: degree of the spherical harmonics in the file. Coefficients that the avatar lacks are zeros, for
+    programs that expect those of degree 3: 248 bytes for each Gaussian (default: the avatar's own degree)."""
     webgpu: bool = False
     """For .html: the page draws with WebGPU where the browser has it on a GPU, and with WebGL2 elsewhere. The page
     becomes 22 kB larger."""
@@ -68,6 +71,8 @@ class Command:
 
         if self.webgpu and self.out.suffix.lower() != ".html":
             raise UserError(f"{self.out}: only an .html page draws with WebGPU; leave --webgpu out")
+        if self.sh is not None and (self.out.suffix.lower() != ".ply" or self.format == "gaussian-avatars"):
+            raise UserError(f"{self.out}: only a .ply has a degree to choose; leave --sh out")
         self._check_webcam()
         if self.workspace.suffix.lower() in _FILES and not self.workspace.is_dir():
             self._check_file()
@@ -163,7 +168,7 @@ class Command:
     def _convert(self) -> None:
         from mien.commands.stages.converting import convert
 
-        convert(self.workspace, self.out, self._webcam_files(), self.webgpu)
+        convert(self.workspace, self.out, self._webcam_files(), self.webgpu, self.sh)
 
     def _check_folder(self) -> None:
         from mien.files import check_writable
@@ -248,7 +253,7 @@ class Command:
         from mien.progress import say
 
         face = with_expression(avatar.subject, avatar.face_model, self.set)
-        write_pose(self.out, _posed(avatar, face))
+        write_pose(self.out, _posed(avatar, face), self.sh)
         say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians")
 
     def _write_series(self, avatar, workspace: Workspace, series: str) -> None:
@@ -262,7 +267,7 @@ class Command:
             say(f"{self.out}: {count} time samples, {self.out.stat().st_size / 1e6:.1f} MB")
             return
         for index in indices:
-            write_pose(self._numbered(index), _posed(avatar, driven[index]))
+            write_pose(self._numbered(index), _posed(avatar, driven[index]), self.sh)
         say(f"{self._numbered(0)} ... {self._numbered(len(driven) - 1).name}: {len(driven)} files")
 
     def _driven(self, avatar, workspace: Workspace, series: str, with_head_pose: bool):

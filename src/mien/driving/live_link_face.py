@@ -14,11 +14,13 @@ import csv
 import io
 import math
 import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
+from mien.bounded import short_lines
 from mien.driving.motion import (
     ARKIT_NAMES,
     MAX_COEFFICIENT,
@@ -47,6 +49,10 @@ _OPTIONAL = "tongueOut"
 """The one coefficient that a csv may lack: it came a year after the others."""
 _MAX_HEADER = 65_536
 """Largest number of characters of the first line that decide what separates the columns."""
+_MAX_LINE = 1 << 20
+"""Most characters of a line."""
+_CELL_BYTES, _SHORT_CELL_BYTES, _MAX_CELLS_BYTES = 72, 8, 5 << 28
+"""Memory that the text of a value takes, also of one character, and most memory that all may take."""
 _SIDES = ("Left", "Right")
 _ANGLES = {name.lower() for name in (*HEAD, *EYES)}
 
@@ -131,15 +137,30 @@ def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
                 first = file.readline(_MAX_HEADER)
             delimiter = max(",;\t", key=first.count)
             file.seek(0)
-            reader = csv.reader(file, delimiter=delimiter)
-            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+            reader = csv.reader(short_lines(file, _MAX_LINE), delimiter=delimiter)
+            rows = [(reader.line_num, row) for row in _bounded(reader) if any(cell.strip() for cell in row)]
         if rows and rows[0][1][0].lower().startswith("sep="):
             del rows[0]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as csv ({error}); give a csv of Live Link Face") from None
     if len(rows) < 2:
         raise UserError(f"{path}: has no frames; give a csv of Live Link Face with a header and one row for each frame")
     return rows[0][1], rows[1:]
+
+
+def _bounded(rows: Iterable[list[str]]) -> Iterator[list[str]]:
+    """The rows, as long as they fit into moderate memory.
+
+    Raises:
+        ValueError: they do not.
+    """
+    taken = 0
+    for row in rows:
+        # Texts of one character take no memory of their own.
+        taken += len(row) * (_CELL_BYTES if sum(map(len, row)) > len(row) else _SHORT_CELL_BYTES)
+        if taken > _MAX_CELLS_BYTES:
+            raise ValueError("it has too many values; cut it into shorter recordings")
+        yield row
 
 
 def _has_face(row: list[str], columns: dict[str, int], width: int) -> bool:

@@ -15,6 +15,8 @@ from mien.training.frames import Frame
 
 _MAX_BYTES = 256 << 20
 """Largest file that is read, in bytes. A frame takes some hundred bytes."""
+_LEAST_LINE = 40
+"""Fewest bytes of a frame's line."""
 _MAX_INDEX = _MAX_BYTES
 """Largest index in a frame."""
 
@@ -51,9 +53,12 @@ class PartialScores:
 
     def _lines(self) -> list[str]:
         try:
-            return read_bytes(self.path, _MAX_BYTES).decode("utf-8", "replace").splitlines()
+            data = read_bytes(self.path, _MAX_BYTES)
         except (OSError, ValueError):
             return []
+        # A line takes more memory than its text, so a file of empty lines is not split.
+        whole = data.count(b"\n") <= 1 + len(data) // _LEAST_LINE
+        return data.decode("utf-8", "replace").split("\n") if whole else []
 
     def add(self, frame: Frame, scores: Mapping[str, Scores], seconds: float) -> None:
         """Append one more frame."""

@@ -50,6 +50,10 @@ def read_glb_avatar(path: Path) -> PortableAvatar:
             f"{path}: has version {found.get('version')!r:.80} of {EXTENSION}, expected {VERSION}; {_REMEDY}"
         )
     try:
+        # Several arrays must not share a view, as a small file would otherwise fill the memory.
+        views = [described["bufferView"] for described in found["tensors"].values() if "bufferView" in described]
+        if sum(glb.content["bufferViews"][view]["byteLength"] for view in views) > len(glb.buffer):
+            raise ValueError("its arrays are larger than its buffer")
         arrays = {name: _tensor(glb, described) for name, described in found["tensors"].items()}
         header = dict(found["avatar"])
         if "format" not in header:
@@ -61,7 +65,7 @@ def read_glb_avatar(path: Path) -> PortableAvatar:
 
 def _tensor(glb: Glb, described: dict[str, Any]) -> np.ndarray:
     shape, kind = described["shape"], _KINDS[described["dtype"]]
-    if not all(type(size) is int and size >= 0 for size in shape):
+    if not isinstance(shape, list) or not all(type(size) is int and size >= 0 for size in shape):
         raise ValueError("a tensor's shape is wrong")
     data = glb.bytes_of(described["bufferView"]) if "bufferView" in described else b""
     return np.frombuffer(data, kind).reshape(shape).copy()

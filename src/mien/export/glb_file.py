@@ -11,11 +11,15 @@ import numpy as np
 from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
 from mien.files import write_atomically
+from mien.limits import checked_whole
 
 _MAGIC, _VERSION = 0x46546C67, 2
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
-_MAX_BYTES = 1 << 30
+_MAX_BYTES = 1 << 28
 """Largest file that is read, in bytes. The largest that mien writes has some tens of megabytes."""
+_MAX_JSON_BYTES = 32 << 20
+_MAX_ROWS = 1 << 24
+"""Most rows of an accessor. One that is sparse may be larger than its bytes."""
 _COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123, np.dtype("u1"): 5121}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 VERTICES, INDICES = 34962, 34963
@@ -125,11 +129,15 @@ class Glb:
     buffer: bytes
 
     def array(self, accessor: int) -> np.ndarray:
-        """The values of an accessor: [n], or [n, c]."""
+        """The values of an accessor: [n], or [n, c].
+
+        Raises:
+            ValueError: it has too many rows, or reaches beyond the buffer.
+        """
         described = self.content["accessors"][accessor]
         width = next(width for width, name in _TYPES.items() if name == described["type"])
         kind = self._kind(described["componentType"])
-        shape = (described["count"], width)
+        shape = (checked_whole(described["count"], 0, _MAX_ROWS), width)
         if "bufferView" in described:
             values = np.frombuffer(self.bytes_of(described["bufferView"]), kind).reshape(shape).copy()
         else:
@@ -173,7 +181,7 @@ def read_glb(path: Path) -> Glb:
             raise ValueError("its header is wrong")
         length, kind = struct.unpack_from("<II", data, 12)
         rest, binary = struct.unpack_from("<II", data, 20 + length)
-        if (kind, binary) != (_JSON, _BINARY) or 28 + length + rest != len(data):
+        if (kind, binary) != (_JSON, _BINARY) or 28 + length + rest != len(data) or length > _MAX_JSON_BYTES:
             raise ValueError("its chunks are wrong")
         content = parse_json(data[20 : 20 + length].decode())
         if not isinstance(content, dict):

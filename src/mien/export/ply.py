@@ -1,6 +1,8 @@
 """The standard .ply format of 3D Gaussians, which viewers, editors and game engines read."""
 
+import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -21,6 +23,8 @@ _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 _MAX_COUNT_DIGITS = 12
 _MAX_GAUSSIANS = 2_000_000
 """Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
+_MAX_BYTES = 1 << 29
+"""Most bytes of vertices that are read: that number of Gaussians, with spherical harmonics of degree 3."""
 _TYPES = {
     "char": "<i1", "int8": "<i1", "uchar": "<u1", "uint8": "<u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -40,7 +44,7 @@ def property_names(sh_coefficients: int) -> list[str]:
     return ["x", "y", "z", "nx", "ny", "nz", *dc, *rest, "opacity", *scales, *quats]
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> None:
+def write_ply(path: Path, gaussians: Gaussians, degree: int | None = None) -> None:
     """Write unbatched Gaussians as binary little-endian .ply with raw values, in the layout of the 3DGS training code.
 
     `opacity` is a logit, `scale_*` are natural logarithms of metres, `rot_*` is wxyz of unit length, and `f_rest_*`
@@ -48,10 +52,18 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     frame if `T_world_local` is set, and in world space otherwise. A comment line keeps that pose for `read_ply`. Other
     programs have no local frame: use `in_world` first if the pose matters to them.
 
+    Args:
+        path: The file.
+        gaussians: Gaussians.
+        degree: Degree of the spherical harmonics in the file, 0 to 3. Coefficients that the Gaussians lack are zero,
+            which does not change their colours: some programs read only degree 3. By default, that of the Gaussians.
+
     Raises:
-        UserError: a value is NaN or infinite.
+        UserError: a value is NaN or infinite, or the Gaussians have a higher degree.
     """
     assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
+    if degree is not None:
+        gaussians = _padded(path, gaussians, degree)
     rows = _raw_rows(gaussians)
     if not np.isfinite(rows).all():
         bad = int((~np.isfinite(rows)).any(1).sum())
@@ -70,6 +82,14 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
         temporary.write_bytes(header.encode("ascii") + rows.tobytes())
 
     write_atomically(path, write)
+
+
+def _padded(path: Path, gaussians: Gaussians, degree: int) -> Gaussians:
+    sh, coefficients = gaussians.sh, (degree + 1) ** 2
+    if sh.shape[1] > coefficients:
+        own = math.isqrt(sh.shape[1]) - 1
+        raise UserError(f"{path}: --sh {degree}: the avatar has degree {own}; give {own} or more, or leave it out")
+    return replace(gaussians, sh=torch.cat([sh, sh.new_zeros(len(sh), coefficients - sh.shape[1], 3)], dim=1))
 
 
 def read_ply(path: Path) -> Gaussians:
@@ -108,6 +128,10 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
                 )
             if count > _MAX_GAUSSIANS:
                 raise UserError(f"{path}: has {count:,} Gaussians, more than {_MAX_GAUSSIANS:,}; remove some of them")
+            if expected > _MAX_BYTES:
+                raise UserError(
+                    f"{path}: has {expected:,} bytes of vertices, more than {_MAX_BYTES:,}; leave columns out"
+                )
             body = file.read(expected)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -125,7 +149,7 @@ def stacked(columns: dict[str, np.ndarray], names: list[str], path: Path) -> Ten
     missing = [name for name in names if name not in columns]
     if missing:
         raise UserError(f"{path}: lacks {missing[0]}; give a .ply with 3D Gaussians")
-    return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32))
+    return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32, copy=False))
 
 
 def stacked_sh(columns: dict[str, np.ndarray], path: Path) -> Tensor:

@@ -6,6 +6,7 @@ Source: the specification at developer.playcanvas.com, "The SOG Format".
 import io
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,13 @@ import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
 
-from mien.bounded import open_ordinary, parse_json
+from mien.bounded import open_archive, open_member, open_ordinary, parse_json
+from mien.capture.picture import announced_size
 from mien.errors import UserError
 from mien.export.splats import finite_arrays, unit_quats
 from mien.files import write_atomically
 from mien.gaussians import Gaussians
+from mien.limits import checked_whole
 
 _VERSION = 2
 _CODES, _ROUNDS = 256, 20
@@ -31,7 +34,16 @@ _MIN_SCALE = 1e-7
 _BANDS = {3: 1, 8: 2, 15: 3}
 """Number of bands by the number of SH coefficients after the first."""
 _DATE = (1980, 1, 1, 0, 0, 0)
-_MAX_MEMBER, _MAX_GAUSSIANS = 1 << 26, 2_000_000
+_MAX_MEMBER, _MAX_META, _MAX_GAUSSIANS = 1 << 26, 1 << 20, 2_000_000
+_MAX_PALETTE = (1 << _PALETTE_BITS) * 15 + (1 << 16)
+"""Most pixels of the coefficients that Gaussians share."""
+_SPARE_PIXELS = 1 << 16
+"""Pixels that a picture may have besides two for each Gaussian: other programs round its sides up."""
+_DAMAGE = (
+    OSError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, SyntaxError, EOFError, zlib.error,
+    zipfile.BadZipFile, UnidentifiedImageError, Image.DecompressionBombError,
+)  # fmt: skip
+"""What Python's zip files, Pillow and numpy raise for damaged content."""
 _REMEDY = "give a .sog of version 2, as `mien export` writes"
 
 
@@ -85,14 +97,18 @@ def read_sog(path: Path) -> Gaussians:
         UserError: the file is missing, damaged, of another version, or too large.
     """
     try:
-        with open_ordinary(path) as file, zipfile.ZipFile(file) as members:
-            meta = parse_json(_member(members, "meta.json").decode())
+        with open_ordinary(path) as file, open_archive(file) as members:
+            meta = parse_json(_member(members, "meta.json", _MAX_META).decode())
             if meta["version"] != _VERSION:
                 raise ValueError(f"it has version {meta['version']!r:.20}")
-            if not 0 <= meta["count"] <= _MAX_GAUSSIANS:
-                raise ValueError(f"it has {meta['count']!r:.20} Gaussians, and at most {_MAX_GAUSSIANS:,} are read")
-            arrays = _decoded(members, meta)
-    except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile, UnidentifiedImageError) as error:
+            try:
+                checked_whole(meta["count"], 0, _MAX_GAUSSIANS)
+            except ValueError:
+                most = f"at most {_MAX_GAUSSIANS:,} are read"
+                raise ValueError(f"it has {meta['count']!r:.20} Gaussians, and {most}") from None
+            with np.errstate(over="ignore"):  # infinity is told below
+                arrays = _decoded(members, meta)
+    except _DAMAGE as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path}: cannot be read as .sog ({str(reason)[:100]}); {_REMEDY}") from None
     gaussians = Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
@@ -104,7 +120,13 @@ def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray
     count = meta["count"]
 
     def pixels(part: str, index: int, channels: int) -> np.ndarray:
-        with Image.open(io.BytesIO(_member(members, meta[part]["files"][index]))) as picture:
+        data = _member(members, meta[part]["files"][index])
+        size, most = announced_size(data), _MAX_PALETTE if (part, index) == ("shN", 0) else 2 * count + _SPARE_PIXELS
+        if size is None or size[0] * size[1] > most:
+            raise ValueError(f"{part} has more pixels than its {count:,} Gaussians need")
+        with Image.open(io.BytesIO(data)) as picture:
+            if picture.size != size:
+                raise ValueError(f"{part} has two sizes")
             values = np.asarray(picture.convert("RGBA")).reshape(-1, 4)[:, :channels]
         if part != "shN" or index == 1:
             if len(values) < count:
@@ -112,8 +134,11 @@ def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray
             return values[:count]
         return values
 
-    def book(part: str) -> np.ndarray:
-        return np.array(meta[part]["codebook"], np.float64)
+    def book(part: str, kind: type = np.float32) -> np.ndarray:
+        values = np.array(meta[part]["codebook"], kind)
+        if values.shape != (_CODES,):
+            raise ValueError(f"{part} has no codebook of {_CODES} numbers")
+        return values
 
     steps = pixels("means", 0, 3).astype(int) + 256 * pixels("means", 1, 3).astype(int)
     low, high = (np.array(meta["means"][name], np.float64) for name in ("mins", "maxs"))
@@ -121,14 +146,14 @@ def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray
     shades = pixels("sh0", 0, 4)
     sh = book("sh0")[shades[:, :3]][:, None]
     if "shN" in meta:
-        rest = (meta["shN"]["bands"] + 1) ** 2 - 1
+        rest = (checked_whole(meta["shN"]["bands"], 1, 3) + 1) ** 2 - 1
         labels = pixels("shN", 1, 2).astype(int) @ np.array([1, 256])
         palette = pixels("shN", 0, 3).reshape(-1, rest, 3)
         sh = np.concatenate([sh, book("shN")[palette[labels]]], axis=1)
     return (
         np.sign(logged) * np.expm1(np.abs(logged)),
         _unpacked_quats(pixels("quats", 0, 4)),
-        np.exp(book("scales")[pixels("scales", 0, 3)]),
+        np.exp(book("scales", np.float64)[pixels("scales", 0, 3)]),
         shades[:, 3] / 255,
         sh,
     )
@@ -232,8 +257,9 @@ def _zipped(members: dict[str, bytes]) -> bytes:
     return file.getvalue()
 
 
-def _member(members: zipfile.ZipFile, name: str) -> bytes:
+def _member(members: zipfile.ZipFile, name: str, most: int = _MAX_MEMBER) -> bytes:
     described = members.getinfo(str(name))
-    if described.file_size > _MAX_MEMBER:
+    if described.file_size > most:
         raise ValueError(f"{described.filename!r:.40} is too large")
-    return members.read(described)
+    with open_member(members, described) as file:
+        return file.read(most)

@@ -6,6 +6,7 @@ Source: the README of github.com/nianticlabs/spz, which describes the header, th
 import gzip
 import io
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -81,14 +82,17 @@ def read_spz(path: Path) -> Gaussians:
             rest = (degree + 1) ** 2 - 1
             shapes = [(count, 3, 3), (count,), (count, 3), (count, 3), (count, 4), (count, rest, 3)]
             columns = [_column(file, shape) for shape in shapes]
-    except (OSError, EOFError, ValueError, struct.error) as error:
+    except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path}: cannot be read as .spz ({reason}); {_REMEDY}") from None
     places, opacities, colours, scales, quats, higher = columns
     wide = np.concatenate([np.zeros((count, 3, 1), np.uint8), places], axis=2)
     means = (wide.reshape(count, 12).view("<i4") >> 8) / 2**fraction
     first = (colours.astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE
-    sh = np.concatenate([first[:, None], (higher.astype(np.float32) - _SH_STEPS) / _SH_STEPS], axis=1)
+    higher = higher.astype(np.float32)
+    higher -= _SH_STEPS  # in place: these are most of the numbers
+    higher /= _SH_STEPS
+    sh = np.concatenate([first[:, None], higher], axis=1)
     arrays = (
         means,
         _unpacked_quats(quats),

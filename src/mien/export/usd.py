@@ -14,15 +14,18 @@ from typing import Any
 import numpy as np
 import torch
 
+from mien.bounded import open_ordinary
 from mien.errors import UserError
 from mien.export.splats import finite_arrays, unit_quats
-from mien.export.usd_package import check_usd
+from mien.export.usd_package import USD_ENDINGS, check_usd
 from mien.files import write_atomically
 from mien.gaussians import Gaussians
 
 _ROOT, _SPLATS = "/avatar", "/avatar/gaussians"
 _REACH = 3.0
 """Standard deviations that the extent has around a centre."""
+_MAX_BYTES, _MAX_GAUSSIANS = 1 << 28, 2_000_000
+_REMEDY = "give a USD file of `mien export`"
 
 
 def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) -> int:
@@ -63,30 +66,81 @@ def read_usd(path: Path, time: float | None = None) -> Gaussians:
     """Read the Gaussians of a USD file at a time sample (default: without time).
 
     Raises:
-        UserError: usd-core is missing, or the file is missing, damaged, or without Gaussians.
+        UserError: usd-core is missing, or the file is missing, damaged, or without Gaussians, refers to other files, or
+            holds NaN or infinity.
     """
     check_usd(path)
     Tf, Usd, UsdVol = _pxr("Tf", "Usd", "UsdVol")
 
+    _check_file(path)
+    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
     try:
-        stage = Usd.Stage.Open(str(path))
+        stage = Usd.Stage.Open(_layer_alone(path))
         prims = (prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat))
         field = UsdVol.ParticleField3DGaussianSplat(next(prims))
+        attributes = (
+            field.GetPositionsAttr(), field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(),
+            field.GetRadianceSphericalHarmonicsCoefficientsAttr(),
+        )  # fmt: skip
+        values = [attribute.Get(at) for attribute in attributes]
     except (Tf.ErrorException, StopIteration):
-        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; give a USD file of `mien export`") from None
-    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-    attributes = (
-        field.GetPositionsAttr(), field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(),
-        field.GetRadianceSphericalHarmonicsCoefficientsAttr(),
-    )  # fmt: skip
-    values = [attribute.Get(at) for attribute in attributes]
+        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
     if any(value is None for value in values):
         raise UserError(f"{path}: has no Gaussians at time {time}; give a time of its samples")
+    try:
+        gaussians = _gaussians_of(values)
+    except (ValueError, TypeError, OverflowError):
+        raise UserError(f"{path}: its arrays do not fit each other; {_REMEDY}") from None
+    finite_arrays(path, gaussians)
+    return gaussians
+
+
+def _gaussians_of(values: list[Any]) -> Gaussians:
+    """Gaussians of the attributes of a field.
+
+    Raises:
+        ValueError: their lengths do not fit each other, or there are too many.
+    """
     means, turns, scales, opacities, sh = (np.array(value, np.float32) for value in values)
-    if not len(means) == len(turns) == len(scales) == len(opacities) or len(sh) % max(len(means), 1):
-        raise UserError(f"{path}: its arrays have different lengths; give a USD file of `mien export`")
-    arrays = (means, turns[:, [3, 0, 1, 2]], scales, opacities, sh.reshape(len(means), -1, 3))
+    count = len(means)
+    coefficients = len(sh) // max(count, 1)
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count * coefficients, 3))
+    if any(array.shape != shape for array, shape in zip((means, turns, scales, opacities, sh), shapes, strict=True)):
+        raise ValueError
+    if count > _MAX_GAUSSIANS or (count and coefficients not in (1, 4, 9, 16)):
+        raise ValueError
+    arrays = (means, turns[:, [3, 0, 1, 2]], scales, opacities, sh.reshape(count, coefficients, 3))
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what is no ordinary file, or is larger than any head. USD would wait for a pipe."""
+    try:
+        with open_ordinary(path) as file:
+            size = os.fstat(file.fileno()).st_size
+    except (OSError, ValueError):
+        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
+    if path.suffix.lower() not in USD_ENDINGS or size > _MAX_BYTES:
+        raise UserError(f"{path}: has no ending of USD, or more than {_MAX_BYTES:,} bytes; {_REMEDY}")
+
+
+def _layer_alone(path: Path) -> Any:
+    """The layer of a file, if it refers to no other file. A stranger's file could name any on this machine.
+
+    Raises:
+        UserError: it refers to another file.
+    """
+    (Sdf,) = _pxr("Sdf")
+
+    layer = Sdf.Layer.FindOrOpen(str(path.absolute()))
+    if layer is None:
+        raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
+    prims: list[Any] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda place: prims.append(place) if place.IsPrimPath() else None)
+    clips = any(layer.GetPrimAtPath(place).HasInfo("clips") for place in prims)
+    if clips or layer.GetCompositionAssetDependencies():
+        raise UserError(f"{path}: refers to other files, which are not opened; flatten it into one file")
+    return layer
 
 
 def _pxr(*names: str) -> list[Any]:

@@ -5,6 +5,8 @@ page.html beside this file is built from web/ and committed, so that writing a p
 
 import base64
 import html
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,14 +60,21 @@ def write_page(
     """
     check_writable(path)
     packed = base64.b64encode(pack(avatar, motion)).decode()
-    page = TEMPLATE.read_text(encoding="utf-8").replace("{{policy}}", POLICY if webcam else "")
-    page = page.replace("{{webcam}}", webcam_part(webcam) if webcam else "")
-    page = page.replace("{{title}}", html.escape(avatar.about.name))
-    gpu = f"\n<script>{WEBGPU.read_text(encoding='utf-8').strip()}</script>" if webgpu else ""
-    page = page.replace("{{webgpu}}", gpu)
-    content = page.replace("{{avatar}}", packed).encode()
+    parts = {
+        "policy": POLICY if webcam else "",
+        "webcam": webcam_part(webcam) if webcam else "",
+        "title": html.escape(avatar.about.name),
+        "webgpu": f"\n<script>{WEBGPU.read_text(encoding='utf-8').strip()}</script>" if webgpu else "",
+        "avatar": packed,
+    }
+    content = filled(TEMPLATE.read_text(encoding="utf-8"), parts).encode()
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
     return WrittenPage(len(content), _psnr(avatar))
+
+
+def filled(template: str, parts: Mapping[str, str]) -> str:
+    """A template with its marks, {{name}}, replaced in one pass: marks inside of a part, such as a name, stay text."""
+    return re.sub(rf"{{{{({'|'.join(parts)})}}}}", lambda mark: parts[mark[1]], template)
 
 
 def write_packed(path: Path, avatar: PortableAvatar, motion: Motion | None = None) -> WrittenPage:

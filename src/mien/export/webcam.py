@@ -13,6 +13,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from mien.bounded import read_bytes
 from mien.errors import UserError
 
 TEMPLATE = Path(__file__).with_name("webcam.html")
@@ -81,9 +82,9 @@ def webcam_part(files: WebcamFiles) -> str:
 
 def _packed(path: Path) -> str:
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+        content = read_bytes(path, _MOST_BYTES)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
 
 

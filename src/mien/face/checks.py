@@ -101,4 +101,4 @@ def _faults(model: FaceModel) -> Iterator[str]:
 
 
 def _is_moderate(tensor: Tensor) -> bool:
-    return tensor.numel() == 0 or bool(tensor.abs().max() <= MAX_NUMBER)
+    return tensor.numel() == 0 or bool(tensor.max() <= MAX_NUMBER and tensor.min() >= -MAX_NUMBER)

@@ -10,14 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mien.bounded import open_archive, open_member, open_ordinary
+
 MAX_MODEL_BYTES = 256 << 20
 """Largest size of all arrays of a face model together, in bytes. FLAME 2023 has 60 MB."""
-_MAX_DIRECTORY_BYTES = 1 << 20
-"""Largest list of members at the end of the archive, in bytes. Each member takes about 50."""
-_END, _END_SIZE = b"PK\x05\x06", 22
-_END_OF_LARGE = b"PK\x06\x07"
-"""Marker of archives with more than 65,534 members, or of 4 GB and more."""
-_MAX_COMMENT_BYTES = 65535
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -33,8 +29,7 @@ def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, 
             than `MAX_MODEL_BYTES`.
         Exception: whatever Python's `zipfile` raises for a file that is no archive or a damaged one.
     """
-    _check_directory(path)
-    with zipfile.ZipFile(path) as archive:
+    with open_ordinary(path) as file, open_archive(file) as archive:
         members = archive.infolist()
         names = [member.filename.removesuffix(_ENDING) for member in members]
         arrays: dict[str, np.ndarray] = {}
@@ -52,24 +47,8 @@ def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, 
     return names, arrays
 
 
-def _check_directory(path: Path) -> None:
-    """Refuse archives with a list of members that would fill the memory."""
-    with path.open("rb") as file:
-        size = path.stat().st_size
-        file.seek(max(0, size - _MAX_COMMENT_BYTES - _END_SIZE))
-        tail = file.read()
-    place = tail.rfind(_END)
-    if place < 0 or len(tail) < place + _END_SIZE:
-        raise ValueError("its end is missing: copy it again")
-    directory = int.from_bytes(tail[place + 12 : place + 16], "little")
-    if directory > _MAX_DIRECTORY_BYTES or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE):
-        raise ValueError("it has far more members than a face model")
-
-
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int) -> np.ndarray:
-    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError("is compressed in a way that numpy does not use")
-    with archive.open(member) as file:
+    with open_member(archive, member) as file:
         version = np.lib.format.read_magic(file)
         if version not in _HEADERS:
             raise ValueError(f"is of version {version} of numpy's format")

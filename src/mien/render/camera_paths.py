@@ -18,6 +18,8 @@ from mien.rotation import invert_rigid, matrix_from_axis_angle, rigid_transform
 from mien.storage import read_json, write_json
 
 FORMAT, VERSION = "mien.cameras", 1
+_MAX_CAMERAS = 50_000
+"""Most cameras of a file: half an hour at 30 frames a second."""
 _WORLD_UP = (0.0, 1.0, 0.0)
 _DISTORTION = re.compile(
     r"dist(?!ance)|fisheye|radial|tangential|coef|^([kp][1-6]|s[1-4]|tau[xy12]|d|kc|xi|rd)$", re.IGNORECASE
@@ -128,6 +130,8 @@ def read_camera_entries(path: Path, remedy: str) -> list[Any]:
         raise UserError(f"{path}: has {names[0]} for all cameras together; write it into the entry of each camera")
     if not isinstance(listed, list) or not listed:
         raise UserError(f"{path}: has no list `cameras`; {remedy}")
+    if len(listed) > _MAX_CAMERAS:
+        raise UserError(f"{path}: has {len(listed):,} cameras, and at most {_MAX_CAMERAS:,} are read; split the file")
     return listed
 
 

@@ -29,6 +29,8 @@ MAX_SHAPES = 256
 """Largest number of expressions, plus nine for each free joint, that native/face.h accepts."""
 MAX_ACTIVATIONS = 8
 """Largest number of activations that native/expression_change.h accepts, for parts other than features."""
+_MAX_NAME = 1000
+"""Most characters of a name or of another text."""
 _MAX_LOG_SCALE = 30
 """Largest logarithm of a scale. Its exponential, and the square of that, still fit into float32."""
 
@@ -87,6 +89,8 @@ def _faults(avatar: PortableAvatar) -> Iterator[str]:
     texts = [getattr(avatar.about, f.name) for f in fields(avatar.about)]
     if not all(map(is_one_line, (*texts, *avatar.expression_names, *avatar.joint_names))):
         yield "a name in it has several lines"
+    if any(len(text) > _MAX_NAME for text in (*texts, *avatar.expression_names, *avatar.joint_names)):
+        yield f"a name in it has more than {_MAX_NAME:,} characters"
 
 
 def _confidence_faults(confidence: np.ndarray, baked: BakedAvatar) -> Iterator[str]:

@@ -24,6 +24,8 @@ from mien.runtime.checks import check
 
 FORMAT, VERSIONS = "mien.baked", (1, 2, 3, 4, 5, 6)
 ENDING = ".mien"
+_MAX_BYTES = 1 << 29
+"""Largest file that is read, in bytes. The largest that mien writes has some tens of megabytes."""
 _REMEDY = "write one with `mien export DIR --out me.mien`"
 
 
@@ -47,6 +49,8 @@ def read_portable(path: Path) -> PortableAvatar:
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file; {_REMEDY}")
+    if path.stat().st_size > _MAX_BYTES:
+        raise UserError(f"{path}: has more than {_MAX_BYTES:,} bytes, too many for an avatar; {_REMEDY}")
     try:
         metadata, arrays = read_safetensors(path, _load)
     except UserError as error:
@@ -93,7 +97,8 @@ def from_arrays(path: Path, header: Any, arrays: dict[str, np.ndarray]) -> Porta
                 f"{path}: does not match its checksum, so it was damaged or changed; copy it again, or export it again "
                 "with `mien export`"
             )
-        tree = _restored(header["content"], arrays)
+        # Each array has one place, so that no check of a small file repeats without end.
+        tree = _restored(header["content"], dict(arrays))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: is damaged ({repr(error)[:200]}); export it again with `mien export`") from None
     with expect_whole(path, "export it again with `mien export`"), jaxtyped("context"):
@@ -133,7 +138,7 @@ def _tree(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 def _restored(node: Any, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(node, dict) and set(node) == {"tensor"}:
-        return arrays[node["tensor"]]
+        return arrays.pop(node["tensor"])
     if isinstance(node, dict):
         return {key: _restored(item, arrays) for key, item in node.items()}
     return [_restored(item, arrays) for item in node] if isinstance(node, list) else node

@@ -11,11 +11,13 @@ from mien.progress import say
 from mien.runtime import PortableAvatar, read_portable, write_portable
 
 
-def convert(source: Path, out: Path, webcam: WebcamFiles | None = None, webgpu: bool = False) -> None:
+def convert(
+    source: Path, out: Path, webcam: WebcamFiles | None = None, webgpu: bool = False, sh: int | None = None
+) -> None:
     """Write the avatar in a file as .mien, .html, .packed, or at rest with the head at the origin, and report it.
 
     `webcam` are files of the face landmarker for a .html page, and `webgpu` says whether it draws with WebGPU where the
-    browser has it.
+    browser has it. `sh` is the degree of the spherical harmonics in a .ply (`mien.export.write_ply`).
 
     Raises:
         UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
@@ -29,7 +31,7 @@ def convert(source: Path, out: Path, webcam: WebcamFiles | None = None, webgpu: 
     elif ending == ".packed":
         write_packed(out, avatar)
     else:
-        write_pose(out, _at_rest(avatar))
+        write_pose(out, _at_rest(avatar), sh)
     say(f"{out}: {avatar.about.name!r} of {source}, {out.stat().st_size / 1e6:.1f} MB")
 
 

@@ -1,0 +1,301 @@
+"""Small files that would take gigabytes, minutes or other errors: refused in one line, before memory is taken."""
+
+import gzip
+import io
+import json
+import random
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+from PIL import Image
+
+from bounded_memory import MIB, allocating_at_most
+from damage import flip_or_cut
+from mien import runtime
+from mien.bounded import parse_json
+from mien.capture.faces import LANDMARKS
+from mien.capture.given import read_landmarks
+from mien.cli import main
+from mien.driving import read_blendshape_json, read_live_link_face
+from mien.errors import UserError
+from mien.export import (
+    read_glb,
+    read_glb_avatar,
+    read_ply,
+    read_sog,
+    read_spz,
+    read_usd,
+    write_sog,
+    write_spz,
+    write_usd,
+)  # fmt: skip
+from mien.export.glb_avatar import EXTENSION
+from mien.export.glb_file import GlbWriter
+from mien.export.ply import property_names
+from mien.render.camera_paths import read_cameras
+from mien.runtime.file import _digest
+from mien.storage import write_json, write_tensors
+from test_glb_avatar import rewritten, written
+from test_splat_files import needs_usd, some
+from toy_workspace import write_toy_workspace
+from web_case import drawn_head
+
+SECONDS = 20
+CASES = 60
+"""Number of damaged files of each format."""
+
+
+def refused(read: Callable[[Path], Any], path: Path, words: str, most: int = 64 * MIB) -> None:
+    with allocating_at_most(most, SECONDS), pytest.raises(UserError, match=words) as error:
+        read(path)
+    message = str(error.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    assert len(message) < 700
+
+
+def members_of(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def write_members(path: Path, members: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return path
+
+
+def webp(width: int, height: int) -> bytes:
+    file = io.BytesIO()
+    Image.new("RGB", (width, height)).save(file, "WEBP", lossless=True)
+    return file.getvalue()
+
+
+def test_arrays_of_a_glb_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
+    source = written("gaussian_avatars", tmp_path)[0]
+
+    def share(content: dict[str, Any]) -> None:
+        tensors = content["extensions"][EXTENSION]["tensors"]
+        largest = max((one for one in tensors.values() if "bufferView" in one), key=lambda one: np.prod(one["shape"]))
+        tensors.update({f"x{index}": largest for index in range(3000)})
+
+    path = rewritten(source, tmp_path / "a.glb", share)
+    refused(read_glb_avatar, path, "its arrays are larger than its buffer")
+
+
+def test_a_sparse_accessor_of_a_glb_has_a_bound(tmp_path: Path) -> None:
+    writer = GlbWriter()
+    writer.sparse(np.eye(4, dtype=np.float32))
+    writer.accessors[0]["count"] = 1 << 40
+    writer.write(tmp_path / "a.glb", {})
+    with allocating_at_most(64 * MIB, SECONDS), pytest.raises(ValueError, match="is not a whole number"):
+        read_glb(tmp_path / "a.glb").array(0)
+
+
+def test_arrays_of_a_mien_have_one_place_each(tmp_path: Path) -> None:
+    """Each of them would be checked again for every place."""
+    path = tmp_path / "a.mien"
+    runtime.write_portable(path, drawn_head(200, 0))
+    with safetensors.safe_open(path, framework="numpy") as file:
+        header, arrays = json.loads(file.metadata()["mien"]), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    baked = header["content"]["baked"]
+    baked["attributes"]["log_scales"] = baked["means"]
+    header["sha256"] = _digest(header["content"], arrays)
+    path.write_bytes(safetensors.numpy.save(arrays, {"mien": json.dumps(header)}))
+    refused(runtime.read_portable, path, "is damaged")
+
+
+def test_pictures_of_a_sog_belong_to_its_gaussians(tmp_path: Path) -> None:
+    write_sog(tmp_path / "a.sog", some(50, 4))
+    members = members_of(tmp_path / "a.sog")
+    large = webp(4096, 1024)
+    assert len(large) < 6000
+    for name in ("means_l", "quats", "sh0", "shN_labels", "shN_centroids"):
+        path = write_members(tmp_path / "b.sog", members | {f"{name}.webp": large})
+        refused(read_sog, path, "has more pixels than its 50 Gaussians need")
+
+
+def test_other_numbers_of_a_sog_have_bounds(tmp_path: Path) -> None:
+    write_sog(tmp_path / "a.sog", some(50, 4))
+    members = members_of(tmp_path / "a.sog")
+    meta = json.loads(members["meta.json"])
+    for part, name, value in (
+        ("shN", "bands", 10**18), ("shN", "bands", -1), ("sh0", "codebook", [[0.0] * 300] * 256),
+        ("scales", "codebook", [1e4] * 256), ("sh0", "codebook", [0.0] * 99),
+    ):  # fmt: skip
+        changed = meta | {part: meta[part] | {name: value}}
+        path = write_members(tmp_path / "b.sog", members | {"meta.json": json.dumps(changed).encode()})
+        refused(read_sog, path, r"cannot be read as \.sog|NaN or infinite")
+    text = json.dumps(meta).encode() + b" " * (2 << 20)
+    refused(read_sog, write_members(tmp_path / "b.sog", members | {"meta.json": text}), "too large")
+
+
+def test_members_that_python_cannot_unpack_are_told(tmp_path: Path) -> None:
+    write_sog(tmp_path / "a.sog", some(50, 1))
+    members = members_of(tmp_path / "a.sog")
+    path = write_members(tmp_path / "b.sog", members, zipfile.ZIP_LZMA)
+    refused(read_sog, path, "is compressed in an unusual way")
+    data = bytearray((tmp_path / "a.sog").read_bytes())
+    directory = data.index(b"PK\x01\x02")
+    for place, value in ((8, b"\x01\x00"), (10, b"\x63\x00"), (8, b"\x20\x00")):  # encrypted, method 99, patched
+        other = data.copy()
+        other[directory + place : directory + place + 2] = value
+        path.write_bytes(other)
+        refused(read_sog, path, r"cannot be read as \.sog")
+
+
+def damaged_files(content: bytes, seed: int) -> list[bytes]:
+    source = random.Random(seed)
+    return [flip_or_cut(content, source) for _ in range(CASES)]
+
+
+def test_random_damage_to_splat_files_is_told(tmp_path: Path) -> None:
+    """Damage behind the checksums, too: of the numbers in gzip, and of the json in a zip."""
+    write_spz(tmp_path / "a.spz", some(50, 4))
+    write_sog(tmp_path / "a.sog", some(50, 4))
+    packed = (tmp_path / "a.spz").read_bytes()
+    plain = gzip.decompress(packed)
+    members = members_of(tmp_path / "a.sog")
+    spz = damaged_files(packed, 1) + [gzip.compress(one) for one in damaged_files(plain, 2)]
+    inner = [
+        write_members(tmp_path / "b.sog", members | {name: one}).read_bytes()
+        for name in members
+        for one in damaged_files(members[name], 3)[:12]
+    ]
+    sog = damaged_files((tmp_path / "a.sog").read_bytes(), 4) + inner
+    for name, read, contents in (("c.spz", read_spz, spz), ("c.sog", read_sog, sog)):
+        for content in contents:
+            (tmp_path / name).write_bytes(content)
+            try:
+                found = read(tmp_path / name)
+            except UserError as error:
+                assert "\n" not in str(error)  # noqa: PT017
+            else:
+                assert all(bool(tensor.isfinite().all()) for tensor in (found.means, found.scales, found.sh))
+
+
+def test_rows_of_a_ply_have_a_bound(tmp_path: Path) -> None:
+    """A file with a hole has any size, and takes no place on the disk."""
+    names = [*property_names(1), *(f"more_{index}" for index in range(2000))]
+    lines = "".join(f"property float {name}\n" for name in names)
+    path = tmp_path / "a.ply"
+    path.write_text(f"ply\nformat binary_little_endian 1.0\nelement vertex 1000000\n{lines}end_header\n")
+    with path.open("r+b") as file:
+        file.truncate(10 << 30)
+    refused(read_ply, path, "bytes of vertices, more than 536,870,912; leave columns out")
+
+
+def test_landmarks_are_as_large_as_their_frames_need(tmp_path: Path) -> None:
+    size = 900 * MIB
+    text = json.dumps({"landmarks": {"dtype": "F32", "shape": [size // 4], "data_offsets": [0, size]}}).encode()
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(struct.pack("<Q", len(text)) + text)
+    with path.open("r+b") as file:
+        file.truncate(8 + len(text) + size)
+    refused(lambda path: read_landmarks(path, 10), path, "landmarks of 10 frames have at most 1,201,536; write")
+
+
+def test_lines_of_a_csv_have_a_bound(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    with path.open("wb") as file:
+        file.truncate(6 << 30)
+    refused(lambda path: read_landmarks(path, 10), path, "a line has more than 61,184 characters")
+    path.write_text(",".join(["0.5"] * 2 * LANDMARKS) + "\n")
+    assert read_landmarks(path, 1).shape == (1, LANDMARKS, 2)
+    path.write_text("12," * (8 << 20))
+    refused(read_live_link_face, path, "a line has more than 1,048,576 characters")
+
+
+def test_values_of_a_csv_have_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mien.driving.live_link_face._MAX_CELLS_BYTES", 1 << 20)
+    path = tmp_path / "a.csv"
+    path.write_text("Timecode,EyeBlinkLeft\n" + "12,12,12,12,12,12,12,12,12\n" * 5000)
+    refused(read_live_link_face, path, "it has too many values; cut it into shorter recordings")
+
+
+def test_lists_of_json_have_a_bound(tmp_path: Path) -> None:
+    """Empty lists take twenty times their text."""
+    path = tmp_path / "a.json"
+    path.write_text("[" + "[]," * (20 << 20) + "[]]")
+    refused(read_blendshape_json, path, "too many lists, objects or numbers", 200 * MIB)
+    names = ",".join(f'"{index}": 0' for index in range(30_000))
+    with allocating_at_most(256 * MIB, SECONDS), pytest.raises(ValueError, match="it holds '0' twice"):
+        parse_json(f'{{{names}, "0": 1}}', unique_names=True)
+
+
+def test_cameras_of_a_file_have_a_bound(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", "mien.cameras", 1, {"cameras": [0] * 50_001})
+    refused(read_cameras, tmp_path / "a.json", "has 50,001 cameras, and at most 50,000 are read; split the file")
+
+
+def test_a_message_shows_the_beginning_and_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A shape of thirty thousand sides would fill the terminal."""
+    write_toy_workspace(tmp_path / "W")
+    track = tmp_path / "W" / "runs" / "toy" / "face_track.safetensors"
+    tensors = safetensors.numpy.load_file(track)
+    write_tensors(track, {name: torch.from_numpy(array) for name, array in tensors.items()})
+    text = track.read_bytes()
+    (size,) = struct.unpack_from("<Q", text)
+    header = json.loads(text[8 : 8 + size])
+    del header["__metadata__"]
+    header["head_rotation"]["shape"] += [1] * 30_000
+    changed = json.dumps(header).encode()
+    track.write_bytes(struct.pack("<Q", len(changed)) + changed + text[8 + size :])
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "W")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert len(said) < 2100
+    assert said.startswith(f"mien: {track}: ")
+    assert said.endswith("train it again\n")
+
+
+@needs_usd
+def test_a_stage_that_names_other_files_is_refused(tmp_path: Path) -> None:
+    """No other file is opened, and infinity is refused as in the other formats."""
+    write_usd(tmp_path / "good.usda", [some(4, 1)])
+    good = (tmp_path / "good.usda").read_text()
+    assert len(read_usd(tmp_path / "good.usda")) == 4
+    path = tmp_path / "a.usda"
+    for text in (
+        "#usda 1.0\n(\n    subLayers = [@good.usda@]\n)\n",
+        '#usda 1.0\ndef "a" (\n    references = @good.usda@\n)\n{\n}\n',
+        '#usda 1.0\ndef "a" (\n    payload = @good.usda@\n)\n{\n}\n',
+        '#usda 1.0\ndef "a" (\n    variants = { string v = "x" }\n    prepend variantSets = "v"\n)\n{\n'
+        '    variantSet "v" = {\n        "x" (references = @good.usda@) {\n        }\n    }\n}\n',
+        '#usda 1.0\ndef "a" (\n    clips = { dictionary default = { asset[] assetPaths = [@good.usda@] } }\n)\n{\n}\n',
+    ):
+        path.write_text(text)
+        refused(read_usd, path, "refers to other files, which are not opened; flatten it into one file")
+    start = good.index("point3f[] positions = [(") + len("point3f[] positions = [(")
+    for number in ("inf", "nan", "1e300"):
+        path.write_text(good[:start] + number + good[good.index(",", start) :])
+        refused(read_usd, path, "1 of 4 Gaussians are NaN or infinite")
+    path.write_text(good.replace("point3f[] positions", "string[] positions").replace("[(", '["', 1))
+    with pytest.raises(UserError):
+        read_usd(path)
+
+
+@needs_usd
+def test_random_damage_to_usd_files_is_told(tmp_path: Path) -> None:
+    for ending in ("usda", "usdc", "usdz"):
+        path = tmp_path / f"a.{ending}"
+        write_usd(path, [some(4, 4)])
+        for content in damaged_files(path.read_bytes(), 5)[:30]:
+            path.unlink()
+            path = tmp_path / f"{random.randrange(1 << 60)}.{ending}"  # USD keeps layers by their names
+            path.write_bytes(content)
+            try:
+                found = read_usd(path)
+            except UserError as error:
+                assert "\n" not in str(error)  # noqa: PT017
+            else:
+                assert bool(found.means.isfinite().all())

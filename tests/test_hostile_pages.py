@@ -1,0 +1,135 @@
+"""Files that would exhaust a page, and names that would fill one: refused in time, within moderate memory."""
+
+import copy
+import gzip
+import json
+import struct
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mien import runtime
+from mien.errors import UserError
+from mien.export import pack, write_page
+from mien.export.web_page import TEMPLATE
+from web_case import WEB, build, drawn_head, node
+
+MOST_BYTES, SECONDS = 1 << 30, 20
+AN_ARRAY = "avatar.baked.means"
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("built"))
+
+
+def read_by_node(built: Path, content: bytes, tmp_path: Path) -> str:
+    """Return the error of the web runtime for a file. It must keep to its time and its memory."""
+    path = tmp_path / "head.packed"
+    path.write_bytes(content)
+    script = [node(), str(WEB / "tests" / "read.mjs"), str(built / "mien.js"), str(path)]
+    done = subprocess.run(script, check=True, capture_output=True, timeout=SECONDS)
+    found = json.loads(done.stdout)
+    assert found["memory"] < MOST_BYTES
+    return found["message"]
+
+
+def parts() -> tuple[dict[str, Any], bytes]:
+    """Return the header of a packed head, and its arrays."""
+    whole = gzip.decompress(pack(drawn_head(200, 3)))
+    (size,) = struct.unpack_from("<I", whole)
+    return json.loads(whole[4 : 4 + size]), whole[4 + size :]
+
+
+def packed(header: dict[str, Any], arrays: bytes) -> bytes:
+    text = json.dumps(header).encode()
+    text += b" " * (-(4 + len(text)) % 4)
+    return gzip.compress(struct.pack("<I", len(text)) + text + arrays, 1)
+
+
+def test_a_whole_file_is_read(built: Path, tmp_path: Path) -> None:
+    assert read_by_node(built, packed(*parts()), tmp_path) == ""
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (f"tensors/{AN_ARRAY}/middle", {"length": 1e15}),
+        (f"tensors/{AN_ARRAY}/step", {"length": 1e15}),
+        (f"tensors/{AN_ARRAY}/middle", []),
+        (f"tensors/{AN_ARRAY}/shape", [1e9, 1e9]),
+        (f"tensors/{AN_ARRAY}/shape", {"length": 3e9}),
+        (f"tensors/{AN_ARRAY}/shape", [-5, -3]),
+        (f"tensors/{AN_ARRAY}/bits", 1e-9),
+        (f"tensors/{AN_ARRAY}/at", -1e15),
+        (f"tensors/{AN_ARRAY}", None),
+        ("tensors", None),
+        ("content/avatar/expression_names", {"length": 3e9}),
+        ("content/avatar/baked/rig/joint_names", {"length": 3e9}),
+        ("content/avatar/baked/faces", {"length": 3e9}),
+        ("content/avatar/baked/means", {"tensor": "avatar.baked.rig.expression_basis", "length": 3e9}),
+    ],
+)
+def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path, place: str, value: Any) -> None:
+    header, arrays = copy.deepcopy(parts())
+    *way, last = place.split("/")
+    node_of: Any = header
+    for name in way:
+        node_of = node_of[name]
+    node_of[last] = value
+    assert read_by_node(built, packed(header, arrays), tmp_path).startswith("is damaged")
+
+
+def test_arrays_that_share_their_bytes_are_refused(built: Path, tmp_path: Path) -> None:
+    """A file of some kilobytes would become 4 GB."""
+    header, arrays = parts()
+    count = 1 << 20
+    described = {"shape": [count], "bits": 8, "axis": "columns", "middle": [0], "step": [1], "at": len(arrays)}
+    header["tensors"] |= {f"x{index}": described for index in range(1000)}
+    header["content"]["more"] = [{"tensor": f"x{index}"} for index in range(1000)]
+    message = read_by_node(built, packed(header, arrays + bytes(count)), tmp_path)
+    assert message == "is damaged: an array lies beyond its end"
+
+
+def test_a_file_that_unpacks_to_gigabytes_is_refused(built: Path, tmp_path: Path) -> None:
+    header, arrays = parts()
+    bomb = gzip.compress(bytes(1 << 28), 9)
+    content = packed(header, arrays) + bomb * 12  # members of one gzip file follow each other
+    assert len(content) < 4 << 20
+    assert read_by_node(built, content, tmp_path) == "is larger than 128 MB"
+
+
+def test_a_mien_whose_arrays_share_their_bytes_is_refused(built: Path, tmp_path: Path) -> None:
+    runtime.write_portable(tmp_path / "head.mien", drawn_head(200, 0))
+    data = (tmp_path / "head.mien").read_bytes()
+    (size,) = struct.unpack_from("<Q", data)
+    header = json.loads(data[8 : 8 + size])
+    told = json.loads(header["__metadata__"]["mien"])
+    largest = max((name for name in header if name != "__metadata__"), key=lambda name: header[name]["data_offsets"][1])
+    told["content"]["more"] = [{"tensor": largest}] * 50_000
+    header["__metadata__"]["mien"] = json.dumps(told)
+    text = json.dumps(header).encode()
+    content = struct.pack("<Q", len(text)) + text + data[8 + size :]
+    assert read_by_node(built, content, tmp_path) == "is damaged: an array lies beyond its end"
+
+
+def named(name: str) -> runtime.PortableAvatar:
+    head = drawn_head(200, 0)
+    return replace(head, about=replace(head.about, name=name))
+
+
+def test_a_name_that_looks_like_a_mark_stays_a_name(tmp_path: Path) -> None:
+    """It would take the place of the avatar, a thousand times."""
+    name = "{{avatar}}{{webgpu}}" * 25
+    plain = write_page(tmp_path / "plain.html", named("x" * len(name)))
+    written = write_page(tmp_path / "page.html", named(name))
+    assert written.size < plain.size + 1000
+    assert (tmp_path / "page.html").read_text().count(name) == TEMPLATE.read_text().count("{{title}}")
+
+
+def test_a_name_of_many_characters_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="a name in it has more than 1,000 characters"):
+        runtime.write_portable(tmp_path / "a.mien", named("{{avatar}}" * 1000))

@@ -1,0 +1,15 @@
+// Reads an avatar as a page does, for tests/test_hostile_pages.py:
+//   node read.mjs MIEN.JS AVATAR   prints json: the error's message, if there is one, and the most memory in bytes
+import { readFileSync } from "node:fs";
+import { pathToFileURL } from "node:url";
+
+const [bundle, path] = process.argv.slice(2);
+const { AvatarError, Poser, readAny } = await import(pathToFileURL(bundle).href);
+let message = "";
+try {
+  const { avatar } = await readAny(new Uint8Array(readFileSync(path)));
+  new Poser(avatar.baked).pose(avatar.neutral);
+} catch (error) {
+  message = error instanceof AvatarError ? error.message : `not told: ${error}`;
+}
+console.log(JSON.stringify({ message, memory: 1024 * process.resourceUsage().maxRSS }));
