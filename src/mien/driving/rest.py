@@ -3,9 +3,9 @@
 A tracker always sees a little in a face at rest, such as raised brows, and this belongs to the person. A grin, an open
 mouth, or a gaze aside that lasts for the whole clip does not: it is motion and must reach the avatar.
 
-The limits come from the spread of calm frames (`docs/log.md`): two tracked real people have coefficients up to 0.22,
-gazes up to 4 degrees and heads up to 7 degrees aside in them, and eleven synthetic ones up to 0.28 (0.36 in a clip of
-eight frames), 12 and 26 degrees. So what is within a limit stays as it is. Beyond it, the face at rest goes back to the
+The limits come from the spread of calm frames (`docs/log.md`): in nine tracked real sequences, coefficients are up to
+0.22, gazes up to 11 and heads up to 18 degrees aside; in ten synthetic ones, 0.28 (0.36 in a clip of eight frames), 12
+and 26 degrees. So what is within a limit stays as it is. Beyond it, the face at rest goes back to the
 model's neutral, and is there at the second limit: what the avatar does grows without a jump.
 """
 

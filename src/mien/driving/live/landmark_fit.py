@@ -33,8 +33,8 @@ _LIMITS = (
     ((0.35, 0.5), ("left_eye", "right_eye")),
 )
 """Limits of `kept_share` for coefficients, and for angles of eyes in radians, of the face at rest. They are wider than
-those of a tracking, because the person's shape is unknown: at rest, the fit sees up to 0.34 and 0.24 in seven filmed
-people. For lids and lips it sees up to 0.9, so their part is always taken as shape.
+those of a tracking, because the person's shape is unknown: in clips of seven people, medians of the fit are up to 0.34
+and 0.24. For lids and lips they are up to 0.9, so their part is always taken as shape.
 """
 _NEAR, _FAR = 0.1, 10.0
 """Bounds of the distance of a head, in metres."""
