@@ -48,8 +48,8 @@ def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: 
 
 
 def overlay_stride(timesteps: int) -> int:
-    """Stride between the timesteps that an overlay shows, so that a long clip has at most 3,000 pictures."""
-    return math.ceil(timesteps / _MAX_PICTURES)
+    """Stride between the timesteps that an overlay shows, so that a long clip has at most 3,000 pictures. At least 1."""
+    return max(1, math.ceil(timesteps / _MAX_PICTURES))
 
 
 def draw_overlay(
