@@ -48,7 +48,7 @@ def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: 
 
 
 def overlay_stride(timesteps: int) -> int:
-    """Stride between the timesteps that an overlay shows, so that a long clip has at most 3,000 pictures. At least 1."""
+    """Stride between the timesteps that an overlay shows, at least 1. A long clip has at most 3,000 pictures."""
     return max(1, math.ceil(timesteps / _MAX_PICTURES))
 
 
