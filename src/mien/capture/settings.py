@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from mien.bounded import MAX_SIDE
-from mien.capture.fields import Deinterlace
+from mien.capture.deinterlacing import Deinterlace
 from mien.errors import UserError
 
 _MIN_SIZE = 32

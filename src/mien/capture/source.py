@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.fields import Deinterlace
+from mien.capture.deinterlacing import Deinterlace
 from mien.capture.lens import Lens
 from mien.capture.picture import decode_picture
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
