@@ -165,7 +165,7 @@ def test_trains_and_goes_on_from_a_checkpoint_as_if_never_stopped(variant: Varia
             write_checkpoint(tmp_path, state)
     assert len(state.avatar.gaussian_store()) != 60
     resumed, data = training(variant)
-    resume(tmp_path, resumed)
+    resume(tmp_path, resumed, first_record=1)
     assert resumed.step == 11
     while resumed.step < SETTINGS.steps:
         step(resumed, data, SETTINGS)

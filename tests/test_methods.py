@@ -162,7 +162,7 @@ def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: s
         if undisturbed.step == 11:
             write_checkpoint(tmp_path, undisturbed)
     resumed = start([sequence], face_model, config_of(method), settings)
-    resume(tmp_path, resumed)
+    resume(tmp_path, resumed, first_record=1)
     assert resumed.step == 11
     while resumed.step < settings.steps:
         step(resumed, data, settings)
