@@ -113,7 +113,7 @@ def test_export_reads_a_glb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     for line, told in (
         (["a.glb", "--out", "a.glb"], "cannot write .glb; use .mien, .html, .packed, .ply"),
         (["a.mien", "--out", "a.mien"], "is the file that is read"),
-        (["a.glb", "--out", "c.mien", "--set", "drop=1"], "leave --run, --set, --series and --every out"),
+        (["a.glb", "--out", "c.mien", "--set", "drop=1"], "leave --run, --set, --series, --neutral and --every out"),
         (["gone.glb", "--out", "c.mien"], "gone.glb: no such file"),
     ):
         assert main(["export", *(str(tmp_path / word) if "." in word else word for word in line)]) == 2

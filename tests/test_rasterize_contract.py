@@ -274,7 +274,7 @@ def test_a_forked_child_renders() -> None:
 
 def test_gsplat_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(UserError, match="pip install 'gsplat"):
+    with pytest.raises(UserError, match="pip install gsplat=="):
         rasterize_in_place(one_gaussian(), front_camera(), torch.zeros(3), "gsplat")
 
 
