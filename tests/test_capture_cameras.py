@@ -281,3 +281,18 @@ def test_calibration_reads_back(rig):
     half = cameras[0].for_pictures(WIDTH // 2, HEIGHT // 2)
     assert half.width == WIDTH // 2
     torch.testing.assert_close(half.K[:2], CAMERAS["left"].K[:2] / 2)
+
+
+def test_a_reading_is_found_in_the_pictures(rig, tmp_path):
+    """Matrices from camera to world with OpenGL's axes, in the world of the left camera."""
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    world = np.linalg.inv(CAMERAS["left"].viewmat.numpy()) @ flip
+    entries = json.loads(rig[1].read_text())["cameras"]
+    for entry in entries:
+        entry["viewmat"] = np.linalg.inv(flip @ np.array(entry["viewmat"]) @ world).tolist()
+    write_entries(tmp_path / "rig.json", entries)
+    with pytest.raises(
+        UserError, match="no two cameras ever .*; the matrices go from camera to world with OpenGL's"
+    ) as e:
+        capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "a" / "capture", "s", CaptureSettings(size=96))
+    assert "cannot tell" not in str(e.value)

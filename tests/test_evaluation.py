@@ -20,6 +20,7 @@ from mien.evaluation.report import RunRecord, report_html
 from mien.evaluation.report_sections import spans
 from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
 from mien.perceptual import load_perceptual
+from mien.tracking.tracking import PARTS
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +40,17 @@ def test_target_is_the_picture_inside_the_mask_over_white(experiment: Experiment
     assert torch.equal(target[torch.from_numpy(alpha == 0)], torch.ones(int((alpha == 0).sum()), 3))
     image = torch.from_numpy(experiment.sequences[0].capture.images[frame[1:]]).float() / 255
     torch.testing.assert_close(target[torch.from_numpy(alpha == 255)], image[torch.from_numpy(alpha == 255)])
+
+
+def test_frames_with_a_hand_are_scored_and_counted(experiment: Experiment, evaluation: Evaluation) -> None:
+    assert "covered_frames" not in protocol_content(experiment, evaluation, EvaluationSettings())
+    sequence, frames = experiment.sequences[0], evaluation.frames[:3]
+    covered = torch.zeros(len(sequence.tracking.valid), 1, len(PARTS), dtype=torch.bool)
+    covered[[frame.timestep for frame in frames], 0, 0] = True
+    tracking = replace(sequence.tracking, covered=covered)
+    hand = replace(experiment, sequences=(replace(sequence, tracking=tracking), *experiment.sequences[1:]))
+    content = protocol_content(hand, evaluation, EvaluationSettings())
+    assert (content["covered_frames"], content["frames"]) == (3, len(evaluation.frames))
 
 
 def test_avatar_that_made_the_truth_is_nearly_perfect(experiment: Experiment) -> None:

@@ -74,6 +74,8 @@ def _check_protocol(entry: Mapping[str, Any]) -> None:
     _require(is_one_line(entry["split"]) and entry["face_params"] in FACE_SOURCE_NAMES, "split or face_params")
     _number(entry, "frames", whole=True)
     _number(entry, "seconds_per_frame")
+    if "covered_frames" in entry:
+        _number(entry, "covered_frames", whole=True)
     if entry["face_params"] != "as_tracked":
         _check_row(entry["as_tracked"])
     if "fitted" in entry:

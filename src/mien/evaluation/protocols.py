@@ -181,6 +181,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "pixels": PIXELS,
         "face_params": experiment.face_source,
         "frames": len(evaluation.frames),
+        **_covered_content(experiment, evaluation.frames),
         "sequences": sorted({experiment.sequences[frame.sequence].name for frame in evaluation.frames}),
         "camera_ids": sorted({experiment.camera_id(frame) for frame in evaluation.frames}),
         "scored_on": scored_on(experiment, evaluation.frames),
@@ -196,6 +197,13 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
             **{name: [_rounded(row.get(name)) for row in own_rows] for name in _figure_names(own_rows)},
         },
     }
+
+
+def _covered_content(experiment: Experiment, frames: Sequence[Frame]) -> dict[str, int]:
+    """How many of the frames have a part of the face covered, such as by a hand; nothing if none has."""
+    clear = [sequence.clear() for sequence in experiment.sequences]
+    covered = sum(not clear[frame.sequence][frame.timestep, frame.camera] for frame in frames)
+    return {"covered_frames": covered} if covered else {}
 
 
 def _fitted_content(scores: Mapping[str, Sequence[Scores]], settings: EvaluationSettings) -> dict[str, Any]:

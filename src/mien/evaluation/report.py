@@ -156,6 +156,8 @@ def _table(protocols: Mapping[str, Any]) -> str:
             f"{entry['training_frames']['psnr']:.2f} dB, head crop {entry['training_frames']['head']['psnr']:.2f} dB"
             f" · ST-LPIPS on {entry['perceptual_frames']} evenly spread frames"
         )
+        if "covered_frames" in entry:
+            caption += f" · in {entry['covered_frames']} of the held-out frames something covers a part of the face"
         parts.append(
             f'<div class="card table"><div class="scroll"><table>{_table_head()}<tbody>{rows}</tbody></table></div>'
             f'<p class="note">{escape(caption)}</p></div>'

@@ -14,17 +14,18 @@ from mien.inside import check_tree, is_one_line
 from mien.limits import MAX_NUMBER, camera_fault
 from mien.locks import read_beside_writers
 from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
-from mien.tracking.tracking import Appearance, Tracking
+from mien.tracking.tracking import PARTS, Appearance, Tracking
 
 _FORMAT, _VERSION = "mien.tracking", 1
 _JSON, _TENSORS = "tracking.json", "tracking.safetensors"
 _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
 _APPEARANCE = ("texture", "trust", "light")
-_OPTIONAL = ("vertex_offsets", "pixel_residuals", *_APPEARANCE)
+_OPTIONAL = ("vertex_offsets", "pixel_residuals", "covered", *_APPEARANCE)
 _AXES = {
     "identity": "i", "expression": "te", "joints": "tj3", "head_rotation": "t3", "head_translation": "t3",
     "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
     "camera_viewmats": "c44", "pixel_residuals": "tc", "texture": "yx3", "trust": "yx", "light": "93",
+    "covered": "tcp",
 }  # fmt: skip
 _STAGE = "`mien track`"
 _REMEDY = "delete the folder and run `mien track` again"
@@ -43,6 +44,8 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
     }
     if tracking.pixel_residuals is not None:
         tensors["pixel_residuals"] = tracking.pixel_residuals
+    if tracking.covered is not None:
+        tensors["covered"] = tracking.covered.to(torch.uint8)
     if tracking.appearance is not None:
         tensors |= {name: getattr(tracking.appearance, name) for name in _APPEARANCE}
     write_tensors(path / _TENSORS, tensors)
@@ -88,6 +91,7 @@ def _read_tracking(path: Path) -> Tracking:
             residuals=tensors["residuals"],
             pixel_residuals=tensors.get("pixel_residuals"),
             appearance=_read_appearance(content.get("looks"), tensors),
+            covered=tensors["covered"].bool() if "covered" in tensors else None,
             settings=_read_settings(content["settings"]),
         )
 
@@ -130,7 +134,7 @@ def _read_settings(settings: Any) -> dict[str, Any]:
 
 def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
     """Check that no tensor is missing, that axes of the same name agree, and that all numbers are finite."""
-    sizes: dict[str, int] = {"3": 3, "4": 4, "9": 9}
+    sizes: dict[str, int] = {"3": 3, "4": 4, "9": 9, "p": len(PARTS)}
     for name, axes in _AXES.items():
         if name not in tensors:
             if name in _OPTIONAL:
@@ -142,7 +146,7 @@ def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
         )
         if not agrees:
             raise UserError(f"{path / _TENSORS}: {name!r} has the shape {list(shape)}; {_REMEDY}")
-        floats = name != "valid"
+        floats = name not in ("valid", "covered")
         if tensors[name].dtype != (torch.float32 if floats else torch.uint8):
             raise UserError(f"{path / _TENSORS}: {name!r} has the type {tensors[name].dtype}; {_REMEDY}")
         if floats and (tensors[name].abs() > MAX_NUMBER).any():

@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.camera import Camera
 from mien.face import FaceParams
+
+PARTS = ("mouth", "nose", "eyes")
+"""Parts of a face that something may cover (`Tracking.covered`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,5 +57,13 @@ class Tracking:
     landmarks alone determined the fit. None if there was no fit to pixels."""
     appearance: Appearance | None = None
     """Texture and light of the model. None if there was no fit to pixels or it found no texture."""
+    covered: Bool[Tensor, "t c p"] | None = None
+    """Which of `PARTS` something covers in each picture, such as a hand. None if nothing was found."""
     settings: dict = field(default_factory=dict)
     """Settings of the tracking, for the report."""
+
+    def covered_pictures(self) -> Bool[Tensor, "t c"]:
+        """The pictures in which something covers a part of the face."""
+        if self.covered is None:
+            return torch.zeros(len(self.valid), len(self.cameras), dtype=torch.bool)
+        return self.covered.any(2)

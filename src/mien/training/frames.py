@@ -58,9 +58,10 @@ def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
 
 
 def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
-    """All frames that are usable, sharp and not held out by their timestep, their sequence or their camera.
+    """All frames that are usable, sharp, and not held out by their timestep, their sequence or their camera.
 
-    The split divides each sequence that is trained on. A held-out sequence or camera is held out at all timesteps.
+    Frames in which something covers a part of the face are left out as well, unless no others are left. The split
+    divides each sequence that is trained on. A held-out sequence or camera is held out at all timesteps.
 
     Raises:
         UserError: no frame is left, or a sequence or camera to hold out does not exist.
@@ -83,6 +84,8 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
         cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
         if sequence.name not in settings.held_out_sequences:
             frames += [Frame(index, int(t), int(c)) for t, c in np.argwhere(usable & np.array(cameras))]
+    clear = [sequence.clear() for sequence in sequences]
+    frames = [frame for frame in frames if clear[frame.sequence][frame.timestep, frame.camera]] or frames
     if not frames:
         places = [str(sequence.folder or sequence.name) for sequence in sequences]
         raise UserError(

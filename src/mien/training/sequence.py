@@ -49,6 +49,10 @@ class Sequence:
         quality = self.capture.quality
         return np.ones(self.capture.valid.shape, bool) if quality is None else ~quality.blurred
 
+    def clear(self) -> np.ndarray:
+        """Bool [t, c]: nothing that the tracking found covers a part of the face, such as a hand."""
+        return ~self.tracking.covered_pictures().numpy()
+
 
 def composite(
     image: UInt8[np.ndarray, "h w 3"],

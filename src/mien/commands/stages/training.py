@@ -62,6 +62,7 @@ def run_training_stage(
         return read, face_model
 
     loaded, face_model = read_beside_writers(read_together, [folder / "tracking" for folder in folders], folders)
+    _tell_covered(loaded, settings)
     with ExitStack() as closing:
         live = LiveView(run, loaded[0].tracking.cameras[0]) if view else None
         if live is not None:
@@ -69,3 +70,13 @@ def run_training_stage(
         train(loaded, face_model, method, settings, run_dir, watch=live)
     summary = read_training_summary(run_dir)
     say(f"{run}: {summary['gaussians']:,} Gaussians after {summary['steps']:,} steps in {summary['seconds']:.0f} s")
+
+
+def _tell_covered(sequences: list[Sequence], settings: TrainSettings) -> None:
+    for sequence in sequences:
+        covered = int((~sequence.clear() & sequence.usable()).sum())
+        if covered and sequence.name not in settings.held_out_sequences:
+            say(
+                f"{sequence.name}: something (a hand?) covers a part of the face in {covered} of "
+                f"{int(sequence.usable().sum())} pictures; training leaves them out, and scoring counts them"
+            )

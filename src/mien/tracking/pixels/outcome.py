@@ -13,6 +13,7 @@ from mien.progress import say
 from mien.render.mesh import sh_basis
 from mien.tracking.fitting import Shot
 from mien.tracking.pixels.comparison import model_pictures
+from mien.tracking.pixels.covered import covered_parts
 from mien.tracking.pixels.texture import PhotometricFit, SkinTexture
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Appearance, Tracking
@@ -28,13 +29,15 @@ def with_pixels(
     face_model: FaceModel,
     settings: TrackingSettings,
 ) -> list[Tracking]:
-    """The trackings with the results of the fit to pixels: appearance and pixel residuals."""
+    """The trackings with the results of the fit to pixels: appearance, pixel residuals, and parts that are covered."""
     complete = []
     for index, (tracking, shot) in enumerate(zip(trackings, shots, strict=True)):
         tracking = replace(tracking, appearance=appearance_of(refined, index, shot, settings))
         found = refined.residuals[index] if refined.residuals else _residuals(tracking, shot, face_model)
         found = found.where(refined.improved[index][:, None], torch.nan)
-        complete.append(_with_pixel_residuals(tracking, shot, found))
+        tracking = _with_pixel_residuals(tracking, shot, found)
+        covered = covered_parts(shot.capture, tracking, face_model)
+        complete.append(replace(tracking, covered=covered) if covered.any() else tracking)
     return complete
 
 

@@ -99,6 +99,11 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
                                  f"alone determined them: {name_runs(alone)}."))  # fmt: skip
         else:
             found.append(("", f"Pixels were used in all {with_face} frames with a face."))
+    for part, covered in report["covered_frames"].items():
+        are = "are" if part == "eyes" else "is"
+        found.append(("odd", f"Something (a hand?) covers the {part} in {len(covered)} of {with_face} frames with a "
+                             f"face, and training leaves them out: {name_runs(covered)}. There the expression of the "
+                             f"{part} is a guess; if the {part} {are} covered for long, film again."))  # fmt: skip
     for name, row in report["cameras"].items():
         if "others_misplaced_px" in row:
             found.append(("odd", f"Warning: camera {name} shows the face {row['misplaced_px']:.0f} px from where the "

@@ -23,7 +23,7 @@ from mien.tracking.report.rig import (
     seen_from_front,
     shared_misfit,
 )
-from mien.tracking.tracking import Tracking
+from mien.tracking.tracking import PARTS, Tracking
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,6 +68,7 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
         "frames": len(valid),
         "frames_without_face": (~valid).nonzero()[:, 0].tolist(),
         "flagged_frames": _flagged(tracking).nonzero()[:, 0].tolist(),
+        "covered_frames": _covered(tracking),
         "landmarks_only_frames": _landmarks_only(tracking).nonzero()[:, 0].tolist(),
         "residual_px": _summary(front_residuals(tracking)),
         "residual_colors": None if tracking.pixel_residuals is None else _summary(tracking.pixel_residuals),
@@ -133,6 +134,14 @@ def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
     if tracking.pixel_residuals is not None:
         flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _MIN_COLOR_STEP)
     return flagged
+
+
+def _covered(tracking: Tracking) -> dict[str, list[int]]:
+    """The frames in which something covers a part of the face, by part; only parts that are covered in any."""
+    if tracking.covered is None:
+        return {}
+    frames = {name: tracking.covered[:, :, part].any(1).nonzero()[:, 0].tolist() for part, name in enumerate(PARTS)}
+    return {name: found for name, found in frames.items() if found}
 
 
 def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
