@@ -1,8 +1,9 @@
 """Build the site of the documentation: `make docs`.
 
 The pages are those of docs/, README.md, CONTRIBUTING.md, SECURITY.md, CHANGELOG.md and the pages beside code. They are
-copied into one folder, and the links between them are changed to match. A page is added for each room of the public API, and for
-each file of code that a page links. docs/README.md becomes the front page, and its sections become the menu.
+copied into one folder, and the links between them are changed to match. A page is added for each room of the public
+API, and for each file of code that a page links. docs/README.md becomes the front page, and its sections become the
+menu.
 
 Any warning of Sphinx (a link, a heading or a reference that leads nowhere) fails the build, and so does a path of this
 machine in the result. External links are not opened.
