@@ -96,8 +96,7 @@ fuzz-native: setup
 MINUTES ?= 10
 fuzz: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
-	  --lines 300 --heavy 10 --findings out/fuzz/findings.jsonl
-	PYTHONPATH=tests $(BIN)/python -m fuzzing.viewer_messages --count 200 --seed $(SEED)
+	  --lines 300 --heavy 10 --viewer 200 --findings out/fuzz/findings.jsonl
 	$(MAKE) fuzz-native
 
 # Commands that are killed at random moments and run again, until there are KILLS kills; findings go to out/fuzz/kills.jsonl.

@@ -108,6 +108,22 @@ def test_damaged_files_are_refused(written: Path, tmp_path: Path) -> None:
         read_glb(tmp_path / "gone.glb")
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("bufferView", True), ("bufferView", -1), ("bufferView", 1e9), ("bufferView", 99), ("componentType", 5),
+     ("type", "VEC9"), ("count", None), ("sparse", 5), ("sparse", {"indices": {}, "values": {}})],
+)  # fmt: skip
+def test_damaged_accessors_are_told(tmp_path: Path, name: str, value: Any) -> None:
+    writer = GlbWriter()
+    writer.accessor(np.eye(3, dtype=np.float32))
+    writer.accessors[0][name] = value
+    writer.write(tmp_path / "a.glb", {})
+    with pytest.raises(
+        ValueError, match=r"accessor 0 is damaged|is not a whole number|beyond the buffer|buffer size|reshape"
+    ):
+        read_glb(tmp_path / "a.glb").array(0)
+
+
 def test_the_mesh_is_the_person_at_rest(glb: Glb, portable: runtime.PortableAvatar) -> None:
     index = glb.array(head(glb)["indices"])
     model = mesh_model(portable)

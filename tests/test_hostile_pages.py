@@ -71,6 +71,14 @@ def test_a_whole_file_is_read(built: Path, tmp_path: Path) -> None:
         ("content/avatar/baked/rig/joint_names", {"length": 3e9}),
         ("content/avatar/baked/faces", {"length": 3e9}),
         ("content/avatar/baked/means", {"tensor": "avatar.baked.rig.expression_basis", "length": 3e9}),
+        ("content/avatar/baked", None),
+        ("content/avatar/baked/rig/joint_template", [0, 1, 2]),
+        ("content/avatar/baked/rig/joint_parents", [5, 5, 5]),
+        ("content/avatar/baked/rig/joint_names", "x" * 100_000),
+        ("content/avatar/baked/changes/rest", [0]),
+        ("content/avatar/neutral", None),
+        ("content/avatar/camera", []),
+        ("content/motion", {"fps": 30}),
     ],
 )
 def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path, place: str, value: Any) -> None:
@@ -81,6 +89,13 @@ def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path, plac
         node_of = node_of[name]
     node_of[last] = value
     assert read_by_node(built, packed(header, arrays), tmp_path).startswith("is damaged")
+
+
+def test_damage_behind_the_beginning_is_told(built: Path, tmp_path: Path) -> None:
+    whole = packed(*parts())
+    middle = len(whole) // 2
+    for content in (whole[:middle], whole[:middle] + bytes(100) + whole[middle + 100 :]):
+        assert read_by_node(built, content, tmp_path) == "is damaged: it cannot be unpacked"
 
 
 def test_arrays_that_share_their_bytes_are_refused(built: Path, tmp_path: Path) -> None:

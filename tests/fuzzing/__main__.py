@@ -25,9 +25,11 @@ def main() -> int:
     parser.add_argument(
         "--heavy", type=int, default=0, help="odd command lines of what takes long: each is stopped after 40 s"
     )
+    parser.add_argument("--viewer", type=int, default=0, help="hostile messages to a running viewer")
     parser.add_argument("--minutes", type=float, default=None, help="go on with further seeds for so long")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", nargs="*", default=None, help="names of targets")
+    parser.add_argument("--by-target", action="store_true", help="print a row for each target, not for each format")
     parser.add_argument("--findings", type=Path, default=None, help="file of json lines for what is found")
     parser.add_argument(
         "--replay", default=None, metavar="TARGET:SEED:NUMBER", help="one case, with all that is known of it"
@@ -45,10 +47,11 @@ def main() -> int:
             return int(result.outcome == "finding")
         until = None if asked.minutes is None else time.monotonic() + 60 * asked.minutes
         plan = campaign.Plan(
-            asked.seed, asked.cases, asked.only, asked.workers, until, asked.lines, asked.heavy, asked.self_check
-        )
+            asked.seed, asked.cases, asked.only, asked.workers, until, asked.lines, asked.heavy, asked.viewer,
+            asked.self_check,
+        )  # fmt: skip
         tally = campaign.run(plan, folder, asked.findings)
-        print(tally.table())
+        print(tally.table(asked.by_target))
         for missed in tally.missed:
             print(f"missed by the fuzzers: {missed}")
         return int(bool(tally.findings or tally.missed))

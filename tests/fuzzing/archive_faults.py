@@ -82,7 +82,8 @@ def faulty_npz(data: bytes, dice: Random) -> tuple[str, bytes]:
     elif kind == "bomb":
         amount = dice.choice((1 << 30, 3 << 30, 6 << 30))
         head = _with_header(b"", f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({amount // 12}, 3), }}")
-        return kind, with_bomb(members, name, head, amount)
+        files = {f"{key}.npy": content for key, content in members.items()}
+        return kind, with_bomb(files, f"{name}.npy", head, amount)
     whole = npz_of(members)
     if kind == "zip":
         at = dice.choice((whole.rfind(b"PK\x01\x02"), whole.rfind(b"PK\x05\x06"), 0))
@@ -98,10 +99,15 @@ def members_of(data: bytes) -> dict[str, bytes]:
 
 def npz_of(members: dict[str, bytes]) -> bytes:
     """Return a .npz with these members."""
+    return zip_of({f"{name}.npy": content for name, content in members.items()})
+
+
+def zip_of(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    """Return a zip archive with these members."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, content in members.items():
-            archive.writestr(zipfile.ZipInfo(name + ".npy"), content)
+            archive.writestr(zipfile.ZipInfo(name), content, method)
     return out.getvalue()
 
 
@@ -113,10 +119,10 @@ def npy_of(array: np.ndarray) -> bytes:
 
 
 def with_bomb(members: dict[str, bytes], name: str, head: bytes, amount: int) -> bytes:
-    """Return a .npz with a member of zeros that is a thousand times as long unpacked."""
+    """Return a zip archive with a member of zeros that is a thousand times as long unpacked."""
     packed = zlib.compressobj(1, zlib.DEFLATED, -15)
     body = packed.compress(head) + packed.flush(zlib.Z_FULL_FLUSH) + zeros(amount)[2:-4]
-    whole = npz_of({key: value for key, value in members.items() if key != name} | {name: b""})
+    whole = zip_of({key: value for key, value in members.items() if key != name} | {name: b""})
     # The empty member comes last. Its local header, its directory entry and the archive's end are rewritten.
     directory = whole.rfind(b"PK\x01\x02")
     local = whole.rfind(b"PK\x03\x04", 0, directory)

@@ -9,7 +9,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -19,8 +19,11 @@ from fuzzing.judge import Result
 from fuzzing.material import make_material
 from fuzzing.run_lines import HEAVY, LIGHT, LINES, run_lines
 from fuzzing.self_check import failures
-from fuzzing.targets import TARGETS, spread
+from fuzzing.targets import TARGETS, present, spread
 from fuzzing.workers import run_cases
+
+VIEWER = "messages to a viewer"
+"""Name of the format of messages."""
 
 
 @dataclass(frozen=True)
@@ -37,54 +40,66 @@ class Plan:
     """Number of command lines to run as well."""
     heavy: int = 0
     """Number of command lines that take long."""
+    viewer: int = 0
+    """Number of messages to a running viewer."""
     self_check: bool = False
     """Whether to check first that the fuzzers can fail."""
 
 
 @dataclass
-class Tally:
-    """Counts by format, and findings by cause, of a campaign."""
+class Row:
+    """Figures of a format or a target."""
 
-    outcomes: Counter[tuple[str, str]] = field(default_factory=Counter)
-    findings: dict[str, list[Result]] = field(default_factory=dict)
-    seconds: float = 0.0
-    """Longest time of a mutated input, in seconds."""
+    outcomes: Counter[str] = field(default_factory=Counter)
     megabytes: float = 0.0
-    """Most memory that a mutated input took, in megabytes."""
+    """Most memory that a case took, beyond what its process had, in megabytes."""
+    seconds: float = 0.0
+    """Longest time of a case, in seconds."""
+
+    def add(self, result: Result) -> None:
+        self.outcomes[result.outcome] += 1
+        if result.outcome != "finding":
+            self.seconds, self.megabytes = max(self.seconds, result.seconds), max(self.megabytes, result.megabytes)
+
+    def cells(self, name: str) -> str:
+        counts = (self.outcomes.total(), *(self.outcomes[one] for one in OUTCOMES))
+        figures = (*(f"{count:,}" for count in counts), f"{self.megabytes:,.0f} MB", f"{self.seconds:.1f} s")
+        return f"| {name} | {' | '.join(figures)} |"
+
+
+OUTCOMES = ("refused", "accepted", "stopped", "finding")
+
+
+@dataclass
+class Tally:
+    """Figures by format and by target, and findings by cause, of a campaign."""
+
+    formats: dict[str, Row] = field(default_factory=dict)
+    targets: dict[str, Row] = field(default_factory=dict)
+    whole: Row = field(default_factory=Row)
+    findings: dict[str, list[Result]] = field(default_factory=dict)
     missed: list[str] = field(default_factory=list)
     """Planted faults that the fuzzers did not find in the self-check."""
 
     def add(self, result: Result) -> None:
-        self.outcomes[result.format, result.outcome] += 1
-        if result.format != LINES and result.outcome != "finding":
-            self.seconds, self.megabytes = max(self.seconds, result.seconds), max(self.megabytes, result.megabytes)
+        self.formats.setdefault(result.format, Row()).add(result)
+        self.targets.setdefault(result.case.rsplit(":", 2)[0], Row()).add(result)
+        self.whole.add(result)
         if result.outcome == "finding":
             self.findings.setdefault(result.cause, []).append(result)
 
-    def table(self) -> str:
-        """Return a table of the counts by format, then the causes with a case of each."""
-        rows = ["| format | cases | refused | accepted | stopped | findings |", "|---|---|---|---|---|---|"]
-        formats = [*dict.fromkeys(target.format for target in TARGETS.values()), LINES]
-        total = Counter[str]()
-        for name in formats:
-            counts = Counter({outcome: count for (other, outcome), count in self.outcomes.items() if other == name})
-            total += counts
-            rows.append(_row(name, counts))
-        rows += [
-            _row("all", total),
-            "",
-            f"longest {self.seconds:.1f} s, most memory {self.megabytes:.0f} MB",
-            "",
-            f"{len(self.findings)} causes:",
-        ]
+    def table(self, by_target: bool = False) -> str:
+        """Return a table of the figures by format or by target, then the causes with a case of each."""
+        formats = [*dict.fromkeys(target.format for target in TARGETS.values()), LINES, VIEWER]
+        kind, order, found = ("target", [*TARGETS], self.targets) if by_target else ("format", formats, self.formats)
+        order += [name for name in found if name not in order]
+        heads = (kind, "cases", *OUTCOMES[:-1], "findings", "most memory", "longest")
+        rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+        rows += [found[name].cells(name) for name in order if name in found]
+        rows += [self.whole.cells("all"), "", f"{len(self.findings)} causes:"]
         for cause, results in sorted(self.findings.items(), key=lambda item: -len(item[1])):
             rows.append(f"{len(results):6} x {cause}    --replay {results[0].case!r}")
         return "\n".join(rows)
-
-
-def _row(name: str, counts: Counter[str]) -> str:
-    cells = (sum(counts.values()), *(counts[outcome] for outcome in ("refused", "accepted", "stopped", "finding")))
-    return f"| {name} | {' | '.join(f'{cell:,}' for cell in cells)} |"
 
 
 def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
@@ -98,7 +113,7 @@ def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
         log = stack.enter_context(_made(findings).open("a")) if findings else None
         for result in _all_results(plan, folder, material):
             tally.add(result)
-            count = sum(tally.outcomes.values())
+            count = tally.whole.outcomes.total()
             if result.outcome == "finding" and log is not None:
                 log.write(json.dumps(result.as_json()) + "\n")
                 log.flush()
@@ -108,7 +123,7 @@ def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
                     file=sys.stderr,
                     flush=True,
                 )
-    print(f"{sum(tally.outcomes.values())} cases in {time.monotonic() - began:.0f} s", file=sys.stderr)
+    print(f"{tally.whole.outcomes.total()} cases in {time.monotonic() - began:.0f} s", file=sys.stderr)
     return tally
 
 
@@ -135,9 +150,12 @@ def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
         f"{name}:{plan.seed}:{n}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for n in range(count)
     ]
     jobs: list[Job] = [partial(run_lines, lines, folder / "lines", material)]
-    seed = plan.seed
+    jobs += [partial(_viewer_results, plan.viewer, plan.seed)] if plan.viewer else []
+    seed, names = plan.seed, plan.only or present(material)
+    if left_out := sorted(TARGETS.keys() - set(names)) if plan.only is None else []:
+        print(f"left out, because node or usd-core is missing: {', '.join(left_out)}", file=sys.stderr)
     while plan.cases or jobs:
-        cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, plan.only)] if plan.cases else []
+        cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, names)] if plan.cases else []
         shares = [cases[index :: plan.workers] for index in range(plan.workers)]
         jobs += [
             partial(run_cases, share, folder / f"worker{index}", material, plan.until)
@@ -147,6 +165,25 @@ def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
         jobs, seed = [], seed + 1
         if plan.until is None or time.monotonic() >= plan.until:
             return
+
+
+def _send_messages(count: int, seed: int) -> dict[str, Any]:
+    from fuzzing.viewer_messages import campaign  # it needs viser, which may be missing
+
+    return asdict(campaign(count, seed))
+
+
+def _viewer_results(count: int, seed: int) -> Iterator[Result]:
+    """Yield a result for each hostile message and request. The viewer is judged as a whole, after them."""
+    figures = _aside(partial(_send_messages, count, seed))
+    numbers = iter(range(10 * count + 100))
+    known = {"megabytes": figures["memory_mib"], "seconds": figures["end_seconds"]}
+    for outcome, amount in (("refused", figures["refused_requests"]), ("accepted", figures["messages"])):
+        for _ in range(amount):
+            yield Result(f"{VIEWER}:{seed}:{next(numbers)}", VIEWER, outcome=outcome, **known)
+    for message in figures["findings"]:
+        told = {"message": message[:2000], "cause": f"viewer: {message[:80]}"}
+        yield Result(f"{VIEWER}:{seed}:{next(numbers)}", VIEWER, outcome="finding", findings=["viewer"], **told)
 
 
 def _side_by_side(jobs: list[Job]) -> Iterator[Result]:

@@ -11,6 +11,7 @@ from fuzzing import place_faults
 from fuzzing.archive_faults import faulty_npz, faulty_pickle
 from fuzzing.box_faults import faulty_mp4, faulty_stream
 from fuzzing.edges import CANARY, PORT
+from fuzzing.export_faults import EXPORT_FAULTS
 from fuzzing.json_faults import faulty_json, faulty_text, written
 from fuzzing.picture_faults import faulty_picture
 from fuzzing.repairs import repair_around, repair_portable, repair_tensors, with_checksum
@@ -80,6 +81,14 @@ def faulty_format(place: Place, dice: Random) -> str:
         kind, data = _BY_ENDING.get(suffix, faulty_stream)(data, dice)
     place.file.write_bytes(place.filled(data))
     repair_around(place.file)
+    return kind
+
+
+def faulty_new_name(place: Place, dice: Random) -> str:
+    """Make a fault, and give the file a name of its own: USD keeps stages by their names."""
+    kind = faulty_file(place, dice)
+    if place.file.is_file() and not place.file.is_symlink():
+        place.file = place.file.rename(place.file.with_stem(f"{dice.getrandbits(60):x}"))
     return kind
 
 
@@ -160,5 +169,5 @@ _BY_ENDING = {
     ".png": faulty_picture, ".jpg": faulty_picture, ".webp": faulty_picture, ".tif": faulty_picture,
     ".bmp": faulty_picture,
     ".mp4": faulty_mp4, ".mov": faulty_mp4, ".csv": faulty_table, ".ply": faulty_ply, ".npz": faulty_npz,
-    ".pkl": faulty_pickle,
+    ".pkl": faulty_pickle, **EXPORT_FAULTS, ".m4a": faulty_mp4,
 }  # fmt: skip

@@ -67,6 +67,9 @@ def make_material(root: Path) -> None:
     from fuzzing.pieces import write_pieces
 
     write_pieces(root / "pieces")
+    from fuzzing.exchange_material import write_exchanged
+
+    write_exchanged(root, avatar, root / RUN)
 
 
 def _evaluate_and_keep_the_partial_file(root: Path) -> None:

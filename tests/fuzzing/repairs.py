@@ -60,15 +60,35 @@ def repair_portable(data: bytes, content: Any = None) -> bytes:
         header, body = split(data)
         entry = json.loads(header["__metadata__"]["mien"])
         entry["content"] = entry["content"] if content is None else content
-        arrays = safetensors.numpy.load(data)
-        digest = hashlib.sha256(json.dumps(entry["content"], sort_keys=True).encode())
-        for name, array in sorted(arrays.items()):
-            digest.update(name.encode() + str(array.dtype).encode() + struct.pack(f"<{array.ndim}q", *array.shape))
-            digest.update(np.ascontiguousarray(array).data)
-        entry["sha256"] = digest.hexdigest()
+        entry["sha256"] = _portable_digest(entry["content"], safetensors.numpy.load(data))
         header["__metadata__"]["mien"] = json.dumps(entry, sort_keys=True)
         return repair_tensors(joined(header, body))
     return repair_tensors(data)
+
+
+def repair_glb(data: bytes) -> bytes:
+    """Return a .glb file with a correct hash over the avatar's content and arrays, if it has one."""
+    with contextlib.suppress(*_UNSOUND):
+        length = int.from_bytes(data[12:16], "little")
+        content, buffer = json.loads(data[20 : 20 + length]), data[28 + length :]
+        extension = content["extensions"]["MIEN_gaussian_avatar"]
+        arrays = {}
+        for name, described in extension["tensors"].items():
+            view = content["bufferViews"][described["bufferView"]] if "bufferView" in described else {"byteLength": 0}
+            start = view.get("byteOffset", 0)
+            numbers = np.frombuffer(buffer[start : start + view["byteLength"]], described["dtype"])
+            arrays[name] = numbers.reshape(described["shape"])
+        found = _portable_digest(extension["avatar"]["content"], arrays)
+        return data.replace(extension["avatar"]["sha256"].encode(), found.encode(), 1)
+    return data
+
+
+def _portable_digest(content: Any, arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(name.encode() + str(array.dtype).encode() + struct.pack(f"<{array.ndim}q", *array.shape))
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
 
 
 def edit_json(path: Path, **values: Any) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from fuzzing import faults, reads, uses
+from fuzzing import exchange, faults, reads, uses
 from fuzzing.faults import Place
 from fuzzing.material import ANALYSIS, RUN, SEQUENCE
 
@@ -126,12 +126,45 @@ def _avatars_and_given_files() -> tuple[Target, ...]:
     )  # fmt: skip
 
 
-TARGETS = {target.name: target for target in (*_in_workspaces(), *_avatars_and_given_files())}
+def _exchanged_files() -> tuple[Target, ...]:
+    exports, study, usd = ("exports",), ("study",), "USD"
+    stages = (
+        Target(f"head.{ending}", usd, f"exports/head.{ending}", exports, exchange.read_splats, uses.use_gaussians,
+               fault=faults.faulty_new_name)
+        for ending in ("usd", "usda", "usdc", "usdz")
+    )  # fmt: skip
+    return (
+        Target("scene of a .glb", ".glb", "exports/head.glb", exports, exchange.read_scene, weight=2),
+        Target("avatar of a .glb", ".glb", "exports/head.glb", exports, exchange.read_avatar_of_glb,
+               uses.use_portable, weight=2),
+        Target("head.spz", ".spz", "exports/head.spz", exports, exchange.read_splats, uses.use_gaussians, weight=3),
+        Target("head.sog", ".sog", "exports/head.sog", exports, exchange.read_splats, uses.use_gaussians, weight=3),
+        *stages,
+        Target("head.packed", ".packed, in node", "packed/*.packed", ("packed", "web"), exchange.read_in_node,
+               weight=3),
+        Target("head.mien in node", ".packed, in node", "head.mien", ("head.mien", "web"), exchange.read_in_node,
+               fault=faults.faulty_portable),
+        Target("sounds", "sounds", "sounds/*", ("sounds",), exchange.read_sound, uses.expect_motion, weight=4),
+        Target("rig.json", "calibrations", "rig/rig.json", ("rig",), exchange.read_rig, exchange.use_rig, weight=2),
+        Target("takes", "motion", "takes/*", ("takes",), reads.read_motion, uses.expect_motion, weight=4),
+        Target("study.key.json", "study", "study/study.key.json", study, exchange.tally, exact=True),
+        Target("answers.json", "study", "study/answers.json", study, exchange.tally),
+        Target("settings files", "--config", "configs/*.json", ("configs",), exchange.read_config, exchange.use_config,
+               weight=2),
+    )  # fmt: skip
 
 
-def spread(total: int, names: list[str] | None = None) -> list[tuple[str, int]]:
+TARGETS = {target.name: target for target in (*_in_workspaces(), *_avatars_and_given_files(), *_exchanged_files())}
+
+
+def present(material: Path) -> list[str]:
+    """Return the targets whose files could be written here. Some need node, or USD's library."""
+    return [target.name for target in TARGETS.values() if next(material.glob(target.files), None) is not None]
+
+
+def spread(total: int, names: list[str]) -> list[tuple[str, int]]:
     """Divide cases among the targets by their weights. They are mixed, so that any part of them holds all targets."""
-    chosen = [TARGETS[name] for name in names] if names else list(TARGETS.values())
+    chosen = [TARGETS[name] for name in names]
     share = total / sum(target.weight for target in chosen)
     places = []
     for target in chosen:

@@ -203,16 +203,17 @@ IMPORTS = (
 
 def run_a_line(root: Path, found: Any, dice: Random) -> None:
     """Run one command on the faulty workspace, in this process."""
-    _run(dice.choice(LINES), root)
+    run_line(dice.choice(LINES), root)
 
 
 def run_an_import(root: Path, found: Any, dice: Random) -> None:
     """Import the faulty folder, in this process, and draw what was made of it."""
-    _run(dice.choice(IMPORTS), root)
-    _run("render {root}/new --out {root}/o.png --size 16 --timestep 1", root)
+    run_line(dice.choice(IMPORTS), root)
+    run_line("render {root}/new --out {root}/o.png --size 16 --timestep 1", root)
 
 
-def _run(line: str, root: Path) -> None:
+def run_line(line: str, root: Path) -> None:
+    """Run a command in this process. A refusal is raised as a `UserError`."""
     os.environ["MIEN_CACHE"] = str(root / "cache")
     words = [word.format(W=root / "W", root=root) for word in line.split()]
     told = io.StringIO()

@@ -1,6 +1,6 @@
 // Reads .mien files (docs/avatar_file.md) and their packed form, which `mien export --out NAME.html` puts into pages.
 
-import type { Avatar, BlendSkinned, Motion } from "./avatar";
+import type { Avatar, BlendSkinned, ExpressionChanges, Face, Motion, Rig } from "./avatar";
 import { onTriangle, skinnedFault } from "./skinned";
 
 type Numbers = Float32Array | Int32Array;
@@ -17,11 +17,17 @@ const MOST_BYTES = 1 << 27;
 /** Most bytes of the json text; it becomes many times as large. */
 const MOST_TEXT = 1 << 23;
 
+const APART = "is damaged: its arrays do not fit together";
+
 const isWhole = (value: unknown, most: number): value is number => Number.isSafeInteger(value) && (value as number) >= 0 && (value as number) <= most;
 const areNumbers = (values: unknown): values is number[] => Array.isArray(values) && values.every((value) => Number.isFinite(value));
 
 /** The avatar in a .mien file. The checksum is not checked: that is the work of `mien`. */
 export function readMien(file: ArrayBuffer): Avatar {
+  return toldOf(() => avatarOf(file));
+}
+
+function avatarOf(file: ArrayBuffer): Avatar {
   const header = safetensorsHeader(file);
   const told = parse((header.__metadata__ as { mien?: string } | undefined)?.mien ?? "{}") as { [key: string]: Tree };
   if (told.format !== "mien.baked") throw new AvatarError("is not a .mien file");
@@ -63,7 +69,14 @@ interface PackedTensor {
  * a json text (uint32), that text, and the arrays as integers of 8 or 16 bits.
  */
 export async function readPacked(packed: Uint8Array): Promise<{ avatar: Avatar; motion: Motion | null }> {
-  const file = await readAll(new Blob([packed as BlobPart]).stream().pipeThrough(new DecompressionStream("gzip")));
+  const stream = new Blob([packed as BlobPart]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const file = await readAll(stream).catch((error) => {
+    throw error instanceof AvatarError ? error : new AvatarError("is damaged: it cannot be unpacked");
+  });
+  return toldOf(() => unpackedOf(file));
+}
+
+function unpackedOf(file: ArrayBuffer): { avatar: Avatar; motion: Motion | null } {
   const size = file.byteLength >= 4 ? new DataView(file).getUint32(0, true) : Infinity;
   if (4 + size > file.byteLength || size > MOST_TEXT) throw new AvatarError(DAMAGED);
   const told = parse(new TextDecoder().decode(new Uint8Array(file, 4, size))) as { [key: string]: Tree };
@@ -77,8 +90,18 @@ export async function readPacked(packed: Uint8Array): Promise<{ avatar: Avatar; 
     if ((left -= (count * entry.bits) / 8) < 0) throw new AvatarError(BEYOND);
     return unpack(file, 4 + size, entry, count);
   };
-  const content = restored(told.content, tensor) as unknown as { avatar: Avatar; motion: Motion | null };
-  return { avatar: checked(content.avatar), motion: content.motion };
+  const { avatar, motion } = restored(told.content, tensor) as unknown as { avatar: Avatar; motion: Motion | null };
+  if (motion && !(motion.fps > 0 && isFace(motion, avatar.neutral, motion.head_rotation.length / 3))) throw new AvatarError(APART);
+  return { avatar: checked(avatar), motion };
+}
+
+/** What `read` returns. Where it stumbles, something is missing in the file, or is of another kind. */
+function toldOf<T>(read: () => T): T {
+  try {
+    return read();
+  } catch (error) {
+    throw error instanceof AvatarError ? error : new AvatarError(DAMAGED);
+  }
 }
 
 /** The bytes of a stream. One that goes beyond MOST_BYTES is left there. */
@@ -151,29 +174,57 @@ function restored(node: Tree, tensor: (name: string) => Numbers): unknown {
   return Object.fromEntries(Object.entries(node).map(([key, item]) => [key, restored(item, tensor)]));
 }
 
+/** Whether entries of an object are arrays of floats of these lengths. */
+const fits = (holder: object, lengths: { [name: string]: number }): boolean =>
+  Object.entries(lengths).every(([name, length]) => {
+    const part = (holder as { [name: string]: unknown })[name];
+    return part instanceof Float32Array && part.length === length;
+  });
+
+/** Whether arrays are those of `count` faces like another one. */
+const isFace = (face: Face, { expression, joints }: Face, count: number): boolean =>
+  fits(face, { expression: count * expression.length, joints: count * joints.length, head_rotation: 3 * count, head_translation: 3 * count });
+
+/** Whether a rig's arrays fit together, and pose a face. */
+function isRig(rig: Rig, { expression, joints }: Face): boolean {
+  const size = rig.template.length, names = expression.length, count = rig.joint_names.length, moves = 3 * names * count;
+  return (
+    fits(rig, {
+      template: size, expression_basis: names * size, joint_template: 3 * count, joint_rotation_basis: moves, joint_translation_basis: moves,
+      skinning_weights: (size / 3) * count, ...(rig.pose_basis && { pose_basis: 3 * joints.length * size }),
+    }) &&
+    rig.expression_names.length === names && 3 * rig.joint_free.filter(Boolean).length === joints.length &&
+    rig.joint_parents.every((parent, joint) => parent < joint)
+  );
+}
+
+/** Whether changes with the face fit a face and `count` Gaussians. */
+function isChanges({ rest, directions, features, ...others }: ExpressionChanges, { expression, joints }: Face, count: number): boolean {
+  if (!fits({ rest, ...others }, { rest: expression.length + joints.length, reach: 1 })) return false;
+  if (!features) return true;
+  const { neutral, own, weights, biases } = features, hidden = biases[0].length, rank = directions.length / rest.length;
+  return (
+    weights.length === 2 && biases.length === 2 && fits(features, { basis: rank * neutral.length }) && fits(biases, { 0: hidden, 1: 4 }) &&
+    fits(weights, { 0: (hidden * (neutral.length + own.length)) / Math.max(count, 1), 1: 4 * hidden })
+  );
+}
+
 /** Refuses what this runtime cannot draw, and indices that lead nowhere. */
 function checked(given: Avatar): Avatar {
   const isSkinned = (given.baked.kind as string) === "BlendSkinned";
   const fault = isSkinned ? skinnedFault(given.baked as unknown as BlendSkinned) : "";
   if (fault) throw new AvatarError(fault);
-  const avatar = isSkinned ? onTriangle(given) : given, baked = avatar.baked;
+  const avatar = isSkinned ? onTriangle(given) : given, { baked, neutral, camera } = avatar, { rig, attributes, changes } = baked;
   if (baked.kind !== "MeshBound") throw new AvatarError(`holds a ${baked.kind} avatar; this page draws MeshBound ones (gaussian_avatars)`);
-  const points = baked.rig.template.length / 3, triangles = baked.faces.length / 3, count = baked.face_index.length;
-  const inside = (indices: Int32Array, size: number) => indices.every((index) => index >= 0 && index < size);
-  const { quats, log_scales, opacity_logits, sh } = baked.attributes;
-  const fits =
-    inside(baked.faces, points) && inside(baked.face_index, triangles) && baked.means.length === 3 * count &&
-    quats.length === 4 * count && log_scales.length === 3 * count && opacity_logits.length === count &&
-    [1, 4, 9, 16].includes(sh.length / 3 / Math.max(count, 1));
-  const features = baked.changes?.features;
-  if (features) {
-    const { neutral, basis, own, weights, biases } = features, rank = baked.changes!.directions.length / baked.changes!.rest.length;
-    const hidden = biases[0].length, inputs = (neutral.length + own.length) / Math.max(count, 1);
-    const whole =
-      weights.length === 2 && biases.length === 2 && basis.length === rank * neutral.length && biases[1].length === 4 &&
-      weights[0].length === hidden * inputs && weights[1].length === 4 * hidden;
-    if (!whole) throw new AvatarError("is damaged: its features do not fit together");
-  }
-  if (!fits) throw new AvatarError("is damaged: its arrays do not fit together");
+  const count = baked.face_index.length, coefficients = attributes.sh.length;
+  const inside = (indices: Int32Array, size: number) => indices instanceof Int32Array && indices.every((index) => index >= 0 && index < size);
+  const whole =
+    inside(baked.faces, rig.template.length / 3) && inside(baked.face_index, baked.faces.length / 3) &&
+    [1, 4, 9, 16].includes(coefficients / 3 / Math.max(count, 1)) && fits(baked, { means: 3 * count }) &&
+    fits(attributes, { quats: 4 * count, log_scales: 3 * count, opacity_logits: count, sh: coefficients }) &&
+    fits(camera, { K: 9, viewmat: 16 }) && camera.width > 0 && camera.height > 0 &&
+    fits(avatar, { expression_bounds: 2 * neutral.expression.length }) && isFace(neutral, neutral, 1) && isRig(rig, neutral) &&
+    (!changes || isChanges(changes, neutral, count));
+  if (!whole) throw new AvatarError(APART);
   return avatar;
 }

@@ -19,9 +19,8 @@ export function skinnedFault({ rig, attributes, bases, network, still_weights, s
     fits &&= network.weights[layer].length === before * bias.length;
     before = bias.length;
   });
-  const { quats, log_scales, opacity_logits, sh } = attributes;
   fits &&= before === network.outputs.reduce((sum, name) => sum + (WIDTHS[name] ?? NaN), 0);
-  fits &&= quats.length === 4 * count && log_scales.length === 3 * count && opacity_logits.length === count && sh.length === 3 * count;
+  fits &&= attributes.sh.length === 3 * count;
   fits &&= !still_weights === !still_pose && (!still_weights || still_weights.length === count);
   return fits ? "" : "is damaged: its arrays do not fit together";
 }

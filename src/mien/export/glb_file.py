@@ -132,8 +132,14 @@ class Glb:
         """The values of an accessor: [n], or [n, c].
 
         Raises:
-            ValueError: it has too many rows, or reaches beyond the buffer.
+            ValueError: it is incomplete, has too many rows, or reaches beyond the buffer.
         """
+        try:
+            return self._array(accessor)
+        except (LookupError, TypeError, AttributeError, StopIteration, OverflowError) as error:
+            raise ValueError(f"accessor {accessor} is damaged ({repr(error)[:80]})") from None
+
+    def _array(self, accessor: int) -> np.ndarray:
         described = self.content["accessors"][accessor]
         width = next(width for width, name in _TYPES.items() if name == described["type"])
         kind = self._kind(described["componentType"])
