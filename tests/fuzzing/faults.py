@@ -52,6 +52,14 @@ def faulty_file(place: Place, dice: Random) -> str:
     return faulty_format(place, dice)
 
 
+def faulty_content(place: Place, dice: Random) -> str:
+    """Damage a file, or make a fault of its format, for readers that get the bytes and not the place."""
+    if dice.random() < 0.15:
+        place.file.write_bytes(flip_or_cut(place.file.read_bytes(), dice))
+        return DAMAGE
+    return faulty_inside(place, dice) if place.file.suffix == ".mien" else faulty_format(place, dice)
+
+
 def faulty_without_damage(place: Place, dice: Random) -> str:
     """Make a fault as `faulty_file` does, but no unrepaired damage, for files that may also be read from elsewhere."""
     return faulty_place(place, dice) if dice.random() < 0.5 else faulty_format(place, dice)
@@ -93,9 +101,12 @@ def faulty_new_name(place: Place, dice: Random) -> str:
 
 
 def faulty_portable(place: Place, dice: Random) -> str:
+    """Damage a .mien file, put something else in its place, or make a fault in it."""
+    return faulty_file(place, dice) if dice.random() < 0.25 else faulty_inside(place, dice)
+
+
+def faulty_inside(place: Place, dice: Random) -> str:
     """Make a fault in a .mien file: in its arrays, in its content, or in the entry around the content."""
-    if dice.random() < 0.25:
-        return faulty_file(place, dice)
     data = place.file.read_bytes()
     if dice.random() < 0.5:
         kind, data = faulty_tensors(data, dice)
