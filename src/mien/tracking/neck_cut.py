@@ -17,6 +17,8 @@ _BESIDE = 1.15
 """Radius that is kept at the neck cut, in radii of the neck."""
 _SLOPE = 1.0
 """Growth of that radius with the height above the cut. Hair is kept; collars and shoulders are cut off."""
+_BAND = 64
+"""Rows of a picture whose cut is computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,15 +87,21 @@ def above_neck_cut(cut: NeckCut, camera: Camera) -> Float[np.ndarray, "h w"]:
     """1 above the cut and near the neck, 0 elsewhere, with soft borders about one pixel wide.
 
     The ray of a pixel is judged where it meets the cylinder, or where it passes nearest to its axis. So all cameras
-    cut the skin of a neck at the same place, which a straight line in each picture does not.
+    cut the skin of a neck at the same place, which a straight line in each picture does not. Rows are taken in bands,
+    because the temporary arrays of a whole picture are many times as large as the picture.
     """
+    bands = (range(row, min(row + _BAND, camera.height)) for row in range(0, camera.height, _BAND))
+    return np.concatenate([_above_in_rows(cut, camera, band) for band in bands])
+
+
+def _above_in_rows(cut: NeckCut, camera: Camera, rows: range) -> Float[np.ndarray, "r w"]:
     to_world = camera.viewmat[:3, :3].double().numpy().T
     eye = camera.position.double().numpy()
     inverse = to_world @ np.linalg.inv(camera.K.double().numpy())
     start = ((eye - cut.origin) @ cut.axes.T).astype(np.float32)
     turned = cut.axes @ inverse
     x = np.arange(camera.width, dtype=np.float32)[None] + 0.5
-    y = np.arange(camera.height, dtype=np.float32)[:, None] + 0.5
+    y = np.asarray(rows, dtype=np.float32)[:, None] + 0.5
     # Rays in the cylinder's frame, of depth 1 along the camera's axis, scaled so that the ellipse is a unit circle.
     dx, dy, dz = ((row[0] * x + row[1] * y + row[2]).astype(np.float32) for row in turned)
     px, py = start[:2] / cut.radii
