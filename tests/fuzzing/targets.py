@@ -149,7 +149,7 @@ def _exchanged_files() -> tuple[Target, ...]:
         Target("takes", "motion", "takes/*", ("takes",), reads.read_motion, uses.expect_motion, weight=4),
         Target("study.key.json", "study", "study/study.key.json", study, exchange.tally, exact=True),
         Target("answers.json", "study", "study/answers.json", study, exchange.tally),
-        Target("settings files", "--config", "configs/*.json", ("configs",), exchange.read_config, exchange.use_config,
+        Target("config files", "--config", "configs/*.json", ("configs",), exchange.read_config, exchange.use_config,
                weight=2),
     )  # fmt: skip
 
