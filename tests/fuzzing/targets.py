@@ -159,7 +159,11 @@ TARGETS = {target.name: target for target in (*_in_workspaces(), *_avatars_and_g
 
 def present(material: Path) -> list[str]:
     """Return the targets whose files could be written here. Some need node, or USD's library."""
-    return [target.name for target in TARGETS.values() if next(material.glob(target.files), None) is not None]
+    return [
+        target.name
+        for target in TARGETS.values()
+        if all((material / part).exists() for part in target.parts) and any(material.glob(target.files))
+    ]
 
 
 def spread(total: int, names: list[str]) -> list[tuple[str, int]]:
