@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 import train_toy
@@ -21,6 +22,7 @@ from mien.face import FaceParams
 from mien.face.checks import check_face_params
 from mien.face.flame import read_flame
 from mien.face.loading import read_landmarks
+from mien.files import read_arrays
 from mien.picture_files import decode_png, png_fits
 from mien.render.validation import NotFiniteError
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
@@ -232,3 +234,10 @@ def test_a_png_chunk_that_is_longer_than_its_file() -> None:
     place = data.index(b"IDAT") - 4
     assert not png_fits(data[:place] + b"\xff\xff\xff\xf0" + data[place + 4 :])
     assert not png_fits(data[:-12])
+
+
+def test_numbers_of_a_type_that_numpy_lacks(tmp_path: Path) -> None:
+    file = tmp_path / "arrays.safetensors"
+    file.write_bytes(safetensors.torch.save({"points": torch.zeros(4).to(torch.float8_e5m2)}))
+    with pytest.raises(UserError, match="arrays.safetensors: damaged safetensors file"):
+        read_arrays(file)

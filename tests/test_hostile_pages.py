@@ -74,6 +74,7 @@ def test_a_whole_file_is_read(built: Path, tmp_path: Path) -> None:
         ("content/avatar/baked", None),
         ("content/avatar/baked/rig/joint_template", [0, 1, 2]),
         ("content/avatar/baked/rig/joint_parents", [5, 5, 5]),
+        ("content/avatar/baked/rig/joint_parents", [-1, [[]], 0]),
         ("content/avatar/baked/rig/joint_names", "x" * 100_000),
         ("content/avatar/baked/changes/rest", [0]),
         ("content/avatar/neutral", None),

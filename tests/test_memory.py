@@ -78,7 +78,9 @@ def test_scoring_is_made_written_and_read_without_being_held(tmp_path: Path, tin
         read = read_scoring(tmp_path / "scoring", "of this capture")
     assert read.masks.nbytes == 30 * MIB
     assert mapped_bytes() - before < 6 * MIB
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scoring", "short"], "files for the time being have no name"
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scoring", "short"], (
+        "files for the time being have no name"
+    )
     np.testing.assert_array_equal(read.masks, made.masks)
     np.testing.assert_array_equal(read.masks[7], expected.masks[1])
 

@@ -25,6 +25,8 @@ from mien.inside import remove_tree
 
 _KEPT_OF_NAME = 100
 """Number of characters of a file's name that its temporary name keeps. File systems allow 255 bytes in all."""
+_UNREADABLE = (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RecursionError, AttributeError)
+"""Errors of a damaged safetensors file. An AttributeError is a type of number that numpy lacks, such as float8."""
 _CHECKSUM = "checksum"
 """Key of the checksum, which covers everything else in a json file, or the header and data of a safetensors file."""
 _ANY_STAGE = "the stage that writes it"
@@ -258,7 +260,7 @@ def read_safetensors(
     try:
         _check_safetensors(path)
         return load(path)
-    except (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+    except _UNREADABLE as error:
         reason = " ".join(str(error).split())[:200]
         remedy = remedy or f"delete it and run {stage} again"
         raise UserError(f"{path}: damaged safetensors file ({reason}); {remedy}") from None

@@ -194,7 +194,7 @@ function isRig(rig: Rig, { expression, joints }: Face): boolean {
       skinning_weights: (size / 3) * count, ...(rig.pose_basis && { pose_basis: 3 * joints.length * size }),
     }) &&
     rig.expression_names.length === names && 3 * rig.joint_free.filter(Boolean).length === joints.length &&
-    rig.joint_parents.every((parent, joint) => parent < joint)
+    rig.joint_parents.every((parent, joint) => Number.isInteger(parent) && parent < joint)
   );
 }
 
