@@ -1,4 +1,4 @@
-"""SIGTERM and Ctrl-C stop work in an orderly way: once, at a moment that suits, and even if a library drops them."""
+"""Signals stop work in an orderly way: once, at a moment that suits, and even if a library drops them."""
 
 import contextlib
 import signal
@@ -11,17 +11,18 @@ from collections.abc import Iterator
 import pytest
 
 from mien import stops
-from mien.stops import EXIT_TERMINATED, Put, Terminated, orderly_stops, stops_put_off
+from mien.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Put, Terminated, orderly_stops, stops_put_off
 
-KINDS = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
+KINDS = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, HungUp)]
 
 
 @pytest.fixture(autouse=True)
 def _hear_ctrl_c() -> Iterator[None]:
-    """Let Ctrl-C be heard, also where a shell started the tests in the background and lets them ignore it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Let Ctrl-C and SIGHUP be heard, also where the tests were started in the background and ignore them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, before[0])
+    signal.signal(signal.SIGHUP, before[1])
 
 
 @pytest.mark.parametrize(("number", "kind"), KINDS)
@@ -128,20 +129,21 @@ def test_a_stop_in_the_last_step_is_not_lost() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_without_a_command_a_stop_ends_the_process() -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, EXIT_TERMINATED), (signal.SIGHUP, EXIT_HUNG_UP)])
+def test_without_a_command_a_stop_ends_the_process(number: signal.Signals, code: int) -> None:
     """A program that trains without the command line ends as a terminated process does, without a traceback."""
-    program = "import signal; from mien.stops import stops_put_off as off\nwith off(): signal.raise_signal(15)"
+    program = f"import signal; from mien.stops import stops_put_off as off\nwith off(): signal.raise_signal({number:d})"
     ended = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True)
-    assert (ended.returncode, ended.stderr) == (EXIT_TERMINATED, b"")
+    assert (ended.returncode, ended.stderr) == (code, b"")
 
 
-def test_background_commands_go_on_ignoring_ctrl_c() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with orderly_stops():
-            signal.raise_signal(signal.SIGINT)
-    finally:
-        signal.signal(signal.SIGINT, before)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_background_commands_go_on_ignoring_what_they_ignore(number: signal.Signals) -> None:
+    """A shell lets commands in the background ignore Ctrl-C, and nohup lets them ignore a closed terminal."""
+    signal.signal(number, signal.SIG_IGN)
+    with orderly_stops(), stops_put_off() as stop:
+        signal.raise_signal(number)
+        assert not stop.asked()
 
 
 def test_other_threads_leave_signals_alone() -> None:

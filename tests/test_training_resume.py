@@ -117,11 +117,13 @@ def test_a_stop_before_the_first_record(
     assert_same_results(tmp_path, undisturbed)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_continues_after_a_termination(method: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("method", "number"), [*((name, signal.SIGTERM) for name in METHODS), ("headgas", signal.SIGHUP)]
+)
+def test_every_method_continues_after_a_termination(method: str, number: signal.Signals, tmp_path: Path) -> None:
     config, settings = METHODS[method].config(), {"steps": 4, "record_every": 10, "checkpoint_every": 1000}
     with pytest.raises(Terminated):
-        train_until_step(tmp_path, 1, partial(signal.raise_signal, signal.SIGTERM), config, **settings)
+        train_until_step(tmp_path, 1, partial(signal.raise_signal, number), config, **settings)
     begun = int(checkpoint_files(tmp_path / "checkpoints")[-1].stem.removeprefix("step_"))
     assert 1 <= begun < 4
     train_until_step(tmp_path, 99, list, config, **settings)

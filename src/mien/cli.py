@@ -18,7 +18,7 @@ from pathlib import Path
 import mien
 from mien.bounded import MAX_SIDE
 from mien.errors import UserError
-from mien.stops import EXIT_INTERRUPTED, EXIT_TERMINATED, Terminated, orderly_stops
+from mien.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
 from mien.threads import asked_threads
 
@@ -74,8 +74,8 @@ _INDENT_OF_DESCRIPTION = 8
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one sub-command and return the exit code.
 
-    The code is 0 on success, 2 after a user's mistake, 1 after a bug in mien, 130 after Ctrl-C, 143 after SIGTERM, and
-    141 if nobody reads the output any more.
+    The code is 0 on success, 2 after a user's mistake, 1 after a bug in mien, 130 after Ctrl-C, 143 after SIGTERM, 129
+    if the terminal was closed, and 141 if nobody reads the output any more.
     """
     open_closed_streams()
     _print_what_can_be_printed()
@@ -101,7 +101,7 @@ def _main(arguments: list[str]) -> int:
         return _complain(str(error))
     except (KeyboardInterrupt, Terminated) as stop:
         tell("mien: stopped; the same command continues where it stopped, or starts again")
-        return EXIT_TERMINATED if isinstance(stop, Terminated) else EXIT_INTERRUPTED
+        return int(str(stop.code)) if isinstance(stop, Terminated) else EXIT_INTERRUPTED
     except BrokenPipeError:
         raise
     except MemoryError as error:

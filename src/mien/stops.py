@@ -1,4 +1,4 @@
-"""Orderly stops: SIGTERM ends a command as Ctrl-C does, and work that must not be left half done puts both off."""
+"""Orderly stops: SIGTERM and SIGHUP end a command as Ctrl-C does. Work that must not be half done puts them off."""
 
 import signal
 import sys
@@ -6,20 +6,33 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
+EXIT_HUNG_UP = 129
 """Exit codes by convention: 128 and the number of the signal."""
 
 
 class Terminated(SystemExit):
-    """SIGTERM has asked the process to end. Nothing catches it by mistake, as nothing catches a KeyboardInterrupt."""
+    """The process must end. Nothing catches it by mistake, as nothing catches a KeyboardInterrupt."""
+
+    def __init__(self, code: int = EXIT_TERMINATED) -> None:
+        super().__init__(code)
+
+
+class HungUp(Terminated):
+    """SIGHUP has come: the terminal was closed, or the connection to another machine was lost."""
 
     def __init__(self) -> None:
-        super().__init__(EXIT_TERMINATED)
+        super().__init__(EXIT_HUNG_UP)
 
 
-_KINDS: dict[int, type[BaseException]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+_KINDS: dict[int, type[BaseException]] = {
+    signal.SIGINT: KeyboardInterrupt,
+    signal.SIGTERM: Terminated,
+    signal.SIGHUP: HungUp,
+}
 _REPEAT_SECONDS = 0.05
 """Time after which a stop that a library has dropped is repeated."""
 _DEAF_SECONDS = 10.0
@@ -45,7 +58,7 @@ class Put:
 
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed.
-            Terminated: SIGTERM has come.
+            Terminated: SIGTERM or SIGHUP has come.
         """
         if self._number is not None:
             raise _KINDS[self._number]
@@ -53,7 +66,7 @@ class Put:
 
 @contextmanager
 def orderly_stops() -> Iterator[None]:
-    """Let SIGTERM and Ctrl-C raise `Terminated` and KeyboardInterrupt, so that unfinished files are removed.
+    """Let SIGTERM, SIGHUP and Ctrl-C raise `Terminated`, `HungUp` and KeyboardInterrupt: unfinished files are removed.
 
     Signals soon after the first are ignored, since they would interrupt the removal and the wait for threads in native
     code. If the exception is raised where Python can only report it (in a callback of a library), the stop is repeated.
@@ -62,9 +75,7 @@ def orderly_stops() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # signal handlers work only there
         yield
         return
-    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in _KINDS}
-    # A shell lets what it starts in the background ignore Ctrl-C.
-    heard = [number for number in _KINDS if number == signal.SIGTERM or before[number] == signal.default_int_handler]
+    before = _heard()
     hook = sys.unraisablehook
 
     asked: list[tuple[int, float]] = []
@@ -76,7 +87,7 @@ def orderly_stops() -> Iterator[None]:
             raise _KINDS[number]
 
     def repeat(dropped: "sys.UnraisableHookArgs") -> None:
-        number = next((number for number, kind in _KINDS.items() if issubclass(dropped.exc_type, kind)), None)
+        number = next((number for number, kind in _KINDS.items() if dropped.exc_type is kind), None)
         if number is None:
             hook(dropped)
             return
@@ -85,7 +96,7 @@ def orderly_stops() -> Iterator[None]:
         again.daemon = True
         again.start()
 
-    for number in heard:
+    for number in before:
         signal.signal(number, stop)
     sys.unraisablehook = repeat
     try:
@@ -96,21 +107,36 @@ def orderly_stops() -> Iterator[None]:
         raise
     finally:
         sys.unraisablehook = hook
-        for number in heard:
-            signal.signal(number, before[number])
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
 def stops_put_off() -> Iterator[Put]:
-    """Put Ctrl-C and SIGTERM off, so that no exception comes in the middle of a step. They take effect at the end."""
+    """Put Ctrl-C, SIGTERM and SIGHUP off, so that none comes in the middle of a step. They take effect at the end."""
     put = Put()
     if threading.current_thread() is not threading.main_thread():
         yield put
         return
-    before = {number: signal.signal(number, put.ask) or signal.SIG_DFL for number in _KINDS}
+    before = _heard()
+    for number in before:
+        signal.signal(number, put.ask)
     try:
         yield put
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     put.follow()
+
+
+def _heard() -> dict[int, Any]:
+    """Return the signals that stop this process, with their present handlers.
+
+    A shell lets what it starts in the background ignore Ctrl-C. nohup lets a command ignore a closed terminal.
+    """
+    handlers = {number: signal.getsignal(number) or signal.SIG_DFL for number in _KINDS}
+    return {
+        number: handler
+        for number, handler in handlers.items()
+        if number == signal.SIGTERM or handler is not signal.SIG_IGN
+    }

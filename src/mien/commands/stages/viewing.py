@@ -25,7 +25,7 @@ from mien.export import Motion
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.progress import say
 from mien.runtime import MeshBound, PortableAvatar, read_portable
-from mien.stops import EXIT_TERMINATED, Terminated
+from mien.stops import Terminated
 from mien.training import read_coverage, run_camera
 from mien.training.run import filmed_range
 from mien.viewer import CameraSwitch, Clip, Door, Mesh, Session, is_loopback, serve
@@ -85,9 +85,9 @@ def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Pl
         serve(session, door, place.port, viewed.portable.about.name, ready, _camera_switch(session, viewed, place))
     except KeyboardInterrupt:
         say("The viewer is closed")
-    except Terminated:
+    except Terminated as stop:
         # Nothing continues later. A training ends its viewer in this way, and says so itself.
-        raise SystemExit(EXIT_TERMINATED) from None
+        raise SystemExit(stop.code) from None
 
 
 def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwitch | None:
