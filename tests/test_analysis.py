@@ -315,6 +315,11 @@ def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.Ca
         told = complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "growth")
         assert "analysis" in told
     path.write_bytes(whole)
+    edit_json(path, lambda content: content.update(paper={"2": []}, run=3))
+    assert analyze(workspace, "--parts", "growth") == 0
+    again, expected = (json.loads(text) for text in (path.read_bytes(), whole))
+    assert [again[name] for name in ("run", "paper", "parts")] == [expected[name] for name in ("run", "paper", "parts")]
+    capsys.readouterr()
     shutil.rmtree(workspace / "analysis")
     (workspace / "analysis").symlink_to(workspace.parent)
     assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace))

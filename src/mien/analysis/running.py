@@ -59,14 +59,15 @@ def run_analysis(
         folder.mkdir(parents=True, exist_ok=True)
         context = Context(run_dir, tuple(sequence_dirs), folder, options)
         avatar = file_digest(run_dir / "avatar" / "avatar.safetensors")
-        content = _known(folder, analysis, avatar) or {
+        content = {
             "run": run_dir.name,
             "method": analysis.method,
             "paper": analysis.paper,
             "avatar": avatar,
-            "parts": {},
+            "parts": _known(folder, analysis, avatar),
+            "mien": mien.__version__,
+            "command_line": sys.argv,
         }
-        content |= {"mien": mien.__version__, "command_line": sys.argv}
         for part in parts:
             key = _key(part, avatar, options)
             if content["parts"].get(part.name, {}).get("key") == key:
@@ -103,21 +104,20 @@ def _key(part: Part, avatar: str, options: AnalysisOptions) -> str:
     return digest_of([part.name, avatar, chosen, _native.thread_count() if part.timed else None])
 
 
-def _known(folder: Path, analysis: Analysis, avatar: str) -> dict[str, Any] | None:
-    """The content of an analysis.json of this avatar, with the parts that are whole; None if there is none."""
+def _known(folder: Path, analysis: Analysis, avatar: str) -> dict[str, Any]:
+    """The parts in an analysis.json of this avatar that are whole; none if there is no such file."""
     path = folder / RECORD
     if not path.is_file():
-        return None
+        return {}
     content = read_json(path, FORMAT, VERSION, remedy=_REMEDY)
     with expect_whole(path, _REMEDY):
         if (content["method"], content["avatar"]) != (analysis.method, avatar):
-            return None
-        content["parts"] = {
+            return {}
+        return {
             part.name: content["parts"][part.name]
             for part in analysis.parts
             if part.name in content["parts"] and _is_whole(folder, part, content["parts"][part.name])
         }
-        return {name: value for name, value in content.items() if name not in ("format", "version")}
 
 
 def _is_whole(folder: Path, part: Part, content: Mapping[str, Any]) -> bool:
