@@ -11,6 +11,7 @@ import safetensors.torch
 import torch
 
 import train_toy
+from bounded_memory import MIB, allocating_at_most
 from fuzzing.material import tiny_flame
 from mien.avatar import load_avatar
 from mien.capture.crop import whole_picture
@@ -102,6 +103,20 @@ def test_landmarks_of_an_added_face_model(text: bytes, tmp_path: Path, monkeypat
     with pytest.raises(UserError, match=r"mine\.landmarks\.json") as error:
         read_landmarks("mine", model)
     assert "\n" not in str(error.value)
+
+
+def test_landmarks_of_gigabytes_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path))
+    path = tmp_path / "face_models" / "added" / "mine.landmarks.json"
+    path.parent.mkdir(parents=True)
+    path.touch()
+    os.truncate(path, 1 << 30)
+    model = toy_sequence(timesteps=1, size=32)[0]
+    with (
+        allocating_at_most(64 * MIB),
+        pytest.raises(UserError, match=r"mine\.landmarks\.json: .*at most 4,194,304 are"),
+    ):
+        read_landmarks("mine", model)
 
 
 def test_face_parameters_of_another_type() -> None:

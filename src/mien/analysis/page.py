@@ -8,12 +8,15 @@ from typing import Any
 
 from mien.analysis.result import chart_from
 from mien.analysis.spec import Analysis
+from mien.bounded import read_bytes
 from mien.evaluation.page import page_html, video_html
 from mien.evaluation.plots import line_chart
 from mien.inside import inside
 from mien.pictures import data_uri
 from mien.storage import write_atomically
 
+_MAX_PICTURE_BYTES = 64 << 20
+"""Limit of a picture of the page, in bytes."""
 _AT_MOST_ITS_SIZE = "width:auto;max-width:100%;max-height:640px"
 
 
@@ -80,7 +83,7 @@ def _chart(entry: Mapping[str, Any]) -> str:
 
 
 def _picture(entry: Mapping[str, Any], folder: Path) -> str:
-    source = data_uri("image/png", inside(folder, entry["file"]).read_bytes())
+    source = data_uri("image/png", read_bytes(inside(folder, entry["file"]), _MAX_PICTURE_BYTES))
     caption = escape(entry["caption"])
     image = f'<img style="{_AT_MOST_ITS_SIZE}" alt="{caption}" src="{source}">'
     return f'<figure class="row">{image}<figcaption>{caption}</figcaption></figure>'

@@ -111,8 +111,8 @@ def picture_html(picture: UInt8[np.ndarray, "_ _ 3"], what: str, max_side: int) 
 def video_html(path: Path, page_folder: Path, note: str) -> str:
     """A video: embedded if it is small, so that the page stays one file, or else linked."""
     link = path.relative_to(page_folder).as_posix()
-    data = path.read_bytes()
-    source = data_uri("video/mp4", data) if len(data) <= _MAX_EMBEDDED_BYTES else link
+    is_small = path.stat().st_size <= _MAX_EMBEDDED_BYTES
+    source = data_uri("video/mp4", path.read_bytes()) if is_small else link
     return (
         f'<video controls muted loop preload="metadata" src="{escape(source)}"></video>'
         f'<p class="note">{escape(note)}: <a href="{escape(link)}">{escape(link)}</a></p>'

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mien.bounded import parse_json
+from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
 from mien.face.anny import bake_anny
 from mien.face.anny_source import anny_tag
@@ -36,6 +36,8 @@ _READABLE_RECIPES = (1, 2)
 """Recipes whose results can still be used. Joints of the first do not follow expressions and offsets."""
 _PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
 """Remedy for landmarks that cannot be read."""
+_MAX_LANDMARK_BYTES = 4 << 20
+"""Limit of a file of landmarks, in bytes. Those of one model have some ten thousand."""
 _LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 
@@ -177,13 +179,13 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
-    file: Any = resources.files("mien.face") / "data" / f"{name}_landmarks.json"
+    file = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
     if not file.is_file():
         file = _landmark_file(_added_file(name))
     if not file.is_file():
         return {}
-    with expect_whole(Path(str(file)), _PLACE_AGAIN):
-        content = parse_json(file.read_text(encoding="utf-8"))
+    with expect_whole(file, _PLACE_AGAIN):
+        content = parse_json(read_bytes(file, _MAX_LANDMARK_BYTES).decode("utf-8"))
         if content["topology_hash"] != model.topology_hash:
             raise UserError(
                 f"{file}: the landmarks of {name} were made for another mesh: run "
