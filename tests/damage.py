@@ -8,7 +8,7 @@ from typing import Any
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change a json file and drop its checksum, as in a file of an old or foreign version of mien."""
+    """Change a json file and drop its checksum, as in a file of a foreign program."""
     content = json.loads(path.read_text())
     content.pop("checksum", None)
     change(content)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning
-from mien.capture import write_capture
+from mien.capture import read_capture_hash, write_capture
 from mien.evaluation.experiment import Experiment
 from mien.pictures import to_uint8
 from mien.render import rasterize
@@ -60,7 +60,8 @@ def write_sequence(root: Path, experiment: Experiment, sequence: Sequence) -> Pa
     crops = np.repeat(experiment.scorings[0].crops, len(sequence.capture.camera_ids), axis=1)
     write_capture(folder / "capture", sequence.capture)
     write_tracking(folder / "tracking", sequence.tracking)
-    write_scoring(folder / "scoring", replace(experiment.scorings[0], masks=sequence.scoring, crops=crops))
+    scoring = replace(experiment.scorings[0], masks=sequence.scoring, crops=crops)
+    write_scoring(folder / "scoring", scoring, read_capture_hash(folder / "capture"))
     return folder
 
 

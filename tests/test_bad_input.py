@@ -119,9 +119,9 @@ def test_an_interrupted_scoring_is_written_the_next_time(tmp_path: Path, monkeyp
     with monkeypatch.context() as patched:
         patched.setattr("mien.tracking.scoring_files.write_arrays", _interrupt)
         with pytest.raises(KeyboardInterrupt):
-            write_scoring(tmp_path / "scoring", scoring)
+            write_scoring(tmp_path / "scoring", scoring, "of a capture")
     assert list(tmp_path.iterdir()) == []
-    write_scoring(tmp_path / "scoring", scoring)
+    write_scoring(tmp_path / "scoring", scoring, "of a capture")
     assert (tmp_path / "scoring" / "scoring.json").is_file()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mien.capture import Capture, write_capture
+from mien.capture import Capture, read_capture_hash, write_capture
 from mien.capture.video import probe_video, write_video
 from mien.commands.stages import driving
 from mien.commands.stages.driving import open_driver, run_driving_stage
@@ -34,7 +34,7 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             write_capture(folder / "capture", capture)
             write_tracking(folder / "tracking", tracking)
             crops = np.tile(np.array([4, 4, 20, 20], np.int64), (timesteps, 1, 1))
-            write_scoring(folder / "scoring", Scoring(capture.mattes, crops))
+            write_scoring(folder / "scoring", Scoring(capture.mattes, crops), read_capture_hash(folder / "capture"))
         return list(PARTS)
 
     def run_tracking_stage(*_: object, **__: object) -> dict[str, Tracking]:

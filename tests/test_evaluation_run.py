@@ -11,7 +11,7 @@ import torch
 
 from evaluation_case import make_experiment
 from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning
-from mien.capture import write_capture
+from mien.capture import read_capture_hash, write_capture
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
 from mien.evaluation.evaluate import is_evaluated
@@ -33,7 +33,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     sequence = experiment.sequences[0]
     write_capture(folder / "capture", sequence.capture)
     write_tracking(folder / "tracking", sequence.tracking)
-    write_scoring(folder / "scoring", experiment.scorings[0])
+    write_scoring(folder / "scoring", experiment.scorings[0], read_capture_hash(folder / "capture"))
     settings = TrainSettings(steps=STEPS, record_every=1, checkpoint_every=STEPS)
     config = METHODS[DEFAULT_METHOD].config(face_tuning=FaceTuning(enabled=False))
     train([read_sequence(folder)], experiment.avatar.face_model, config, settings, run_dir)
@@ -82,7 +82,8 @@ def test_figures_of_other_scoring_masks_are_not_kept(workspace: tuple[Path, Path
     before = evaluate(run_dir, [folder], quick)
     shutil.rmtree(folder / "scoring")
     scoring = make_experiment().scorings[0]
-    write_scoring(folder / "scoring", replace(scoring, masks=np.full_like(scoring.masks, 255)))
+    white = replace(scoring, masks=np.full_like(scoring.masks, 255))
+    write_scoring(folder / "scoring", white, read_capture_hash(folder / "capture"))
     assert not is_evaluated(run_dir, [folder], quick)
     after = evaluate(run_dir, [folder], quick)
     assert after["fingerprints"] != before["fingerprints"], "figures of an interrupted evaluation are kept by these"

@@ -217,13 +217,12 @@ def header_of(path: Path) -> dict:
         return json.loads(file.metadata()["mien"])
 
 
-def test_files_with_changes_have_version_2_and_others_stay_as_they_were(tmp_path: Path) -> None:
-    for rank, version in ((0, 1), (2, 2)):
+def test_files_with_changes_and_without_come_back(tmp_path: Path) -> None:
+    for rank in (0, 2):
         avatar, path = new_avatar(rank), tmp_path / f"{rank}.mien"
         runtime.write_portable(path, make_portable(avatar, toy_camera(32), "toy"))
         header = header_of(path)
-        assert header["version"] == version
-        assert ("changes" in header["content"]["baked"]) == (rank > 0)
+        assert (header["content"]["baked"]["changes"] is not None) == (rank > 0)
         read = runtime.read_portable(path)
         runtime.write_portable(tmp_path / "again.mien", read)
         assert (tmp_path / "again.mien").read_bytes() == path.read_bytes()

@@ -125,7 +125,7 @@ def test_changes_have_a_penalty_of_their_own() -> None:
 
 
 def test_features_have_their_own_number_of_activations() -> None:
-    """Bases take the first activations. Avatars from before had as many for features as for bases."""
+    """Bases take the first activations."""
     avatar = new_avatar()
     assert avatar.store["feature_bases"].shape[1] == DIRECTIONS
     assert avatar.store["offset_basis"].shape[-1] == RANK
@@ -138,9 +138,6 @@ def test_features_have_their_own_number_of_activations() -> None:
     alone = replace(CONFIG, expression_rank=0)
     alone.check()
     assert baked_fault(new_avatar(alone).bake()) is None
-    stored = {"expression_rank": 4, "appearance": "features"}
-    assert GaussianAvatarsConfig.upgraded(stored)["appearance_directions"] == 4
-    assert "appearance_directions" not in GaussianAvatarsConfig.upgraded({"appearance": "static"})
 
 
 def test_density_control_keeps_every_tensor_as_long_and_every_triangle() -> None:

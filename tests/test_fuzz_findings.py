@@ -188,7 +188,7 @@ def test_a_curve_without_a_number(run: Path, tmp_path: Path) -> None:
 def test_a_crop_that_misses_its_mask(tmp_path: Path) -> None:
     """A crop that holds nothing of its mask is refused."""
     masks, crops = np.full((2, 1, 8, 8), 255, np.uint8), np.array([[[0, 0, 8, 8]], [[0, 0, 0, 0]]])
-    write_scoring(tmp_path / "scoring", Scoring(masks, crops))
+    write_scoring(tmp_path / "scoring", Scoring(masks, crops), "of a capture")
     with pytest.raises(UserError, match=r"crops\.safetensors: a crop is empty although its mask is not"):
         read_scoring(tmp_path / "scoring")
 

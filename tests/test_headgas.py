@@ -1,7 +1,6 @@
 """HeadGaS follows its formulas."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +9,6 @@ from torch import Tensor
 from mien.avatar import HeadGas, HeadGasConfig, Progress
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.files import overwrite
 from mien.avatar.headgas import input_directions, neighbour_distances, sample_surface, spread_out
 from mien.avatar.headgas_settings import PRESET_STEPS, PRESETS
 from mien.avatar.settings import Photometric
@@ -65,21 +63,6 @@ def test_all_directions_span_the_inputs_and_few_the_largest_spread() -> None:
     used = every[:, every.abs().sum(0) > 0]
     assert used.shape[1] == 2
     torch.testing.assert_close((offsets - offsets.mean(0)) @ used @ torch.linalg.pinv(used), offsets - offsets.mean(0))
-
-
-def test_avatars_of_older_versions_have_the_same_features() -> None:
-    avatar, face = new_avatar(), toy_face(5)
-    old = {name: tensor.clone() for name, tensor in avatar.state_dict().items()}
-    bases = torch.randn(40, 5, 5)
-    for name in ("store.trained.bases", "rest", "directions"):
-        del old[name]
-    old["store.trained.feature_bases"] = bases
-    overwrite(avatar, old, 40, Path("old"))
-    expected = avatar.store["neutral_features"] + torch.einsum("nfi,bi->bnf", bases, inputs_of(face))
-    torch.testing.assert_close(blended(avatar, face), expected)
-    before = {"features": 5, "sh_degree": 1}
-    assert HeadGasConfig(**HeadGasConfig.upgraded({"points": 40, **before, "judged_expressions": 0})) == SMALL
-    assert HeadGasConfig.upgraded({"directions": 20}) == {"directions": 20}
 
 
 def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:

@@ -380,13 +380,8 @@ def test_rates_halve_at_their_times() -> None:
         assert rates == [1, 1, 0.5, 0.25, 0.25], group.name
 
 
-def test_an_avatar_of_an_older_version_is_refused_in_one_line() -> None:
-    with pytest.raises(UserError, match="older version of mono_gaussian_avatar"):
-        MonoGaussianAvatarConfig.upgraded({"points": 400, "rounds": 50})
-
-
 def test_points_without_attributes_of_their_own() -> None:
-    """The preset `paper` has none, nor have avatars of older versions, which get the defaults."""
+    """The preset `paper` has none."""
     assert MonoGaussianAvatarConfig().own_rate == PRESETS["paper"].own_rate == Rate(0.0)
     avatar = new_avatar(replace(SMALL, own_rate=Rate(0.0)))
     assert avatar.store.names() == ("means",)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mien.avatar import neutral_of
-from mien.capture import write_capture
+from mien.capture import read_capture_hash, write_capture
 from mien.commands.options import check_neutral
 from mien.commands.stages.driving import open_driver
 from mien.driving import drive, facing, rest_of, with_neutral
@@ -161,7 +161,7 @@ def tracked(folder: Path, first: float, then: float) -> Path:
         replace(sequence.tracking, face=replace(sequence.tracking.face, expression=expression)),
     )
     crops = np.tile(np.array([4, 4, 20, 20], np.int64), (30, 1, 1))
-    write_scoring(folder / "scoring", Scoring(sequence.capture.mattes, crops))
+    write_scoring(folder / "scoring", Scoring(sequence.capture.mattes, crops), read_capture_hash(folder / "capture"))
     return folder
 
 

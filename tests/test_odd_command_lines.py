@@ -176,20 +176,32 @@ def test_landmarks_that_no_face_could_have(
     assert "no face fits the landmarks" in capsys.readouterr().err
 
 
-def test_an_avatar_of_an_older_version_says_train_again(
+def test_an_avatar_of_another_version_says_train_again(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An avatar of an older version asks to be trained again.
-
-    Before checksums, avatar.json had no hash of its tensors.
-    """
+    """An avatar of another version, or with more or fewer entries, asks to be trained again."""
     monkeypatch.chdir(place)
     path = place / "W/runs/toy/avatar/avatar.json"
     whole = path.read_bytes()
     try:
-        edit_json(path, lambda content: content.pop("tensors_sha256"))
+        for version in (0, 2):
+            edit_json(path, lambda content: content.update(version=version))  # noqa: B023
+            assert main(["render", "W", "--out", "a.png"]) == 2
+            told = capsys.readouterr().err
+            assert f"version {version}, expected 'mien.avatar' version 1" in told
+            assert "train it again with `mien train`" in told
+        edit_json(path, lambda content: content.update(version=1))
+        for field in ("tensors_sha256", "config"):
+            edit_json(path, lambda content: content.pop(field))  # noqa: B023
+            assert main(["render", "W", "--out", "a.png"]) == 2
+            told = capsys.readouterr().err
+            assert f"lacks ['{field}'] (made by another version of mien?)" in told
+            assert "train it again with `mien train`" in told
+            path.write_bytes(whole)
+        edit_json(path, lambda content: content["config"].pop("photometric"))
         assert main(["render", "W", "--out", "a.png"]) == 2
-        assert "train it again with `mien train`" in capsys.readouterr().err
+        assert "lacks ['photometric']" in capsys.readouterr().err
+        path.write_bytes(whole)
         edit_json(path, lambda content: content.update(tensors_sha256="0", future=1))
         assert main(["export", "W", "--out", "a.ply"]) == 2
         assert "unknown entries ['future']" in capsys.readouterr().err

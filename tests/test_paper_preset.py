@@ -12,12 +12,10 @@ import torch
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate
 from mien.avatar.mono_schedule import Schedule, ScheduleName
 from mien.camera import Camera
-from mien.errors import UserError
-from mien.training import PRESETS, TrainSettings, check_run, train
+from mien.training import PRESETS, TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import _round_steps
 from mien.training.frames import MIN_EXTENT, Frame, camera_extent
-from mien.training.run import claim_run
 from toy_scene import toy_face, toy_face_model, toy_sequence
 
 PAGE = Path(__file__).parent.parent / "docs" / "paper_preset.md"
@@ -222,21 +220,3 @@ def test_a_stopped_run_of_the_preset_ends_as_if_it_had_not_stopped(
     again = train([sequence], face_model, PAPER, settings, tmp_path / "stopped")
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, again.state_dict()[name]), name
-
-
-# -- runs of older versions -------------------------------------------------------------------------------------------
-
-
-def test_a_run_from_before_these_settings_goes_on(tmp_path: Path) -> None:
-    _, sequence = toy_sequence(timesteps=5, size=32)
-    config, settings = GaussianAvatarsConfig(), TrainSettings()
-    claim_run(tmp_path, [sequence], config, settings)
-    written = (tmp_path / "config.json").read_text()
-    older = re.sub(r'\s*"(size_unit|means_times_extent)": [^,]*,', "", written)
-    older = re.sub(r',\s*"rules": {[^}]*}', "", older)
-    older = re.sub(r',?\s*"checksum": "[^"]*"', "", older)
-    assert len(older) < len(written) - 200
-    (tmp_path / "config.json").write_text(older)
-    assert check_run(tmp_path, config, settings)
-    with pytest.raises(UserError, match=r"holds a run with other method.density.size_unit"):
-        check_run(tmp_path, replace(config, density=replace(config.density, size_unit="extent")), settings)

@@ -1,6 +1,7 @@
 """Avatars without torch draw the same pictures, do not import torch, and report damaged files."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,7 +19,6 @@ from mien.face import FaceParams
 from mien.render import rasterize
 from mien.runtime.checks import baked_fault
 from mien.runtime.posing import run_network
-from older_files import with_a_basis_for_each_input
 from toy_scene import runtime_face, toy_camera, toy_sequence
 
 SIZE = 64
@@ -171,23 +171,17 @@ def test_linear_bases_add_to_the_raw_values(kind: str) -> None:
 
 
 @torch.no_grad()
-def test_features_along_directions_equal_a_basis_for_each_input(tmp_path: Path) -> None:
-    """Files of version 6 pose as older ones, in which every input has its own basis, and take less room."""
-    whole = export(new_avatar("headgas", directions=2), tmp_path / "new.mien").portable
+def test_the_features_network_equals_its_reference_in_numpy(tmp_path: Path) -> None:
+    whole = export(new_avatar("headgas", directions=2), tmp_path / "a.mien").portable
     assert isinstance(whole.baked, runtime.Static)
-    older = replace(whole, baked=with_a_basis_for_each_input(whole.baked))
-    runtime.write_portable(tmp_path / "old.mien", older)
-    sizes = [(tmp_path / name).stat().st_size for name in ("new.mien", "old.mien")]
-    assert sizes[0] < 0.8 * sizes[1]
+    network = whole.baked.network
+    assert network is not None
     for timestep in range(3):
         face = runtime_face(toy_sequence(5, SIZE)[1].tracking.face[timestep])
-        new, old = (runtime.pose(one.baked, face) for one in (whole, runtime.load(tmp_path / "old.mien").portable))
-        np.testing.assert_allclose(new.sh, old.sh, rtol=0, atol=2e-6)
-        np.testing.assert_allclose(new.opacities, old.opacities, rtol=0, atol=5e-7)
-        network = whole.baked.network
-        assert network is not None
+        posed = runtime.pose(whole.baked, face)
         by_hand = run_network(network, np.zeros_like(whole.baked.means), face)
-        np.testing.assert_allclose(by_hand[:, :-1].reshape(new.sh.shape), new.sh, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(by_hand[:, :-1].reshape(posed.sh.shape), posed.sh, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(1 / (1 + np.exp(-by_hand[:, -1])), posed.opacities, rtol=0, atol=5e-7)
 
 
 def test_directions_that_do_not_fit_are_told(tmp_path: Path) -> None:
@@ -202,10 +196,9 @@ def test_directions_that_do_not_fit_are_told(tmp_path: Path) -> None:
             replace(network, along=replace(along, rest=along.rest[1:], directions=along.directions[1:])),
             "the shape of rest of its directions",
         ),
-        (replace(network, along=replace(along, basis=along.basis[:, :, 1:])), "the shape of basis of its directions"),
+        (replace(network, along=replace(along, basis=np.repeat(along.basis, 9, 2))), "288 features, but"),
         (replace(network, along=replace(along, basis=along.basis[1:])), "the shape of basis of its directions"),
-        (replace(network, joint_basis=np.zeros((3, *network.basis.shape[1:]), np.float32)), "beside another input"),
-        (replace(network, along=None), "the shape of its network's basis"),
+        (replace(network, along=None), "the input features, which does not fit its directions"),
     ):
         with pytest.raises(UserError, match=part):
             runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=replace(whole.baked, network=wrong)))
@@ -248,9 +241,11 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=part):
             runtime.write_portable(path, wrong)
     arrays = safetensors.numpy.load_file(path)
-    safetensors.numpy.save_file(arrays, path, {"mien": json.dumps({"format": "mien.baked", "version": 9})})
-    with pytest.raises(UserError, match="version 9"):
-        runtime.load(path)
+    for version in (0, 2, 6, "1", None):
+        safetensors.numpy.save_file(arrays, path, {"mien": json.dumps({"format": "mien.baked", "version": version})})
+        told = f"version {version!r}, expected 'mien.baked' version 1; export it again with `mien export`"
+        with pytest.raises(UserError, match=re.escape(told)):
+            runtime.load(path)
     safetensors.numpy.save_file(arrays, path)
     with pytest.raises(UserError, match=r"is not a \.mien file; write one with `mien export"):
         runtime.load(path)

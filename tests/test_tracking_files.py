@@ -143,13 +143,13 @@ def test_scoring_round_trip_and_frozen(tmp_path):
     """A scoring is read as it was written, and never overwritten."""
     folder = tmp_path / "scoring"
     assert not scoring_exists(folder)
-    write_scoring(folder, _scoring())
+    write_scoring(folder, _scoring(), "a1")
     assert scoring_exists(folder)
     again = read_scoring(folder)
     np.testing.assert_array_equal(again.masks, _scoring().masks)
     np.testing.assert_array_equal(again.crops, _scoring().crops)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    write_scoring(folder, _scoring(value=100))
+    write_scoring(folder, _scoring(value=100), "a1")
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     assert list(tmp_path.iterdir()) == [folder], "no scratch folder stays behind"
 
@@ -157,13 +157,13 @@ def test_scoring_round_trip_and_frozen(tmp_path):
 def test_half_written_scoring_is_replaced(tmp_path):
     folder = tmp_path / "scoring"
     (folder / "masks").mkdir(parents=True)
-    write_scoring(folder, _scoring())
+    write_scoring(folder, _scoring(), "a1")
     assert read_scoring(folder).masks.max() == 200
 
 
 def test_damaged_scoring(tmp_path):
     """Missing, damaged and exchanged masks of a scoring are refused."""
-    write_scoring(tmp_path / "s", _scoring())
+    write_scoring(tmp_path / "s", _scoring(), "a1")
     mask = tmp_path / "s" / "masks" / "00" / "000001.png"
     whole = mask.read_bytes()
     mask.write_bytes(whole[:-5])
@@ -172,7 +172,7 @@ def test_damaged_scoring(tmp_path):
     mask.unlink()
     with pytest.raises(UserError, match="missing"):
         read_scoring(tmp_path / "s")
-    write_scoring(tmp_path / "other", _scoring(value=100))
+    write_scoring(tmp_path / "other", _scoring(value=100), "a1")
     mask.write_bytes((tmp_path / "other" / "masks" / "00" / "000001.png").read_bytes())
     with pytest.raises(UserError, match="have changed since they were written"):
         read_scoring(tmp_path / "s")
@@ -183,18 +183,18 @@ def test_scoring_of_other_pictures_is_refused(tmp_path):
     assert read_scoring(tmp_path / "s", "a1").masks.max() == 200
     with pytest.raises(UserError, match=r"other pictures than the capture beside it; run `mien track` again"):
         read_scoring(tmp_path / "s", "b2")
-    # Files of the first release do not name the capture that they belong to.
-    write_scoring(tmp_path / "old", _scoring())
-    assert read_scoring(tmp_path / "old", "b2").masks.max() == 200
+    edit_json(tmp_path / "s" / "scoring.json", lambda content: content.pop("capture_hash"))
+    with pytest.raises(UserError, match="other pictures than the capture beside it"):
+        read_scoring(tmp_path / "s", "a1")
 
 
 def test_the_hash_of_a_scoring_is_over_masks_and_crops(tmp_path):
     """The hash of a scoring covers masks and crops. Figures of other runs name it, so it must not change."""
-    write_scoring(tmp_path / "s", _scoring())
+    write_scoring(tmp_path / "s", _scoring(), "a1")
     digest = hashlib.sha256(_scoring().masks.tobytes() + _scoring().crops.astype(np.int32).tobytes()).hexdigest()
     assert read_scoring_hash(tmp_path / "s") == digest
     other = _scoring()
     other.crops[1, 0, 2] += 1
-    write_scoring(tmp_path / "crops", other)
-    write_scoring(tmp_path / "masks", _scoring(value=201))
+    write_scoring(tmp_path / "crops", other, "a1")
+    write_scoring(tmp_path / "masks", _scoring(value=201), "a1")
     assert len({read_scoring_hash(tmp_path / name) for name in ("s", "crops", "masks")}) == 3

@@ -51,19 +51,19 @@ def added(cache, monkeypatch, tmp_path_factory):
     return path, calls
 
 
-def test_one_that_an_earlier_version_added_is_renewed_only_on_demand(added):
+def test_one_of_another_recipe_is_not_there_and_is_added_again(added):
     path, calls = added
     source = cache_folder() / "face_models/added/my_head.source.json"
     content = {"path": str(path), "sha256": file_digest(path), "recipe": 1}
     write_json(source, "mien.face_model_source", 1, content)
     calls.clear()
-    stage.face_model_of(str(path))
-    assert "my_head" in [info.name for info in available_face_models()]
-    assert calls == []
-    assert main(["face-models", "--add", str(path)]) == 0
-    assert len(calls) == 2
-    assert main(["face-models", "--add", str(path)]) == 0
-    assert len(calls) == 2
+    assert "my_head" not in [info.name for info in available_face_models()]
+    with pytest.raises(UserError, match="there is no face model 'my_head'"):
+        load_face_model("my_head")
+    for _ in range(2):
+        assert main(["face-models", "--add", str(path)]) == 0
+        assert "my_head" in [info.name for info in available_face_models()]
+    assert len(calls) == 2, "it is added once"
 
 
 def test_it_is_added_once_and_then_goes_by_its_name(added):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mien.capture import write_capture
+from mien.capture import read_capture_hash, write_capture
 from mien.capture.pace import frame_rate, pace_report
 from mien.driving import read_tracked_driver
 from mien.driving.drivers import Driver
@@ -56,7 +56,7 @@ def filmed_at(folder: Path, times: np.ndarray, fps: float) -> Driver:
     tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, head_rotation=turned))
     write_tracking(folder / "tracking", tracking)
     crops = np.tile(np.array([4, 4, 20, 20], np.int64), (len(times), 1, 1))
-    write_scoring(folder / "scoring", Scoring(sequence.capture.mattes, crops))
+    write_scoring(folder / "scoring", Scoring(sequence.capture.mattes, crops), read_capture_hash(folder / "capture"))
     return read_tracked_driver([folder])
 
 

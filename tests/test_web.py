@@ -20,7 +20,6 @@ from mien.export import Motion, pack, unpacked, write_page
 from mien.export.bound_features import bound_features
 from mien.export.web_page import TEMPLATE
 from mien.runtime.posing import expression_changes, rig_points
-from older_files import with_a_basis_for_each_input
 from test_runtime import new_avatar
 from toy_scene import toy_camera
 from toy_workspace import write_toy_workspace
@@ -83,13 +82,9 @@ def test_faces_are_posed_as_in_python(built: Path, tmp_path: Path, form: str, ra
             np.testing.assert_allclose(ours, theirs.reshape(-1), rtol=0, atol=EQUAL)
 
 
-@pytest.mark.parametrize("version", [5, 6])
-def test_gaussians_of_headgas_are_the_same_on_a_triangle(version: int) -> None:
+def test_gaussians_of_headgas_are_the_same_on_a_triangle() -> None:
     """Bound to a triangle that never moves, with features along few directions, they look as before."""
     portable = painted_head(500)
-    assert isinstance(portable.baked, runtime.Static)
-    if version == 5:
-        portable = replace(portable, baked=with_a_basis_for_each_input(portable.baked))
     baked = bound_features(portable)
     assert baked.changes is not None
     assert baked.changes.features is not None

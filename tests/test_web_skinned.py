@@ -46,9 +46,7 @@ def skinned_head(still: bool = True) -> runtime.PortableAvatar:
         pose_basis=some(0.002, 9 * sum(rig.joint_free), 4000, 3),
     )
     first, *rest = baked.network.weights
-    network = replace(
-        baked.network, base=some(0.01, 4000, 3), basis=np.zeros((0, 4000, 0), np.float32), weights=(first, *rest)
-    )
+    network = replace(baked.network, base=some(0.01, 4000, 3), weights=(first, *rest))
     attributes = runtime.Attributes(some(1, 4000, 4), some(1, 4000, 3), some(2, 4000), some(1, 4000, 1, 3))
     pose = np.eye(4, dtype=np.float32)
     pose[:3, 3] = drawn.neutral.head_translation

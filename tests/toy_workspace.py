@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import train_toy
-from mien.capture import write_capture
+from mien.capture import read_capture_hash, write_capture
 from mien.evaluation import EvaluationSettings, evaluate
 from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import read_sequence, train
@@ -20,7 +20,7 @@ def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
     write_capture(folder / "capture", sequence.capture)
     write_tracking(folder / "tracking", sequence.tracking)
     crops = np.tile(np.array([4, 4, 20, 20], np.int64), (timesteps, 1, 1))
-    write_scoring(folder / "scoring", Scoring(sequence.scoring, crops))
+    write_scoring(folder / "scoring", Scoring(sequence.scoring, crops), read_capture_hash(folder / "capture"))
     settings = replace(train_toy.SETTINGS, split="tail")
     train([read_sequence(folder)], face_model, train_toy.CONFIG, settings, root / "runs" / "toy")
 

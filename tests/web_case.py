@@ -112,7 +112,6 @@ def drawn_head(
         taken = columns or rank
         parts = (some(0.3, 3, taken), some(0.3, taken), some(0.1, 3, taken))
         changes = runtime.ExpressionChanges(rest, directions, reach, *parts, basis_columns=columns)
-        # With what was filmed, the file has the latest version of the format.
         eye = np.eye(inputs, dtype=np.float32)
         filmed = runtime.Filmed(rest, rest + 1, eye, reach, np.zeros((2, 2), np.float32))
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)

@@ -4,7 +4,7 @@ import contextlib
 import difflib
 import types
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -27,11 +27,11 @@ def encode(value: Any) -> Any:
 
 
 def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make it again") -> Any:
-    """Decode what `encode` encoded into the type `hint`. Missing fields get their defaults.
+    """Decode what `encode` encoded into the type `hint`. Every field is there, also one with a default.
 
     Raises:
-        UserError: a field is unknown, is missing and has no default, has a value of another type, or is out of its
-            range. The message ends with `remedy`.
+        UserError: a field is unknown or missing, has a value of another type, or is out of its range. The message ends
+            with `remedy`.
     """
     try:
         return _decode(hint, value, where)
@@ -144,16 +144,13 @@ def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}")
     hints = get_type_hints(hint, include_extras=True)
-    known = {f.name: f for f in fields(hint)}
-    unknown = set(value) - set(known) - {"kind"}
-    missing = [
-        name for name, f in known.items() if name not in value and f.default is MISSING and f.default_factory is MISSING
-    ]
+    known = [f.name for f in fields(hint)]
+    unknown, missing = set(value) - {*known, "kind"}, [name for name in known if name not in value]
     if unknown or missing:
         faults = [f"has unknown entries {_in_short(sorted(unknown))}"] if unknown else []
         faults += [f"lacks {_in_short(missing)}"] if missing else []
         raise UserError(f"{where}: {' and '.join(faults)}")
-    return hint(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in known if name in value})
+    return hint(**{name: _decode(hints[name], value[name], f"{where}.{name}") for name in known})
 
 
 def _decode_union(options: tuple[Any, ...], value: Any, where: str) -> Any:

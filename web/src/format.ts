@@ -9,7 +9,8 @@ type Tree = null | boolean | number | string | Tree[] | { [key: string]: Tree };
 /** A file that cannot be read. Its message is for the user. */
 export class AvatarError extends Error {}
 
-const VERSIONS = [1, 2, 3, 4, 5, 6];
+/** The version of both forms that is read: there is one. */
+const VERSION = 1;
 const BEYOND = "is damaged: an array lies beyond its end";
 const DAMAGED = "is damaged: its header cannot be";
 /** Most bytes of an avatar: a small file may unpack to gigabytes. */
@@ -31,9 +32,7 @@ function avatarOf(file: ArrayBuffer): Avatar {
   const header = safetensorsHeader(file);
   const told = parse((header.__metadata__ as { mien?: string } | undefined)?.mien ?? "{}") as { [key: string]: Tree };
   if (told.format !== "mien.baked") throw new AvatarError("is not a .mien file");
-  if (!VERSIONS.includes(told.version as number)) {
-    throw new AvatarError(`has version ${told.version} of the format; this page reads ${VERSIONS.join(", ")}`);
-  }
+  checkVersion(told.version);
   const start = 8 + Number(new DataView(file).getBigUint64(0, true));
   let left = file.byteLength - start;
   const tensor = (name: string): Numbers => {
@@ -46,6 +45,10 @@ function avatarOf(file: ArrayBuffer): Avatar {
     return entry.dtype === "I32" ? new Int32Array(bytes) : new Float32Array(bytes);
   };
   return checked(restored(told.content, tensor) as unknown as Avatar);
+}
+
+function checkVersion(found: Tree | undefined): void {
+  if (found !== VERSION) throw new AvatarError(`has version ${found} of the format, and version ${VERSION} is read; export it again with mien export`);
 }
 
 function safetensorsHeader(file: ArrayBuffer): { [key: string]: Tree } {
@@ -80,7 +83,8 @@ function unpackedOf(file: ArrayBuffer): { avatar: Avatar; motion: Motion | null 
   const size = file.byteLength >= 4 ? new DataView(file).getUint32(0, true) : Infinity;
   if (4 + size > file.byteLength || size > MOST_TEXT) throw new AvatarError(DAMAGED);
   const told = parse(new TextDecoder().decode(new Uint8Array(file, 4, size))) as { [key: string]: Tree };
-  if (told.format !== "mien.packed" || told.version !== 1) throw new AvatarError("was written by another version of mien");
+  if (told.format !== "mien.packed") throw new AvatarError("is not an avatar in packed form");
+  checkVersion(told.version);
   const tensors = (told.tensors ?? {}) as unknown as { [name: string]: PackedTensor };
   let left = file.byteLength;
   const tensor = (name: string) => {

@@ -123,7 +123,7 @@ class Avatar(nn.Module, ABC):
         self.subject = neutral_of(face)
         """One timestep: this person's identity and offsets, and the face at rest."""
         self.filmed: Filmed | None = None
-        """What training saw of the face. None if it is not known, as for older and imported avatars."""
+        """What training saw of the face. None if it is not known, as for imported avatars."""
 
     @abstractmethod
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
@@ -166,10 +166,6 @@ class Avatar(nn.Module, ABC):
 
     def paint(self, colors: Float[Tensor, "v 3"]) -> None:
         """Take the face model's vertices' mean colours in the training pictures, 0..1, as first colours."""
-
-    def upgraded(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the tensors of a file that an older version wrote, as this version names them. Most need no change."""
-        return state
 
     def triangles(self) -> Int[Tensor, " n"] | None:
         """The triangle that each Gaussian is bound to. None for methods that bind none, which train on all pixels."""

@@ -99,11 +99,7 @@ def _load_avatar(folder: Path) -> Avatar:
     if file_digest(folder / "avatar.safetensors") != content.tensors_sha256:
         raise UserError(f"{folder / 'avatar.safetensors'}: was changed or damaged after it was written; {_REMEDY}")
     face_model = _face_model_of(folder, content)
-    try:
-        upgraded = method.config.upgraded(content.config)
-    except UserError as error:
-        raise UserError(f"{where}: {error}") from None
-    config = decode(method.config, upgraded, where, _REMEDY)
+    config = decode(method.config, content.config, where, _REMEDY)
     with expect_whole(folder, _REMEDY):
         face = FaceParams(**_with_prefix(tensors, "subject."))
     check_face_params(face_model, face, str(folder), _REMEDY)
@@ -136,7 +132,6 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     Raises:
         UserError: `state`, which was read from `source`, does not belong to this method and config, or cannot be posed.
     """
-    state = avatar.upgraded(state)
     misfit = _misfit(avatar.state_dict(), state, gaussians)
     if misfit is not None:
         raise UserError(f"{source}: does not fit its settings ({misfit}); train it again")

@@ -1,8 +1,7 @@
 """The settings of GaussianAvatars."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, PerceptualLoss, Photometric
@@ -112,14 +111,6 @@ class GaussianAvatarsConfig(MethodConfig):
     """Limits that keep Gaussians on the surface of the mesh."""
     density: GradientSettings = field(default_factory=GradientSettings)
     """Density control: when and where Gaussians are added and removed."""
-
-    @classmethod
-    def upgraded(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
-        """Features had the activations of `expression_rank` before they had their own number."""
-        settings = super().upgraded(stored)
-        if settings.get("appearance") == "features":
-            settings.setdefault("appearance_directions", settings.get("expression_rank", 1))
-        return settings
 
 
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000

@@ -55,7 +55,6 @@ from mien.rotation import multiply_quaternions
 from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
 
 _CHUNK = 512
-_OLD_BASES = "feature_bases"
 _COLOUR_RATE = 2.5e-3
 """Learning rate of the colours in 3D Gaussian Splatting."""
 
@@ -148,16 +147,6 @@ class HeadGas(Avatar):
         """Every per-Gaussian tensor."""
         return self.store
 
-    def upgraded(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Older versions kept one basis per input and feature [n, f, i], without directions."""
-        old = f"store.trained.{_OLD_BASES}"
-        if old not in state or state[old].ndim != 3:
-            return state
-        bases = state[old]
-        rest, directions = bases.new_zeros(bases.shape[2]), torch.eye(bases.shape[2]).to(bases)
-        kept = {name: tensor for name, tensor in state.items() if name != old}
-        return kept | {"store.trained.bases": bases.mT.contiguous(), "rest": rest, "directions": directions}
-
     def density(self) -> GradientDensity:
         """Gradient-based control. Children copy features. `judged_opacities` says which opacity counts."""
         return GradientDensity(self.config.density, opacity_logits=None, judged_opacities=self.judged_opacities)
@@ -197,7 +186,6 @@ class HeadGas(Avatar):
         network = AttributeNetwork(
             input="features",
             base=np.concatenate([as_array(neutral), as_array(self._encoding())], axis=1),
-            basis=np.empty((0, *neutral.shape), np.float32),
             weights=tuple(map(as_array, weights)),
             biases=tuple(map(as_array, biases)),
             activation="leaky_relu",

@@ -1,8 +1,7 @@
 """The settings of HeadGaS."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
@@ -18,12 +17,6 @@ def _density() -> GradientSettings:
 
 def _face_tuning() -> FaceTuning:
     return FaceTuning(within_bounds=True)
-
-
-_BEFORE = {
-    "directions": 0, "sh_warmup": 0.0, "sh_higher_share": 1.0, "means_times_extent": False, "judged_expressions": 0
-}  # fmt: skip
-"""What avatars of versions without these settings have."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +73,6 @@ class HeadGasConfig(MethodConfig):
     density: GradientSettings = field(default_factory=_density)
     """Density control: when and where Gaussians are added and removed. Opacities come from the network and are never
     reset, so `size_start` sets when large Gaussians are removed."""
-
-    @classmethod
-    def upgraded(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
-        """Avatars of versions without directions have a basis for each input."""
-        return dict(stored) if "directions" in stored else {**_BEFORE, **stored}
 
 
 _STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS = 50_000, 100, 500, 15_000, 1_000

@@ -20,7 +20,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -240,7 +239,6 @@ class MonoGaussianAvatar(Avatar):
         network = AttributeNetwork(
             input="displacement",
             base=as_array(rest - canonical),
-            basis=np.zeros((0, len(self.store), 0), np.float32),
             weights=tuple(
                 as_array(part) for part in (torch.cat([first, first], dim=1), *(layer.weight for layer in layers[1:]))
             ),

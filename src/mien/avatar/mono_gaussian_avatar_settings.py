@@ -1,8 +1,7 @@
 """The settings of MonoGaussianAvatar."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import GAUSSIAN_COUNT, FaceTuning, MethodConfig, PerceptualLoss, Photometric
@@ -91,20 +90,6 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Weight of the losses that keep the networks near the face model. It halves at epochs 20, 30, 50 and 70."""
     face_points: Annotated[int, GAUSSIAN_COUNT] = 256
     """Number of points that these losses use in each step, in turn."""
-
-    @classmethod
-    def upgraded(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
-        """Refuse avatars of versions whose bone stood still in the head frame: their networks have other shapes.
-
-        Raises:
-            UserError: it is such an avatar.
-        """
-        if "epochs" not in stored:
-            raise UserError(
-                "was made by an older version of mono_gaussian_avatar, whose networks this version cannot read; "
-                "train it again under another name (`mien train --method mono_gaussian_avatar --run NAME`)"
-            )
-        return dict(stored)
 
     def check(self) -> None:
         """Check the numbers' ranges, and that the run has epochs.

@@ -3,9 +3,8 @@
 Every number has its range beside it (`mien.ranges`), and every field a description that `--help-all` shows.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
@@ -191,11 +190,6 @@ class MethodConfig:
     """Weights of the losses that compare a rendering with its target."""
     face_tuning: FaceTuning = field(default_factory=FaceTuning)
     """Whether and how fast training changes the tracked face parameters of each frame."""
-
-    @classmethod
-    def upgraded(cls, stored: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings in an avatar's file with those added that its version did not have. Most need none."""
-        return dict(stored)
 
     def check(self) -> None:
         """Check that all numbers are in their ranges.

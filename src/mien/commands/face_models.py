@@ -51,7 +51,7 @@ class Command:
                     f"--add {self.add}: there is no folder to keep it in (no home folder, or it cannot be written to); "
                     "set MIEN_CACHE to a folder"
                 )
-            add_face_model_file(self.add, self.name, self.shareable, renew=True)
+            add_face_model_file(self.add, self.name, self.shareable)
         if self.bake is not None:
             load_face_model(self.bake)
         rows = [asdict(info) for info in available_face_models()]

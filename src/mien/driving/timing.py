@@ -29,7 +29,7 @@ class Moments:
 
 
 def rate_of(capture: Capture) -> float:
-    """The frame rate of a capture, without its pauses. Captures of older versions have the mean rate."""
+    """The frame rate of a capture, without its pauses."""
     return frame_rate(capture.timestamps - capture.timestamps[:1], capture.fps)
 
 

@@ -117,10 +117,6 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
                     f"{run.label}: has no {protocol}; it held out other frames or was evaluated with other settings"
                 )
                 continue
-            if not entry.get("scored_on"):
-                warnings.append(
-                    f"{run.label}: was evaluated by an older version of mien; evaluate it again to compare its mask"
-                )
             groups.setdefault(_ground(entry), []).append(run)
         tables += [_table(protocol, group) for group in groups.values()]
         if len(groups) > 1:
@@ -138,7 +134,7 @@ def _ground(entry: Mapping[str, Any]) -> str:
     """Two runs can be compared if they share these: the scored frames, pictures and masks."""
     frames = entry["per_frame"]
     keys = ("sequence", "timestep", "camera_id")
-    return repr([entry.get("scored_on"), entry.get("pixels"), *(frames[key] for key in keys)])
+    return repr([entry["scored_on"], entry["pixels"], *(frames[key] for key in keys)])
 
 
 def _differences(table: Table) -> list[str]:
@@ -173,7 +169,7 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
     first = runs[0].metrics["protocols"][protocol]
     for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
-    return Table(protocol, first["split"], first["frames"], first.get("scored_on", {}), tuple(rows))
+    return Table(protocol, first["split"], first["frames"], first["scored_on"], tuple(rows))
 
 
 def _baseline_rows(key: str, name: str, runs: Sequence[ScoredRun], protocol: str) -> list[Row]:

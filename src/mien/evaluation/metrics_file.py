@@ -86,7 +86,7 @@ def _check_protocol(entry: Mapping[str, Any]) -> None:
     for name in ("perceptual_backbone", "pixels", "part_crops"):
         _require(entry.get(name) is None or is_one_line(entry[name]), name)
     _require(isinstance(entry.get("perceptual_frames"), int | None), "perceptual_frames")
-    for name, digests in entry.get("scored_on", {}).items():
+    for name, digests in entry["scored_on"].items():
         _require(all(map(is_one_line, (name, *digests, *digests.values()))), "scored_on")
     _check_frames(entry["per_frame"])
 

@@ -1,19 +1,13 @@
-"""Gaussians of headgas in the form of bound ones, which web pages draw: features on one triangle that never moves.
-
-Older .mien files have a basis of features for each input of the face. Here they are written along few directions of the
-face. Avatars are trained along 20 directions, so this loses nothing.
-"""
+"""Gaussians of headgas in the form of bound ones, which web pages draw: features on one triangle that never moves."""
 
 import numpy as np
 
 from mien.errors import UserError
 from mien.runtime import MeshBound, PortableAvatar, Rig, Static
-from mien.runtime.baked import AttributeNetwork, ExpressionChanges, FeatureChanges, FeatureDirections
+from mien.runtime.baked import ExpressionChanges, FeatureChanges
 
 _UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
 """A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""
-_LEAST_SHARE = 1e-9
-"""Share of the largest direction's energy, of those that are kept."""
 _REACH = np.float32(1e6)
 """Length of activations that no face has, so that none is shortened."""
 
@@ -27,7 +21,12 @@ def bound_features(avatar: PortableAvatar) -> MeshBound:
     baked = avatar.baked
     assert isinstance(baked, Static)
     network, name = baked.network, avatar.about.name
-    if network is None or len(network.weights) != 2 or network.outputs != ("sh", "opacity_logits"):
+    if (
+        network is None
+        or network.along is None
+        or len(network.weights) != 2
+        or network.outputs != ("sh", "opacity_logits")
+    ):
         raise UserError(
             f"{name}: a page draws avatars of headgas with --method.variant full; train one, or export a .mien"
         )
@@ -36,7 +35,7 @@ def bound_features(avatar: PortableAvatar) -> MeshBound:
             f"{name}: colours depend on the view ({baked.attributes.sh.shape[1]} coefficients), and a page draws "
             "avatars of headgas with one colour; train with --method.sh-degree 0, or export a .mien"
         )
-    along = network.along or _factored(network)
+    along = network.along
     width = along.basis.shape[2]
     changes = ExpressionChanges(
         rest=along.rest,
@@ -59,20 +58,6 @@ def bound_features(avatar: PortableAvatar) -> MeshBound:
         sh_frame="head",
         changes=changes,
     )
-
-
-def _factored(network: AttributeNetwork) -> FeatureDirections:
-    """Directions of the face whose products with the features' changes along them are the basis of every input."""
-    parts = [network.basis, *([] if network.joint_basis is None else [network.joint_basis])]
-    inputs = np.concatenate(parts)
-    _, n, width = inputs.shape
-    flat = inputs.reshape(len(inputs), -1).astype(np.float64)
-    energies, vectors = np.linalg.eigh(flat @ flat.T)
-    keep = np.flatnonzero(energies > _LEAST_SHARE * max(energies[-1], np.finfo(np.float64).tiny))[::-1]
-    directions = vectors[:, keep]
-    basis = (directions.T @ flat).reshape(len(keep), n, width).transpose(1, 0, 2)
-    arrays = (np.zeros(len(directions)), directions, basis)
-    return FeatureDirections(*(np.ascontiguousarray(array, np.float32) for array in arrays))
 
 
 def _still_rig(avatar: PortableAvatar) -> Rig:

@@ -25,7 +25,7 @@ from mien.runtime import Face, Gaussians, MeshBound, PortableAvatar, Rig
 from mien.runtime.posing import SH_C0, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 
-FORMAT, VERSION = "mien.glb", 2
+FORMAT, VERSION = "mien.glb", 1
 TEXTURE_SIZE = 1024
 """Side of the texture in texels."""
 _JPEG_QUALITY = 92

@@ -30,10 +30,8 @@ _TENSORS = (
     "pose_basis", "expression_sigmas", "joint_regressor", "flame_origin",
 )  # fmt: skip
 _SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
-ADDED_RECIPE = 2
+_ADDED_RECIPE = 2
 """Recipe version, raised whenever adding a user's file gives a different result."""
-_READABLE_RECIPES = (1, 2)
-"""Recipes whose results can still be used. Joints of the first do not follow expressions and offsets."""
 _PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
 """Remedy for landmarks that cannot be read."""
 _MAX_LANDMARK_BYTES = 4 << 20
@@ -117,7 +115,7 @@ def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:
     stem = _added_file(model.name)
     write_face_model(stem, model)
     write_landmarks(_landmark_file(stem), model, "mien face-models --add FILE")
-    content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": ADDED_RECIPE}
+    content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": _ADDED_RECIPE}
     write_json(_source_file(stem), _SOURCE_FORMAT, 1, content)
 
 
@@ -127,7 +125,7 @@ def read_added_source(name: str) -> dict[str, Any] | None:
         content = read_json(_source_file(_added_file(name)), _SOURCE_FORMAT, 1)
     except UserError:
         return None
-    return content if content.get("recipe") in _READABLE_RECIPES and {"path", "sha256"} <= content.keys() else None
+    return content if content.get("recipe") == _ADDED_RECIPE and {"path", "sha256"} <= content.keys() else None
 
 
 def write_face_model(stem: Path, model: FaceModel) -> None:
@@ -153,7 +151,7 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
     try:
         values: dict[str, Any] = {name: tuple(content[name]) for name in _LISTS}
         values.update({name: _widened(tensors[name]) for name in _TENSORS if name in tensors})
-        values["shareable"] = bool(content.get("shareable", True))
+        values["shareable"] = bool(content["shareable"])
         model = FaceModel(name=content["name"], landmarks={}, **values)
     except (KeyError, TypeError) as error:
         raise UserError(f"{stem}: incomplete face model ({error}); {remedy}") from None

@@ -10,12 +10,9 @@ fields, so neither can change.
 Letters in shapes mean the same in the whole file: n Gaussians, m points of the rig, f triangles, e expressions, k
 joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel, r activations, i inputs
 (e expression coefficients, then 3 j angles).
-
-A field that came with a later version of the format has that version as `since` in its metadata. It is None by default,
-and files leave it out then, so that their version stays the older one.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -80,15 +77,12 @@ class FeatureDirections:
 class AttributeNetwork:
     """A small network, the same for all Gaussians. Its outputs are added to the raw values.
 
-    Its input is a row of `base` with an addition. With `features`, sums are added to the first w columns: those of
-    `along`, or, in older files, `basis` weighted by the expression and `joint_basis` weighted by the free joints. With
-    `displacement`, the centre's motion from the rig's template is appended, in metres.
+    Its input is a row of `base` with an addition. With `features`, the changes of `along` are added to the first w
+    columns. With `displacement`, the centre's motion from the rig's template is appended, in metres.
     """
 
     input: Literal["features", "displacement"]
     base: Float32[np.ndarray, "n _"]
-    basis: Float32[np.ndarray, "_ n _"]
-    """[e, n, w]. With `displacement` it has no entries, and with `along` it is [0, n, w]."""
     weights: tuple[Float32[np.ndarray, "_ _"], ...]
     """Weights of each layer, [out, in]."""
     biases: tuple[Float32[np.ndarray, " _"], ...]
@@ -96,10 +90,8 @@ class AttributeNetwork:
     """Activation between layers. The slope of leaky_relu is 0.01."""
     outputs: tuple[str, ...]
     """Names out of quats, log_scales, opacity_logits and sh, in the order of the last layer's columns."""
-    joint_basis: Float32[np.ndarray, "_ n _"] | None = None
-    """[3 j, n, w]: for each free joint, the change per radian of each component of its axis-angle vector."""
-    along: FeatureDirections | None = field(default=None, metadata={"since": 6})
-    """Features that change along directions of the face, instead of `basis` and `joint_basis`."""
+    along: FeatureDirections | None = None
+    """Changes of the features along directions of the face. None with `displacement`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +131,9 @@ class ExpressionChanges:
     opacity_logits: Float32[np.ndarray, "n _"] | None = None
     means: Float32[np.ndarray, "n 3 _"] | None = None
     """Changes of the centres, in the triangle's frame and units."""
-    features: FeatureChanges | None = field(default=None, metadata={"since": 5})
+    features: FeatureChanges | None = None
     """Further changes of colours and opacities."""
-    basis_columns: int | None = field(default=None, metadata={"since": 6})
+    basis_columns: int | None = None
     """Number of columns c of colour, opacity_logits and means, which the first c activations weight. None if they have
     all r."""
 
@@ -160,7 +152,7 @@ class MeshBound:
     attributes: Attributes
     sh_frame: Literal["world", "head"]
     """Frame of the view direction for spherical harmonics."""
-    changes: ExpressionChanges | None = field(default=None, metadata={"since": 2})
+    changes: ExpressionChanges | None = None
     """Changes with the expression, beside those that the mesh makes."""
 
 
@@ -179,10 +171,10 @@ class BlendSkinned:
     """With `sigmoid`: the only SH coefficient is the logit of the colour."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
-    still_weights: Float32[np.ndarray, " n"] | None = field(default=None, metadata={"since": 4})
+    still_weights: Float32[np.ndarray, " n"] | None = None
     """Skinning weights of one more bone, which stands still in the world while the head moves. It comes with
     `still_pose`."""
-    still_pose: Float32[np.ndarray, "4 4"] | None = field(default=None, metadata={"since": 4})
+    still_pose: Float32[np.ndarray, "4 4"] | None = None
     """Head pose (T_world_head) at which this bone moves no points."""
 
 
@@ -195,7 +187,7 @@ class Static:
     attributes: Attributes
     expression_names: tuple[str, ...]
     joint_names: tuple[str, ...] = ()
-    """Free joints, in the order of the network's `joint_basis`."""
+    """Free joints, in the order of the inputs of the network's `along`."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None
 
@@ -283,9 +275,9 @@ class PortableAvatar:
     camera: Camera
     """The camera that the avatar was trained with: a good first view."""
     about: About
-    filmed: Filmed | None = field(default=None, metadata={"since": 3})
+    filmed: Filmed | None = None
     """What training saw of the face. None if it is not known."""
-    confidence: Float32[np.ndarray, " f"] | None = field(default=None, metadata={"since": 6})
+    confidence: Float32[np.ndarray, " f"] | None = None
     """How often and how squarely the training pictures show each triangle of the face model, from 0 (never, so it is
     made up) to 1. With w the sum, over the frames, of c^2 s(5 c - 0.5) v m, it is s(w), and 0 if w is at most 0.001.
 

@@ -244,24 +244,17 @@ def _network_faults(network: AttributeNetwork, attributes: Attributes, e: int, j
         width = len(weight)
     if width != sum(widths[name] for name in network.outputs):
         yield "the width of its network's outputs does not fit"
-    if network.input == "features":
-        features = network.basis.shape[2]
-        joints, n = network.joint_basis, len(network.base)
-        if network.basis.shape[1] != n or (joints is not None and joints.shape[1] != n):
-            yield "its network's bases have another number of Gaussians"
-        if network.basis.shape[0] != (e if network.along is None else 0) or features > network.base.shape[1]:
-            yield "the shape of its network's basis does not fit"
-        if joints is not None and (joints.shape[0] != 3 * j or joints.shape[2] != features):
-            yield "the shape of its network's joint basis does not fit"
+    if (network.input == "features") != (network.along is not None):
+        yield f"its network has the input {network.input}, which does not fit its directions of features"
     if network.along is not None:
         yield from _along_faults(network, network.along, e + 3 * j)
 
 
 def _along_faults(network: AttributeNetwork, along: FeatureDirections, inputs: int) -> Iterator[str]:
-    if network.input != "features" or network.joint_basis is not None:
-        yield "its network has directions of features beside another input"
-    k = along.directions.shape[1]
-    shapes = {"rest": (inputs,), "directions": (inputs, k), "basis": (len(network.base), k, network.basis.shape[2])}
+    (n, columns), k, features = network.base.shape, along.directions.shape[1], along.basis.shape[2]
+    if features > columns:
+        yield f"its network has {features} features, but {columns} columns"
+    shapes = {"rest": (inputs,), "directions": (inputs, k), "basis": (n, k, features)}
     for name, shape in shapes.items():
         if getattr(along, name).shape != shape:
             yield f"the shape of {name} of its directions of features does not fit"

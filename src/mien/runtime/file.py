@@ -22,7 +22,7 @@ from mien.files import check_writable, expect_whole, read_safetensors, write_arr
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.checks import check
 
-FORMAT, VERSIONS = "mien.baked", (1, 2, 3, 4, 5, 6)
+FORMAT, VERSION = "mien.baked", 1
 ENDING = ".mien"
 _MAX_BYTES = 1 << 29
 """Largest file that is read, in bytes. The largest that mien writes has some tens of megabytes."""
@@ -72,7 +72,7 @@ def to_arrays(path: Path, avatar: PortableAvatar) -> tuple[dict[str, Any], dict[
     check(avatar, str(path))
     arrays: dict[str, np.ndarray] = {}
     content = _tree(avatar, "", arrays)
-    header = {"format": FORMAT, "version": _version(avatar), "sha256": _digest(content, arrays), "content": content}
+    header = {"format": FORMAT, "version": VERSION, "sha256": _digest(content, arrays), "content": content}
     return header, arrays
 
 
@@ -86,10 +86,9 @@ def from_arrays(path: Path, header: Any, arrays: dict[str, np.ndarray]) -> Porta
         found = (header.get("format"), header.get("version"))
         if found == (None, None):
             raise UserError(f"{path}: is not a .mien file; {_REMEDY}")
-        if found[0] != FORMAT or found[1] not in VERSIONS:
+        if found != (FORMAT, VERSION):
             raise UserError(
-                f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {FORMAT!r} version "
-                f"{', '.join(map(str, VERSIONS[:-1]))} or {VERSIONS[-1]}; "
+                f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {FORMAT!r} version {VERSION}; "
                 "export it again with `mien export`"
             )
         if header["sha256"] != _digest(header["content"], arrays):
@@ -112,24 +111,13 @@ def _load(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
         return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
 
-def _version(value: Any) -> int:
-    """The lowest version of the format that can hold `value`: that of its latest field which is not None."""
-    if isinstance(value, tuple):
-        return max(map(_version, value), default=VERSIONS[0])
-    if not is_dataclass(value):
-        return VERSIONS[0]
-    held = [(f, getattr(value, f.name)) for f in fields(value) if getattr(value, f.name) is not None]
-    return max([VERSIONS[0], *(max(f.metadata.get("since", VERSIONS[0]), _version(item)) for f, item in held)])
-
-
 def _tree(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     """`value` as json. Arrays are replaced by their dotted paths and put into `arrays` under these."""
     if isinstance(value, np.ndarray):
         arrays[path] = value
         return {"tensor": path}
     if is_dataclass(value) and not isinstance(value, type):
-        held = [f.name for f in fields(value) if "since" not in f.metadata or getattr(value, f.name) is not None]
-        inside = {name: _tree(getattr(value, name), f"{path}.{name}".lstrip("."), arrays) for name in held}
+        inside = {f.name: _tree(getattr(value, f.name), f"{path}.{f.name}".lstrip("."), arrays) for f in fields(value)}
         return {"kind": type(value).__name__, **inside}
     if isinstance(value, tuple):
         return [_tree(item, f"{path}.{index}", arrays) for index, item in enumerate(value)]

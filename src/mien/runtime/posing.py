@@ -293,32 +293,21 @@ def _has_native(network: AttributeNetwork) -> bool:
 
 def _run_native(network: AttributeNetwork, face: Face) -> tuple[np.ndarray, np.ndarray]:
     """The outputs of such a network, by the same operation as in training, as two arrays."""
+    along = network.along
+    assert along is not None
     prepared = _networks.get(network)
     if prepared is None:
-        width = network.basis.shape[2]
+        width = along.basis.shape[2]
         rows = [np.ascontiguousarray(part, np.float32) for part in (network.base[:, :width], network.base[:, width:])]
         layers = zip(network.weights, network.biases, strict=True)
         arrays = [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer]
         prepared = _networks[network] = _native.FeatureNetwork(*rows, *arrays)
-    bases = _native_bases(network, face)
+    activations = _along(face, along.rest, along.directions, _UNBOUNDED)
+    bases = [_native.FeatureBases(np.ascontiguousarray(along.basis), activations, by_input=False)]
     n, outputs = len(network.base), len(network.biases[-1])
     sh, opacity_logits = np.empty((n, outputs - 1), np.float32), np.empty(n, np.float32)
     _native.feature_network(prepared, bases, None, sh, opacity_logits)
     return sh, opacity_logits
-
-
-def _native_bases(network: AttributeNetwork, face: Face) -> list[_native.FeatureBases]:
-    along = network.along
-    if along is not None:
-        activations = _along(face, along.rest, along.directions, _UNBOUNDED)
-        return [_native.FeatureBases(np.ascontiguousarray(along.basis), activations, by_input=False)]
-    inputs = [(network.basis, face.expression)]
-    if network.joint_basis is not None:
-        inputs.append((network.joint_basis, face.joints.reshape(-1)))
-    return [
-        _native.FeatureBases(np.ascontiguousarray(basis), _contiguous_row(values), by_input=True)
-        for basis, values in inputs
-    ]
 
 
 _networks: "WeakKeyDictionary[AttributeNetwork, _native.FeatureNetwork]" = WeakKeyDictionary()
@@ -332,8 +321,10 @@ def run_network(
     network: AttributeNetwork, displacement: Float32[np.ndarray, "n 3"], face: Face
 ) -> Float32[np.ndarray, "n _"]:
     """The outputs of an attribute network, in numpy. This is the reference of `_native.feature_network`."""
-    if network.input == "features":
-        blended = _blended(network, face)
+    along = network.along
+    if along is not None:
+        activations = _along(face, along.rest, along.directions, _UNBOUNDED)
+        blended = _combined(along.basis.swapaxes(0, 1), activations)
         values = network.base.copy()
         values[:, : blended.shape[1]] += blended
     else:
@@ -343,17 +334,6 @@ def run_network(
         if index + 1 < len(network.weights):
             values = _ACTIVATIONS[network.activation](values)
     return values
-
-
-def _blended(network: AttributeNetwork, face: Face) -> Float32[np.ndarray, "n w"]:
-    """What the face adds to the features."""
-    along = network.along
-    if along is not None:
-        return _combined(along.basis.swapaxes(0, 1), _along(face, along.rest, along.directions, _UNBOUNDED))
-    blended = _combined(network.basis, face.expression)
-    if network.joint_basis is None:
-        return blended
-    return blended + _combined(network.joint_basis, face.joints.reshape(-1))
 
 
 def _combined(basis: Float32[np.ndarray, "b n w"], coefficients: Float32[np.ndarray, " b"]) -> np.ndarray:

@@ -26,7 +26,7 @@ from mien.synthetic.scene import SyntheticScene
 from mien.synthetic.truth import hash_surface, truth_of, write_truth
 from mien.tracking import Tracking
 
-FORMAT, VERSION = "mien.synthetic_capture", 2
+FORMAT, VERSION = "mien.synthetic_capture", 1
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
 VIDEO_NAME, CAPTURE_NAME, TRUTH_NAME = "video.mp4", "capture", "truth"
 DRAWING = 3

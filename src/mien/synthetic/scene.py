@@ -186,7 +186,7 @@ class SyntheticScene:
 
     @property
     def extent(self) -> dict:
-        """The moments for keys and records. It is empty for whole recipes, whose keys are older than moments."""
+        """The moments for keys and records. It is empty for whole recipes."""
         return {} if self.moments is None else {"moments": list(self.moments)}
 
     @property

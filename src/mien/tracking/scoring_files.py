@@ -24,11 +24,10 @@ def scoring_exists(path: Path, capture_hash: str | None = None) -> bool:
     file = path / "scoring.json"
     if capture_hash is None or not file.is_file():
         return file.is_file()
-    # Scorings of the first release have no hash. They were removed whenever their capture changed.
-    return read_json(file, _FORMAT, _VERSION, _STAGE).get("capture_hash", capture_hash) == capture_hash
+    return read_json(file, _FORMAT, _VERSION, _STAGE).get("capture_hash") == capture_hash
 
 
-def write_scoring(path: Path, scoring: Scoring, capture_hash: str | None = None) -> None:
+def write_scoring(path: Path, scoring: Scoring, capture_hash: str) -> None:
     """Write a scoring as the folder `path`, all or nothing. An existing scoring of the same capture is kept.
 
     Args:
@@ -68,7 +67,7 @@ def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
 def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     check_tree(path)
     content = read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE)
-    if capture_hash is not None and content.get("capture_hash", capture_hash) != capture_hash:
+    if capture_hash is not None and content.get("capture_hash") != capture_hash:
         raise UserError(
             f"{path}: its masks belong to other pictures than the capture beside it; run `mien track` again "
             "to make new ones"
@@ -113,7 +112,7 @@ def read_scoring_hash(path: Path) -> str:
     return str(read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE).get("sha256"))
 
 
-def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> None:
+def _write_into(folder: Path, scoring: Scoring, capture_hash: str) -> None:
     timesteps, cameras, height, width = scoring.masks.shape
     digest = hashlib.sha256()
     for timestep, camera in np.ndindex(timesteps, cameras):
@@ -125,10 +124,14 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str | None) -> Non
             opened.write(encode_picture(mask))
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
-    size = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width}
-    origin = {} if capture_hash is None else {"capture_hash": capture_hash}
+    about = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width, "capture_hash": capture_hash}
     digest.update(crops.tobytes())
-    write_json(folder / "scoring.json", _FORMAT, _VERSION, {**size, **origin, "sha256": digest.hexdigest()})
+    write_json(
+        folder / "scoring.json",
+        _FORMAT,
+        _VERSION,
+        {**about, "sha256": digest.hexdigest()},
+    )
 
 
 def _mask_file(folder: Path, timestep: int, camera: int) -> Path:

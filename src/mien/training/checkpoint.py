@@ -149,13 +149,12 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor], first
     if state.colors is not None:
         _check_like(part("colors."), state.colors.state(), None)
         state.colors.load_state(part("colors."))
-    if state.hair is not None and part("hair."):  # Versions before it have left none.
+    if state.hair is not None:
         _check_like(part("hair."), state.hair.state, None)
         state.hair.load_state(part("hair."))
         state.follow_hair()
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
-    if "peak_memory_mb" in tensors:  # Versions before it have left none.
-        state.peak_memory_mb = float(tensors["peak_memory_mb"])
+    state.peak_memory_mb = float(tensors["peak_memory_mb"])
     curves = part("curves.")
     if state.step < 0 or state.seconds < 0 or any(curve.ndim != 1 for curve in curves.values()):
         raise ValueError("its step, its time or a curve is not valid")

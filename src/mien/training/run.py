@@ -14,7 +14,7 @@ import torch
 import mien
 from mien.avatar import Avatar, MethodConfig, measure_filmed, method_of, write_avatar
 from mien.camera import Camera
-from mien.config import decode, encode
+from mien.config import encode
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
@@ -81,8 +81,7 @@ def check_run(
     found = read_run_config(run_dir)
     remedy = "give this run another name (--run NAME) or delete it"
     choices = json.loads(json.dumps(_choices(method_config, settings)))
-    kept = {"method": _as_now(found["method"], method_config), "settings": _as_now(found["settings"], settings)}
-    different = sorted(_differences(kept, choices))
+    different = sorted(_differences({name: found[name] for name in choices}, choices))
     if different:
         raise UserError(f"{run_dir}: holds a run with other {', '.join(different[:5])}; {remedy}")
     trained = [entry["sequence"] for entry in found["data"]]
@@ -265,15 +264,6 @@ def _choices(method_config: MethodConfig, settings: TrainSettings) -> dict[str, 
         "method": {**encode(method_config), "kind": method_of(method_config)},
         "settings": encode(settings),
     }
-
-
-def _as_now(kept: dict[str, Any], like: MethodConfig | TrainSettings) -> Any:
-    """Settings of a run, with defaults for those that came with a later version. Others' settings stay as they are."""
-    try:
-        known = decode(type(like), kept)
-    except UserError:
-        return kept
-    return json.loads(json.dumps({**encode(known), "kind": kept.get("kind")}))
 
 
 def _fingerprint(sequence: Sequence) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
 from mien.face.flame import flame_face_model, read_flame
-from mien.face.loading import ADDED_RECIPE, cache_folder, is_built_in
+from mien.face.loading import cache_folder, is_built_in
 from mien.locks import hold
 from mien.progress import say
 from mien.storage import file_digest
@@ -35,12 +35,11 @@ def face_model_of(choice: str) -> FaceModel:
     return load_face_model(choice)
 
 
-def add_face_model_file(path: Path, name: str | None = None, shareable: bool = False, renew: bool = False) -> FaceModel:
+def add_face_model_file(path: Path, name: str | None = None, shareable: bool = False) -> FaceModel:
     """Add a file in FLAME's schema to this user's face models, unless it is already there.
 
     The default name is the file's. Landmarks are placed by running the landmark detector on pictures of the model (some
-    minutes, once). A model that an earlier version of mien added stays as it is, because runs depend on it, unless
-    `renew` asks for the current recipe.
+    minutes, once).
 
     Raises:
         UserError: the file is missing, damaged or in another schema, or the name is taken.
@@ -51,17 +50,17 @@ def add_face_model_file(path: Path, name: str | None = None, shareable: bool = F
     if not path.is_file():
         raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
     with hold(cache_folder() / "face_models" / "added" / name):
-        return _add(path, name, shareable, renew)
+        return _add(path, name, shareable)
 
 
-def _add(path: Path, name: str, shareable: bool, renew: bool) -> FaceModel:
+def _add(path: Path, name: str, shareable: bool) -> FaceModel:
     digest, known = file_digest(path), read_added_source(name)
     other = f"add this one under another name: mien face-models --add {path} --name NAME"
     if is_built_in(name):
         raise UserError(f"{path}: {name!r} is the name of one of mien's own face models; {other}")
     if known is not None and known["sha256"] != digest:
         raise UserError(f"{path}: another file has the name {name!r}, {known['path']}; {other}")
-    if known is None or (renew and known["recipe"] != ADDED_RECIPE):
+    if known is None:
         model = _calibrated(flame_face_model(read_flame(path), name, shareable))
     else:
         model = load_face_model(name)
