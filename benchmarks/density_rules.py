@@ -1,4 +1,4 @@
-"""Measure what each rule of density control is worth, and print the table of docs/history/2026-11-22-paper-preset.md.
+"""Measure what each rule of density control is worth, and print a table of them (docs/log.md has the figures).
 
     python benchmarks/density_rules.py --out out/density_rules            # about half an hour on one core
 

@@ -27,7 +27,6 @@ from sphinx.cmd.build import main as sphinx_build
 
 ROOT = Path(__file__).parent.parent.parent
 FRONT = "docs/README.md"
-_LOG = "docs/log.md"
 _BESIDE_CODE = {
     "README.md": "readme.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -63,8 +62,7 @@ def copy_pages(to: Path) -> None:
         if source == FRONT:
             assert _REFERENCE in text
             text = text.replace(_REFERENCE, "| [Reference](reference.md) |")
-        if source in (FRONT, _LOG):
-            text += _menu(text, captions=source == FRONT)
+            text += _menu(text)
         _write(to / name, text)
 
 
@@ -94,13 +92,13 @@ def _copied(linked: str, to: Path) -> str | None:
     return f"code/{linked}.md"
 
 
-def _menu(page: str, captions: bool) -> str:
-    """Hidden tables of contents, for the sidebar: one for each section of a page that has a table of pages."""
+def _menu(page: str) -> str:
+    """Hidden tables of contents, for the sidebar: one for each section of the front page that has a table of pages."""
     menu = ""
     for section in re.split(r"^#+ ", page, flags=re.MULTILINE)[1:]:
         entries = re.findall(r"^\| *\[([^\]]*)\]\(([^)\s#:]+)\.md\)", section, flags=re.MULTILINE)
         if entries:
-            caption = f":caption: {section.splitlines()[0]}\n" if captions else ""
+            caption = f":caption: {section.splitlines()[0]}\n"
             lines = "\n".join(f"{title} <{page}>" for title, page in entries)
             menu += f"\n```{{toctree}}\n:hidden:\n{caption}\n{lines}\n```\n"
     return menu

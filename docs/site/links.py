@@ -16,7 +16,7 @@ from sphinx.util import logging
 
 _LOGGER = logging.getLogger(__name__)
 _NAME = re.compile(r"([A-Za-z_][\w.]*)(\(.*\))?")
-_OLD_PAGES = ("changelog", "history/")
+_OLD_PAGES = ("changelog", "log")
 """Pages about earlier versions, which name what is gone."""
 
 
@@ -35,7 +35,7 @@ def link_names(app: Sphinx, doctree: nodes.document) -> None:
     """Replace code that names public things by references, and report full names that lead nowhere."""
     places = _places()
     page = app.env.docname
-    if page.startswith(_OLD_PAGES):
+    if page in _OLD_PAGES:
         return
     for literal in list(doctree.findall(nodes.literal)):
         written = _NAME.fullmatch(literal.astext())

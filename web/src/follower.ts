@@ -37,7 +37,7 @@ const MOST_SHIFT = 0.08;
 const CENTIMETRE = 0.01;
 /** Score of the detector at which lids are closed: 0.70 to 0.79 on drawn and filmed people. */
 const CLOSED = 0.75;
-/** They leave 0.35 to 0.5 of the tremble, and add 4 to 40 ms (docs/history/2026-11-23-webcam.md). Units: 1, radians, metres. */
+/** They leave 0.35 to 0.5 of the tremble, and add 4 to 40 ms (docs/log.md). Units: 1, radians, metres. */
 const SCORES: Smoothing = { rest: 1, follow: 8 }, TURNS: Smoothing = { rest: 0.5, follow: 16 }, SHIFTS: Smoothing = { rest: 0.5, follow: 128 };
 
 /**
