@@ -5,13 +5,13 @@ import re
 import shlex
 import shutil
 from dataclasses import replace
-from html import escape
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pytest
 import torch
+from markupsafe import escape
 
 import toy_scene
 import train_toy

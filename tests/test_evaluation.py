@@ -157,7 +157,7 @@ def test_report_stands_alone_and_shows_everything(experiment: Experiment, evalua
     page = report_html(_run_record(), protocols, {"self_reenactment": (experiment, evaluation)})
     for forbidden in ("http://", "https://", "<script", "<link", "url(", "/somewhere"):
         assert forbidden not in page
-    assert "mien create &#x27;&lt;clip&gt;.mp4&#x27;" in page, "the command must be there, quoted and escaped"
+    assert "mien create &#39;&lt;clip&gt;.mp4&#39;" in page, "the command must be there, quoted and escaped"
     for wanted in (
         "Held-out frames",
         "best",

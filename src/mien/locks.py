@@ -1,15 +1,17 @@
 """Two commands on one workspace: writers hold a lock, and readers never wait.
 
 `hold` takes the lock of a place (a folder or a file, which may be missing). The lock is the hidden file `.NAME.lock`
-beside the place, locked with flock(2). The system releases it when the process ends, however it ends, so no lock is
-ever left over. If another process holds a place, `hold` raises `BeingWrittenError` at once and quotes what that process
-wrote about itself into the file.
+beside the place, locked by the library filelock with flock(2). The system releases it when the process ends, however it
+ends, so no lock is ever left over. If another process holds a place, `hold` raises `BeingWrittenError` at once and
+quotes what that process wrote about itself into the file.
 
-The file is removed with the lock. That is safe, because it is removed only while it is locked, and because each process
-that gets a lock checks that the file still has its name, and starts again if not. After a kill the file stays,
-unlocked, and the next process uses it.
+The file is removed with the lock. That is safe, because it is removed only while it is locked, and because a process
+that gets the lock of a removed file starts again. After a kill the file stays, unlocked, and the next process uses it.
 
 The file may come from a stranger together with the workspace: no link is followed, and its content is not trusted.
+
+Readers look at a lock with flock(2) itself, because they must not create the file, and because two of them that look at
+the same time must not take each other for writers. filelock has no such look.
 
 docs/conventions.md, "Two commands at once", lists which command holds which locks. Readers use `read_beside_writers`.
 """
@@ -21,15 +23,19 @@ import json
 import os
 import shlex
 import socket
+import stat
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mien.bounded import NotOrdinaryError, open_handle, parse_json
+from filelock import Timeout, UnixFileLock, lock_descriptor
+
+from mien.bounded import open_handle, parse_json
 from mien.errors import CannotWriteError, UserError
 from mien.files import cannot_write
 from mien.progress import say
@@ -59,10 +65,10 @@ _MAX_SIGNATURE_BYTES = 4096
 _MAX_SHOWN = {"host": 60, "since": 30, "command": 200}
 """Most characters that are shown of each entry about a holder."""
 
-_ours: dict[int, tuple[int, int]] = {}
-"""Open lock files of this process -> their device and number."""
+_ours: dict[tuple[int, int], int] = {}
+"""Device and number of each lock file that is held -> the process that holds it. A child made by fork has a copy."""
 _once: set[str] = set()
-"""Actions and messages that happen only once per process."""
+"""Messages that are shown only once per process."""
 
 
 class BeingWrittenError(UserError):
@@ -100,21 +106,7 @@ def check_free(place: Path, remedy: str = WAIT) -> None:
 
 def holder_of(place: Path) -> str | None:
     """A description of the other process that is writing a place, or None if there is none."""
-    try:
-        handle = _open(lock_file(place), os.O_RDONLY)
-    except (OSError, UserError):
-        return None
-    try:
-        if _identity(os.fstat(handle)) in _ours.values():
-            return None
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return _wait_for_name(handle)
-    except OSError:
-        return None
-    finally:
-        os.close(handle)
-    return None
+    return _holder(lock_file(place), ours=False)
 
 
 def read_beside_writers(read: Callable[[], Result], folders: Sequence[Path], places: Sequence[Path]) -> Result:
@@ -159,57 +151,111 @@ def _hold_one(place: Path, remedy: str) -> Iterator[None]:
     file, process = lock_file(place), os.getpid()
     try:
         missing = [folder for folder in file.parents if not folder.exists()]
-        handle = _acquire(place, file, remedy)
+        unlock = _acquire(place, file, remedy)
     except OSError as error:
         raise cannot_write(place, error) from None
     try:
         yield
     finally:
-        if os.getpid() == process:  # a child made by fork has closed its copy, and the lock is its parent's
-            _release(file, handle)
+        if os.getpid() == process:  # in a child made by fork, filelock has closed the copy; the lock is its parent's
+            unlock()
             for folder in missing:
                 with suppress(OSError):
                     folder.rmdir()
 
 
-def _acquire(place: Path, file: Path, remedy: str) -> int | None:
-    """The descriptor of the open and locked file, or None if the file system has no locks."""
-    _let_children_forget()
+def _acquire(place: Path, file: Path, remedy: str) -> Callable[[], None]:
+    """Lock the file, and return what removes and unlocks it. That does nothing if the file system has no locks."""
     patience = time.monotonic() + _PATIENCE_SECONDS
     while True:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        locked, holder, handle = True, None, None
         try:
-            handle = _open_own(file)
-            locked = _try_lock(handle)
-            if locked and _is_named(handle, file):
-                _sign(handle, file)
-                _ours[handle] = _identity(os.fstat(handle))
-                return handle
-            holder = None if locked else read_holder(handle)
+            return _lock(file)
+        except Timeout:
+            holder = _holder(file)
+            if holder not in (None, _NAMELESS) or time.monotonic() >= patience:
+                raise _being_written(place, holder or _NAMELESS, remedy) from None
         except OSError as error:
             if error.errno in _NO_LOCKS:
                 _warn_of_no_locks(file)
-                return None
-            if error.errno not in _REMOVED:
+                return lambda: None
+            if error.errno not in _REMOVED or time.monotonic() >= patience:
                 raise
-        finally:
-            if handle is not None and handle not in _ours:
-                os.close(handle)
-        patient = time.monotonic() < patience
-        if holder is not None or not (locked or patient):
-            raise _being_written(place, holder or _NAMELESS, remedy)
-        if not patient:
-            raise OSError(errno.EAGAIN, "its lock file is removed again and again", str(file))
         time.sleep(_STEP_SECONDS)
 
 
-def _try_lock(handle: int) -> bool:
+def _lock(file: Path) -> Callable[[], None]:
+    """Lock and sign the file, which is created if it is missing. Returns what removes and unlocks it.
+
+    Raises:
+        Timeout: another process, or another thread of this one, has locked the file.
+        UserError: it is not a lock file.
+        OSError: it cannot be opened or locked, or it was removed meanwhile.
+    """
+    with suppress(FileNotFoundError):
+        _check_plain(file, file.lstat())
+    with ExitStack() as held:
+        begin = partial(_begin, file, held)
+        lock = UnixFileLock(file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=begin)
+        held.callback(lock.release)
+        try:
+            lock.acquire()
+        except PermissionError:
+            if not file.is_file():
+                raise
+            # Another user's file, which a kill has left. Reading is enough to lock it, but UnixFileLock also writes.
+            handle = open_handle(file, os.O_RDONLY, follow_link=False)
+            held.callback(os.close, handle)
+            if not lock_descriptor(handle, blocking=False):
+                raise Timeout(str(file)) from None
+            begin(handle)
+        return held.pop_all().close
+
+
+def _begin(file: Path, held: ExitStack, handle: int) -> None:
+    """Check and sign the open and locked file. It is removed at the end of `held`."""
+    opened = os.fstat(handle)
+    _check_plain(file, opened)
+    # Over NFS, a removed file that is open still has a name, so filelock does not notice that it was removed.
+    if _identity(opened) != _identity(file.lstat()):
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(file))
+    _sign(handle, file)
+    _ours[_identity(opened)] = os.getpid()
+    held.callback(_remove, file, _identity(opened))
+
+
+def _remove(file: Path, identity: tuple[int, int]) -> None:
+    """Remove the file while it is locked: a process that waits for it then finds that it has lost its name."""
+    _ours.pop(identity, None)
+    with suppress(OSError):
+        if _identity(file.lstat()) == identity:
+            file.unlink()
+
+
+def _check_plain(file: Path, status: os.stat_result) -> None:
+    """Refuse links, folders, pipes and files with a second name."""
+    if not stat.S_ISREG(status.st_mode):
+        raise UserError(f"{file}: is not an ordinary file, but has the name of a lock file; remove it")
+    if status.st_nlink > 1:
+        raise UserError(f"{file}: has a second name, which no lock file has; remove it")
+
+
+def _holder(file: Path, *, ours: bool = True) -> str | None:
+    """A description of the process that has locked the file, or None. `ours`: whether this process counts."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        handle = open_handle(file, os.O_RDONLY, follow_link=False)
+    except (OSError, ValueError):
+        return None
+    try:
+        if not ours and _ours.get(_identity(os.fstat(handle))) == os.getpid():
+            return None
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        return False
-    return True
+        return _wait_for_name(handle)
+    except OSError:
+        return None
+    finally:
+        os.close(handle)
+    return None
 
 
 def _wait_for_name(handle: int) -> str:
@@ -219,54 +265,6 @@ def _wait_for_name(handle: int) -> str:
             return holder
         time.sleep(_STEP_SECONDS)
     return _NAMELESS
-
-
-def _release(file: Path, handle: int | None) -> None:
-    if handle is None:
-        return
-    # Remove it while it is locked: a process that waits for this file then finds that it has lost its name.
-    with suppress(OSError):
-        if _is_named(handle, file):
-            file.unlink()
-    _ours.pop(handle, None)
-    os.close(handle)
-
-
-def _open_own(file: Path) -> int:
-    """Open the lock file, and create it if it is missing."""
-    try:
-        return _open(file, os.O_RDWR | os.O_CREAT)
-    except PermissionError:
-        if not file.is_file():
-            raise
-        return _open(file, os.O_RDONLY)  # another user's file, which can still be locked
-
-
-def _open(file: Path, flags: int) -> int:
-    """Open a lock file. Links, pipes and files with a second name are refused.
-
-    Raises:
-        UserError: the path is not a plain file with a single name.
-        OSError: it cannot be opened.
-    """
-    try:
-        handle = open_handle(file, flags, follow_link=False)
-    except NotOrdinaryError:
-        raise UserError(f"{file}: is not an ordinary file, but has the name of a lock file; remove it") from None
-    if os.fstat(handle).st_nlink > 1:
-        os.close(handle)
-        raise UserError(f"{file}: has a second name, which no lock file has; remove it")
-    return handle
-
-
-def _is_named(handle: int, file: Path) -> bool:
-    """Whether the open file is still the file of that name."""
-    opened = os.fstat(handle)
-    try:
-        named = file.lstat()
-    except FileNotFoundError:
-        return False
-    return opened.st_nlink > 0 and _identity(opened) == _identity(named)
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:
@@ -291,20 +289,6 @@ def _warn_of_no_locks(file: Path) -> None:
     if "warned" not in _once:
         _once.add("warned")
         say(f"warning: {file.parent}: its file system has no locks; run only one command at a time there")
-
-
-def _let_children_forget() -> None:
-    """Close the locks in children made by fork, which would otherwise keep them after their parent has died."""
-    if "fork" not in _once:
-        _once.add("fork")
-        os.register_at_fork(after_in_child=_forget)
-
-
-def _forget() -> None:
-    for handle in _ours:
-        with suppress(OSError):
-            os.close(handle)
-    _ours.clear()
 
 
 def _sign(handle: int, file: Path) -> None:

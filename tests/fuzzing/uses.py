@@ -113,7 +113,7 @@ def use_comparison(root: Path, found: Any, dice: Random) -> None:
     comparison = compare_runs({"a": root / RUN})
     comparison_text(comparison, bold=False)
     comparison.content()
-    comparison_html(comparison, [""] * len(comparison.tables))
+    comparison_html(comparison, [[]] * len(comparison.tables))
 
 
 def use_avatar(root: Path, found: Any, dice: Random) -> None:

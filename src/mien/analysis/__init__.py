@@ -14,15 +14,7 @@ if TYPE_CHECKING:
     from mien.analysis.running import run_analysis
     from mien.analysis.spec import Analysis, AnalysisOptions, Part, chosen_parts
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "running": ["run_analysis"],
-            "registry": ["ANALYSES"],
-            "result": ["Chart", "Film", "PartResult", "Picture", "Table"],
-            "spec": ["Analysis", "AnalysisOptions", "Part", "chosen_parts"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "ANALYSES",

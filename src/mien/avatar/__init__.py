@@ -39,44 +39,7 @@ if TYPE_CHECKING:
     )
     from mien.avatar.store import GaussianStore, Moments
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "activation": ["sigmoid"],
-            "avatar": [
-                "Avatar",
-                "ParameterGroup",
-                "Posed",
-                "SurfacePrior",
-                "move_avatar",
-                "network_group",
-                "neutral_of",
-                "store_group",
-            ],
-            "baking": ["as_array", "bake_rig", "make_portable"],
-            "density": ["DensityControl", "FixedDensity", "GradientDensity", "RefillDensity"],
-            "files": ["load_avatar", "write_avatar"],
-            "filmed": ["measure_filmed"],
-            "gaussian_avatars": ["GaussianAvatars"],
-            "gaussian_avatars_settings": ["GaussianAvatarsConfig"],
-            "headgas": ["HeadGas"],
-            "headgas_settings": ["HeadGasConfig"],
-            "methods": ["DEFAULT_METHOD", "METHODS", "Method", "method_named", "method_of"],
-            "mono_gaussian_avatar": ["MonoGaussianAvatar"],
-            "mono_gaussian_avatar_settings": ["MonoGaussianAvatarConfig"],
-            "schedules": ["TRAINED", "Progress", "Rate"],
-            "settings": [
-                "DensityRules",
-                "FaceTuning",
-                "GradientSettings",
-                "MethodConfig",
-                "PerceptualLoss",
-                "Photometric",
-                "RefillSettings",
-            ],
-            "store": ["GaussianStore", "Moments"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "DEFAULT_METHOD",

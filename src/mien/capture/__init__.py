@@ -31,17 +31,7 @@ if TYPE_CHECKING:
     from mien.capture.settings import CaptureSettings
     from mien.capture.store import read_capture, read_capture_hash, write_capture
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "capture": ["Capture"],
-            "from_cameras": ["capture_cameras"],
-            "from_video": ["capture_video", "capture_video_parts"],
-            "quality": ["FrameQuality"],
-            "settings": ["CaptureSettings"],
-            "store": ["read_capture", "read_capture_hash", "write_capture"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "Capture",

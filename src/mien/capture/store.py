@@ -1,7 +1,7 @@
 """Write and read captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/` and a `cache/`."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ _OPTIONAL_ARRAYS = (_CALIBRATION_ARRAYS, _QUALITY_ARRAYS)
 
 @dataclass(frozen=True, eq=False)
 class CaptureData:
-    """A capture without its pictures."""
+    """A capture without its pictures. Its fields are those of `Capture` with the same names."""
 
     name: str
     camera_ids: tuple[str, ...]
@@ -86,18 +86,7 @@ def write_capture(path: Path, capture: Capture) -> str:
                 writer.submit(timestep, lambda images=images, mattes=mattes: (images, mattes))
                 advance()
             writer.flush()
-        data = CaptureData(
-            name=capture.name,
-            camera_ids=capture.camera_ids,
-            fps=capture.fps,
-            timestamps=capture.timestamps,
-            landmarks=capture.landmarks,
-            valid=capture.valid,
-            principal_point=capture.principal_point,
-            source=capture.source,
-            calibration=capture.calibration,
-            quality=capture.quality,
-        )
+        data = CaptureData(**{one.name: getattr(capture, one.name) for one in fields(CaptureData)})
         return finish_capture(layout, path, data, writer.digests)
     except OSError as error:
         raise cannot_write(path, error) from None
@@ -126,20 +115,7 @@ def _read_capture(path: Path) -> Capture:
     if read_capture_hash(path) != content["capture_hash"]:
         # The folder was replaced while it was mapped, so the maps may be of two captures.
         raise UserError(f"{path}: was replaced while it was read; run the same command again")
-    return Capture(
-        name=data.name,
-        camera_ids=data.camera_ids,
-        fps=data.fps,
-        timestamps=data.timestamps,
-        images=images,
-        mattes=mattes,
-        landmarks=data.landmarks,
-        valid=data.valid,
-        principal_point=data.principal_point,
-        source=data.source,
-        calibration=data.calibration,
-        quality=data.quality,
-    )
+    return Capture(images=images, mattes=mattes, **vars(data))
 
 
 def read_capture_hash(path: Path) -> str:

@@ -14,19 +14,7 @@ if TYPE_CHECKING:
     from mien.driving.rest import facing, rest_before, rest_of
     from mien.driving.transfer import drive, face_of_motion
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "blendshape_json": ["read_blendshape_json"],
-            "drivers": ["Driver", "read_recording", "read_tracked_driver"],
-            "keeping": ["keep_to_filmed"],
-            "live_link_face": ["read_live_link_face"],
-            "motion": ["ARKIT_NAMES", "Motion"],
-            "neutral": ["with_neutral"],
-            "rest": ["facing", "rest_before", "rest_of"],
-            "transfer": ["drive", "face_of_motion"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "ARKIT_NAMES",

@@ -90,7 +90,7 @@ def _evaluate(
     avatars = [experiment.avatar for experiment in experiments.values()]
     covered = read_coverage(run_dir, avatars[0].face_model) if avatars else None
     run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir), covered)
-    section = cross_section(driven["cross_reenactment"], driven_videos, run_dir) if driven else ""
+    section = cross_section(driven["cross_reenactment"], driven_videos, run_dir) if driven else None
     write_report(run_dir / "report.html", run, protocols, results, videos, section)
     write_json(run_dir / "metrics.json", FORMAT, VERSION, content)
     for partial in partials.values():

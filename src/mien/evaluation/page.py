@@ -1,17 +1,19 @@
-"""What report.html and compare.html share: the frame of the page, explanations, pictures and videos.
+"""What report.html, compare.html and analysis.html share: the templates, explanations, tables, pictures and videos.
 
-The functions return HTML. A page is one file that can be sent around. It needs no network and no scripts, and works in
-light, in dark and on paper.
+A page is one file that can be sent around. It needs no network and no scripts, and works in light, in dark and on
+paper. Its HTML is in `templates/`, which escapes every text. Python code prepares what the templates show.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
+import jinja2
 import numpy as np
 from jaxtyping import UInt8
+from markupsafe import Markup
 
 from mien.evaluation.metrics_file import COLUMNS
 from mien.pictures import ERROR_LIMIT, data_uri, heat_gradient, picture_uri, shrink
@@ -62,61 +64,63 @@ FITTED_GLOSSARY = {
 _MAX_EMBEDDED_BYTES = 6 << 20
 
 
-def page_html(title: str, body: str, *, broad: bool = False) -> str:
-    """A whole page. `body` is HTML; `title` is text."""
-    style = files("mien.evaluation").joinpath("report.css").read_text(encoding="utf-8")
-    main = '<main class="broad">' if broad else "<main>"
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>mien: {escape(title)}</title>\n<style>\n{style}</style></head>\n"
-        f"<body>{main}\n{body}\n</main></body></html>\n"
-    )
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table."""
+
+    text: str
+    kind: str = ""
+    """CSS classes: `head` starts a group of columns, `group` is the name of one, `left` is aligned to the left."""
+    columns: int = 1
+    """How many columns it spans."""
+    best: bool = False
+    """Whether it is the best of its column, in bold."""
+    lead: str = ""
+    """A lead over other rows, shown small after the text."""
 
 
-def glossary_html(terms: Mapping[str, str] = GLOSSARY) -> str:
-    """The explanations, folded."""
-    entries = "".join(f"<dt>{term}</dt><dd>{escape(text)}</dd>" for term, text in terms.items())
-    return f'<details class="card"><summary>How to read this</summary><dl>{entries}</dl></details>'
+@dataclass(frozen=True)
+class DataTable:
+    """A table of text and figures."""
+
+    head: Sequence[Sequence[Cell]]
+    """Rows of headings."""
+    rows: Sequence[Sequence[Cell]]
+    note: str = ""
+    """Text below the table."""
+    own: bool = False
+    """Whether the first row is the subject of the page, in bold."""
 
 
-def metric_headings(crops: int | None = None) -> str:
-    """The heading cells of all metrics, for the whole frame and then for the head crop, or for a number of crops."""
-    names = "".join(f"<th>{name} {'↑' if higher else '↓'}</th>" for _, name, _, higher in COLUMNS)
-    crop = names.replace("<th>", '<th class="head">', 1)
-    return names + crop if crops is None else crops * crop
+@dataclass(frozen=True)
+class Picture:
+    """A picture in a page."""
+
+    what: str
+    """Its text for readers who do not see it."""
+    source: str
+    """Data URI."""
+    caption: str = ""
 
 
-def metric_groups() -> str:
-    """The cells above `metric_headings`."""
-    count = len(COLUMNS)
-    return (
-        f'<th class="group" colspan="{count}">Whole frame</th><th class="group head" colspan="{count}">Head crop</th>'
-    )
+@dataclass(frozen=True)
+class Card:
+    """A chart with a title."""
+
+    title: str
+    chart: Markup
+    caption: str = ""
 
 
-def error_scale(label: str = "") -> str:
-    """The colours of `error_heat`, with their limits."""
-    return (
-        f'<span class="scale">{label}0 <i style="background:{heat_gradient()}"></i> '
-        f"{ERROR_LIMIT * 255:.0f} of 255 and more</span>"
-    )
+@dataclass(frozen=True)
+class Video:
+    """A video in a page: embedded if it is small, so that the page stays one file, or else linked."""
 
-
-def picture_html(picture: UInt8[np.ndarray, "_ _ 3"], what: str, max_side: int) -> str:
-    """A picture whose longer side has at most `max_side` pixels. `what` is its text for readers who do not see it."""
-    return f'<img alt="{escape(what)}" src="{picture_uri(shrink(picture, max_side))}">'
-
-
-def video_html(path: Path, page_folder: Path, note: str) -> str:
-    """A video: embedded if it is small, so that the page stays one file, or else linked."""
-    link = path.relative_to(page_folder).as_posix()
-    is_small = path.stat().st_size <= _MAX_EMBEDDED_BYTES
-    source = data_uri("video/mp4", path.read_bytes()) if is_small else link
-    return (
-        f'<video controls muted loop preload="metadata" src="{escape(source)}"></video>'
-        f'<p class="note">{escape(note)}: <a href="{escape(link)}">{escape(link)}</a></p>'
-    )
+    source: str
+    """Data URI or link."""
+    link: str
+    """Path from the page's folder."""
+    note: str
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,55 @@ class ReportVideo:
     scored: int
     """Number of frames that were scored."""
 
-    def html(self, page_folder: Path) -> str:
+    def on_page(self, page_folder: Path) -> Video:
         """The video of truth, rendering and error."""
         part = "" if self.shown == self.scored else f", {self.shown} of {self.scored} frames"
-        return video_html(self.path, page_folder, f"Truth, rendering, error{part}")
+        return video_of(self.path, page_folder, f"Truth, rendering, error{part}")
+
+
+def render(template: str, **content: object) -> Markup:
+    """HTML from a template, which is named by its path in `mien`. Text in `content` is escaped, `Markup` is not."""
+    return Markup(_templates().get_template(template).render(content))
+
+
+@cache
+def _templates() -> jinja2.Environment:
+    folder = files("mien")
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda name: folder.joinpath(name).read_text(encoding="utf-8")),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals |= {"heat_gradient": heat_gradient(), "error_limit": f"{ERROR_LIMIT * 255:.0f}"}
+    return environment
+
+
+def metric_headings(crops: int | None = None) -> list[Cell]:
+    """The heading cells of all metrics, for the whole frame and then for the head crop, or for a number of crops."""
+    names = [f"{name} {'↑' if higher else '↓'}" for _, name, _, higher in COLUMNS]
+    crop = [Cell(name, "head" if index == 0 else "") for index, name in enumerate(names)]
+    return [*map(Cell, names), *crop] if crops is None else crops * crop
+
+
+def metric_groups() -> list[Cell]:
+    """The cells above `metric_headings`."""
+    return [Cell("Whole frame", "group", len(COLUMNS)), Cell("Head crop", "group head", len(COLUMNS))]
+
+
+def figure_text(value: float | None, digits: int) -> str:
+    """A figure of a table. A missing one is a dash."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def picture_of(picture: UInt8[np.ndarray, "_ _ 3"], what: str, max_side: int, caption: str = "") -> Picture:
+    """A picture whose longer side has at most `max_side` pixels. `what` is its text for readers who do not see it."""
+    return Picture(what, picture_uri(shrink(picture, max_side)), caption)
+
+
+def video_of(path: Path, page_folder: Path, note: str) -> Video:
+    """A video in or below the page's folder."""
+    link = path.relative_to(page_folder).as_posix()
+    is_small = path.stat().st_size <= _MAX_EMBEDDED_BYTES
+    return Video(data_uri("video/mp4", path.read_bytes()) if is_small else link, link, note)

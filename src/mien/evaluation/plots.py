@@ -1,12 +1,18 @@
-"""Line charts as inline SVG, without scripts or fonts. The page's CSS sets the colours, so they fit light and dark."""
+"""Line charts as inline SVG, without scripts or fonts. The page's CSS sets the colours, so they fit light and dark.
+
+The SVG is in `templates/chart.html`. The code here finds the ticks and the positions.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from markupsafe import Markup
+
+from mien.evaluation.page import render
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 34
 _MAX_POINTS = 400
@@ -41,23 +47,23 @@ class Axes:
     """Spans of x with a tinted background."""
 
 
-def line_chart(series: Sequence[Series], axes: Axes) -> str:
+def line_chart(series: Sequence[Series], axes: Axes) -> Markup:
     """An <svg> of some series over common axes. Series without a finite value are left out."""
     drawn = [one for one in series if np.isfinite(one.y).any()]
     if not drawn:
-        return '<p class="note">There are no values to draw.</p>'
+        return Markup('<p class="note">There are no values to draw.</p>')
     x_range = _range(np.concatenate([one.x for one in drawn]))
     y_range = _padded(_range(np.concatenate([one.y for one in drawn])), axes.from_zero)
     plot = _Plot(axes, x_range, y_range)
-    bands = "".join(plot.band(span) for span in axes.shaded)
-    grid = "".join(plot.grid_line(tick) for tick in _ticks(*y_range, 5))
-    labels = "".join(plot.x_tick(tick) for tick in _ticks(*x_range, 6))
-    lines = "".join(plot.dots(one) if one.points else plot.line(one) for one in drawn)
-    described = f"{axes.y_label} over {axes.x_label}: " + ", ".join(one.label for one in drawn)
-    return (
-        f'<svg class="chart" viewBox="0 0 {axes.width} {axes.height}" role="img" aria-label="{escape(described)}">'
-        f"{bands}{grid}{labels}{lines}"
-        f'<text class="axis" x="{_LEFT}" y="{axes.height - 4}">{escape(axes.x_label)}</text></svg>' + _legend(drawn)
+    return render(
+        "evaluation/templates/chart.html",
+        axes=axes,
+        about=f"{axes.y_label} over {axes.x_label}: " + ", ".join(one.label for one in drawn),
+        left=_LEFT,
+        bands=[plot.band(span) for span in axes.shaded],
+        grid=[plot.grid_line(tick) for tick in _ticks(*y_range, 5)],
+        ticks=[plot.x_tick(tick) for tick in _ticks(*x_range, 6)],
+        series=[plot.drawn(one) for one in drawn],
     )
 
 
@@ -83,23 +89,23 @@ class _Plot:
         low, high = self._y_range
         return self._axes.height - _BOTTOM - (value - low) / (high - low) * (self._axes.height - _TOP - _BOTTOM)
 
-    def band(self, span: tuple[float, float]) -> str:
+    def band(self, span: tuple[float, float]) -> dict[str, Any]:
         left, right = (self._x(min(max(value, self._x_range[0]), self._x_range[1])) for value in span)
         height = self._axes.height - _TOP - _BOTTOM
-        return f'<rect class="band" x="{left:.1f}" y="{_TOP}" width="{max(right - left, 1):.1f}" height="{height}"/>'
+        return {"x": f"{left:.1f}", "y": _TOP, "width": f"{max(right - left, 1):.1f}", "height": height}
 
-    def grid_line(self, value: float) -> str:
+    def grid_line(self, value: float) -> dict[str, Any]:
         y, right = self._y(value), self._axes.width - _RIGHT
-        return (
-            f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>'
-            f'<text class="tick end" x="{_LEFT - 6}" y="{y + 3.5:.1f}">{_number(value)}</text>'
-        )
+        return {"left": _LEFT, "right": right, "y": f"{y:.1f}", "text_y": f"{y + 3.5:.1f}", "text": _number(value)}
 
-    def x_tick(self, value: float) -> str:
-        x, y = self._x(value), self._axes.height - _BOTTOM + 14
-        return f'<text class="tick middle" x="{x:.1f}" y="{y}">{_number(value)}</text>'
+    def x_tick(self, value: float) -> dict[str, Any]:
+        return {"x": f"{self._x(value):.1f}", "y": self._axes.height - _BOTTOM + 14, "text": _number(value)}
 
-    def line(self, series: Series) -> str:
+    def drawn(self, series: Series) -> dict[str, Any]:
+        shape = {"dots": self._dots(series)} if series.points else {"path": self._path(series)}
+        return {"label": series.label, "style": series.style, **shape}
+
+    def _path(self, series: Series) -> str:
         x, y = thin(series.x, series.y)
         parts, pen = [], "M"
         for a, b in zip(x.tolist(), y.tolist(), strict=True):
@@ -108,23 +114,15 @@ class _Plot:
                 continue
             parts.append(f"{pen}{self._x(a):.1f} {self._y(b):.1f}")
             pen = "L"
-        return f'<path class="line {series.style}" d="{"".join(parts)}"><title>{escape(series.label)}</title></path>'
+        return "".join(parts)
 
-    def dots(self, series: Series) -> str:
-        return "".join(
-            f'<circle class="dot {series.style}" cx="{self._x(a):.1f}" cy="{self._y(b):.1f}" r="2.4">'
-            f"<title>{escape(series.label)}, {_number(a)}: {b:.2f}</title></circle>"
+    def _dots(self, series: Series) -> list[tuple[str, str, str]]:
+        """Position and text of each point."""
+        return [
+            (f"{self._x(a):.1f}", f"{self._y(b):.1f}", f"{_number(a)}: {b:.2f}")
             for a, b in zip(series.x.tolist(), series.y.tolist(), strict=True)
             if math.isfinite(b)
-        )
-
-
-def _legend(series: Sequence[Series]) -> str:
-    """Names beside colours. A single series needs none."""
-    if len(series) < 2:
-        return ""
-    entries = "".join(f'<span><i class="{one.style}"></i>{escape(one.label)}</span>' for one in series)
-    return f'<p class="legend">{entries}</p>'
+        ]
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:

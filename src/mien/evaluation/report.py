@@ -4,7 +4,6 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,11 +16,14 @@ from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FITTED_NAME, P
 from mien.evaluation.page import (
     FITTED_GLOSSARY,
     GLOSSARY,
+    Cell,
+    DataTable,
     ReportVideo,
-    glossary_html,
+    Video,
+    figure_text,
     metric_groups,
     metric_headings,
-    page_html,
+    render,
 )
 from mien.evaluation.protocols import Evaluation
 from mien.storage import write_atomically
@@ -61,7 +63,7 @@ def write_report(
     protocols: Mapping[str, Any],
     results: Mapping[str, tuple[Experiment, Evaluation]],
     videos: Mapping[str, ReportVideo] = MappingProxyType({}),
-    driven: str = "",
+    driven: sections.CrossSection | None = None,
 ) -> None:
     """Write the page of a run.
 
@@ -71,11 +73,10 @@ def write_report(
         protocols: `protocols` of metrics.json.
         results: The experiment and every frame's figures, by protocol.
         videos: Side-by-side videos by protocol, in or below the page's folder.
-        driven: The section on cross-reenactment, as HTML.
+        driven: The section on cross-reenactment.
     """
-    text = report_html(
-        run, protocols, results, {name: video.html(path.parent) for name, video in videos.items()}, driven
-    )
+    shown = {name: video.on_page(path.parent) for name, video in videos.items()}
+    text = report_html(run, protocols, results, shown, driven)
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
@@ -83,36 +84,38 @@ def report_html(
     run: RunRecord,
     protocols: Mapping[str, Any],
     results: Mapping[str, tuple[Experiment, Evaluation]],
-    videos: Mapping[str, str] = MappingProxyType({}),
-    driven: str = "",
+    videos: Mapping[str, Video] = MappingProxyType({}),
+    driven: sections.CrossSection | None = None,
 ) -> str:
-    """The page as text. `videos` holds a piece of HTML by protocol."""
-    title = f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}"
-    body = [_heading(title, run), _tiles(run, protocols)]
-    body += ["<h2>Figures</h2>", _table(protocols), _how_to_read(protocols)]
-    for name, (experiment, evaluation) in results.items():
-        heading = escape(_TITLES.get(name, name))
-        body += [f"<h2>{heading}: held-out frames</h2>", sections.comparison(experiment, evaluation)]
-        body.append(videos.get(name, ""))
-        body += [f"<h2>{heading}: over time</h2>", sections.over_time(experiment, evaluation)]
-        body += ["<h2>Baselines</h2>", sections.baseline_pictures(experiment, evaluation)]
-    body.append(driven)
-    body += ["<h2>Training</h2>", sections.training_curves(run.curves)]
+    """The page as text. `videos` holds a video by protocol."""
+    command_line = _shortened(run.config["command_line"])
     first = next(iter(results.values()), None)
-    if first is not None and run.coverage is not None:
-        body += ["<h2>Filmed and made up</h2>", sections.confidence(first[0].avatar, run.coverage)]
-    if first is not None:
-        body += ["<h2>Tracking</h2>", sections.tracking_overlays(first[0])]
-    body.append(_settings(run))
-    return page_html(title, "\n".join(body))
-
-
-def _heading(title: str, run: RunRecord) -> str:
-    command = shlex.join(_shortened(run.config["command_line"]))
-    version = escape(str(run.config["mien"]))
-    return (
-        f"<h1>{escape(title)}</h1>"
-        f'<p class="sub">Run {escape(run.name)} · mien {version} · <code>{escape(command)}</code></p>'
+    shown = [
+        {
+            "title": _TITLES.get(name, name),
+            "comparison": sections.comparison(experiment, evaluation),
+            "video": videos.get(name),
+            "over_time": sections.over_time(experiment, evaluation),
+            "baselines": sections.baseline_pictures(experiment, evaluation),
+        }
+        for name, (experiment, evaluation) in results.items()
+    ]
+    return render(
+        "evaluation/templates/report.html",
+        title=f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}",
+        name=run.name,
+        version=run.config["mien"],
+        command=shlex.join(command_line),
+        tiles=_tiles(run, protocols),
+        tables=_tables(protocols),
+        glossary=_glossary(protocols),
+        protocols=shown,
+        driven=driven,
+        training=sections.training_curves(run.curves),
+        filmed=sections.confidence(first[0].avatar, run.coverage) if first and run.coverage is not None else None,
+        tracking=sections.tracking_overlays(first[0]) if first else None,
+        memory=f"{run.summary['peak_memory_mb']:,.0f}",
+        config=json.dumps({**run.config, "command_line": command_line}, indent=1),
     )
 
 
@@ -121,8 +124,8 @@ def _shortened(command_line: Sequence[str]) -> list[str]:
     return [Path(command_line[0]).name, *command_line[1:]] if command_line else []
 
 
-def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> str:
-    """The few figures to read first."""
+def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The few figures to read first, each with its name."""
     tiles: list[tuple[str, str]] = []
     for name, entry in protocols.items():
         where = "" if len(protocols) == 1 else f", {_TITLES.get(name, name).lower()}"
@@ -134,22 +137,16 @@ def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> str:
     tiles.append((f"{summary['gaussians']:,}", "Gaussians"))
     tiles.append((_duration(summary["seconds"]), f"training, {summary['steps']:,} steps"))
     tiles.append((f"{summary['step_ms_median']:.1f} ms", "per step, median"))
-    content = "".join(f'<div class="tile"><b>{value}</b><span>{name}</span></div>' for value, name in tiles)
-    return f'<div class="tiles">{content}</div>'
+    return tiles
 
 
-def _table(protocols: Mapping[str, Any]) -> str:
-    """Every metric of the avatar and of both baselines, on the whole frame and on the head crop."""
-    parts = []
+def _tables(protocols: Mapping[str, Any]) -> list[DataTable]:
+    """Every metric of the avatar and of the baselines: on whole frame and head crop, then on eyes and mouth."""
+    tables = []
     for name, entry in protocols.items():
         corrected = {} if entry["face_params"] == "as_tracked" else {"as_tracked": entry["as_tracked"]}
         fitted = {"fitted": entry["fitted"]} if "fitted" in entry else {}
         subjects = {"avatar": entry, **corrected, **fitted, **entry["baselines"]}
-        rows = "".join(
-            f'<tr class="{"own" if key == "avatar" else ""}"><td>{label}</td>{_cells(key, subjects)}</tr>'
-            for key, label in _ROWS.items()
-            if key in subjects
-        )
         caption = (
             f"{_TITLES.get(name, name)} · {entry['frames']} held-out frames ({entry['split']}) · face parameters "
             f"{entry['face_params'].replace('_', ' ')} · PSNR on training frames: "
@@ -158,80 +155,55 @@ def _table(protocols: Mapping[str, Any]) -> str:
         )
         if "covered_frames" in entry:
             caption += f" · in {entry['covered_frames']} of the held-out frames something covers a part of the face"
-        parts.append(
-            f'<div class="card table"><div class="scroll"><table>{_table_head()}<tbody>{rows}</tbody></table></div>'
-            f'<p class="note">{escape(caption)}</p></div>'
-        )
-        parts.append(_parts_table(subjects))
-    return "".join(parts) or '<p class="note">No frame was held out, so nothing was scored.</p>'
+        head = [[Cell("", "blank"), *metric_groups()], [Cell(""), *metric_headings()]]
+        rows = [[Cell(label), *_cells(key, subjects)] for key, label in _ROWS.items() if key in subjects]
+        tables.append(DataTable(head, rows, caption, own=True))
+        shown = [part for part in PART_NAMES if part in entry]
+        if shown:
+            tables.append(_parts_table(subjects, shown))
+    return tables
 
 
-def _parts_table(subjects: Mapping[str, Any]) -> str:
-    """Every metric on the crops of eyes and mouth, or nothing if no frame shows them."""
-    shown = [part for part in PART_NAMES if part in subjects["avatar"]]
-    if not shown:
-        return ""
-    groups = "".join(f'<th class="group head" colspan="{len(COLUMNS)}">{PART_NAMES[part]}</th>' for part in shown)
-    rows = "".join(
-        f'<tr class="{"own" if key == "avatar" else ""}"><td>{label}</td>{_part_cells(subjects[key], shown)}</tr>'
-        for key, label in _ROWS.items()
-        if key in subjects
-    )
-    head = f'<tr><th class="blank"></th>{groups}</tr><tr><th></th>{metric_headings(len(shown))}</tr>'
-    return (
-        f'<div class="card table"><div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
-        f'<p class="note">Crops of eyes and mouth, in the frames that show them</p></div>'
-    )
+def _parts_table(subjects: Mapping[str, Any], parts: Sequence[str]) -> DataTable:
+    """Every metric on the crops of eyes and mouth."""
+    groups = [Cell(PART_NAMES[part], "group head", len(COLUMNS)) for part in parts]
+    head = [[Cell("", "blank"), *groups], [Cell(""), *metric_headings(len(parts))]]
+    rows = [[Cell(label), *_part_cells(subjects[key], parts)] for key, label in _ROWS.items() if key in subjects]
+    return DataTable(head, rows, "Crops of eyes and mouth, in the frames that show them", own=True)
 
 
-def _part_cells(entry: Mapping[str, Any], parts: Sequence[str]) -> str:
+def _part_cells(entry: Mapping[str, Any], parts: Sequence[str]) -> list[Cell]:
     cells = []
     for part in parts:
         for index, (metric, _, digits, _) in enumerate(COLUMNS):
             value = figure(entry, part, metric) if part in entry else None
-            text = "–" if value is None else f"{value:.{digits}f}"
-            cells.append(f"<td{' class=head' if index == 0 else ''}>{text}</td>")
-    return "".join(cells)
+            cells.append(Cell(figure_text(value, digits), "head" if index == 0 else ""))
+    return cells
 
 
-def _table_head() -> str:
-    return f'<thead><tr><th class="blank"></th>{metric_groups()}</tr><tr><th></th>{metric_headings()}</tr></thead>'
-
-
-def _cells(key: str, subjects: Mapping[str, Any]) -> str:
+def _cells(key: str, subjects: Mapping[str, Any]) -> list[Cell]:
     """One row's figures. The avatar's PSNR includes its lead over the better baseline."""
     cells = []
     for part in (None, "head"):
         for index, (metric, _, digits, _) in enumerate(COLUMNS):
             value = figure(subjects[key], part, metric)
-            text = "–" if value is None else f"{value:.{digits}f}"
             others = [figure(entry, part, metric) for name, entry in subjects.items() if name in BASELINE_NAMES]
             known = [other for other in others if other is not None]
+            lead = ""
             if key == "avatar" and metric == "psnr" and value is not None and known:
-                text += f" <small>{value - max(known):+.1f}</small>"
-            cells.append(f"<td{' class=head' if part and index == 0 else ''}>{text}</td>")
-    return "".join(cells)
+                lead = f"{value - max(known):+.1f}"
+            cells.append(Cell(figure_text(value, digits), "head" if part and index == 0 else "", lead=lead))
+    return cells
 
 
-def _how_to_read(protocols: Mapping[str, Any]) -> str:
+def _glossary(protocols: Mapping[str, Any]) -> dict[str, str]:
     backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
     fitted = FITTED_GLOSSARY if any("fitted" in entry for entry in protocols.values()) else {}
-    texts = {
+    return {
         **GLOSSARY,
         **fitted,
         "ST-LPIPS": f"{GLOSSARY['ST-LPIPS']} Here: {', '.join(sorted(backbones)) or 'not computed'}.",
     }
-    return glossary_html(texts)
-
-
-def _settings(run: RunRecord) -> str:
-    shown = {**run.config, "command_line": _shortened(run.config["command_line"])}
-    text = json.dumps(shown, indent=1)
-    memory = run.summary["peak_memory_mb"]
-    return (
-        f'<h2>Settings</h2><p class="note">Peak memory {memory:,.0f} MB.</p>'
-        f"<details class='card'><summary>config.json</summary><pre><code>{escape(text)}</code></pre></details>"
-    )
 
 
 def _duration(seconds: float) -> str:

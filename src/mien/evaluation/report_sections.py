@@ -1,7 +1,7 @@
-"""The parts of report.html with pictures and charts. Every function returns a piece of HTML."""
+"""The parts of report.html with pictures and charts."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from mien.avatar import Avatar
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import BASELINE_NAMES
-from mien.evaluation.page import error_scale, picture_html, video_html
+from mien.evaluation.page import Card, Cell, DataTable, Picture, Video, figure_text, picture_of, video_of
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
 from mien.pictures import Box, error_heat, to_uint8
@@ -48,16 +48,49 @@ _CROSS_NOTE = (
 )
 
 
-def comparison(experiment: Experiment, evaluation: Evaluation) -> str:
+@dataclass(frozen=True)
+class ComparedFrame:
+    """A held-out frame as truth, rendering and error."""
+
+    rank: str
+    """`best`, `median`, `worst`, or empty."""
+    frame: str
+    figures: str
+    pictures: Sequence[Picture]
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """What the training pictures show of the head."""
+
+    pictures: Sequence[Picture]
+    note: str
+
+
+@dataclass(frozen=True)
+class TrackedSequence:
+    """How the mesh was tracked in a sequence."""
+
+    pictures: Sequence[Picture]
+    residuals: Card
+
+
+@dataclass(frozen=True)
+class CrossSection:
+    """Cross-reenactment."""
+
+    table: DataTable
+    videos: Sequence[Video]
+
+
+def comparison(experiment: Experiment, evaluation: Evaluation) -> list[ComparedFrame]:
     """Truth, rendering and error of the best, the median and the worst held-out frame, and of some between."""
     ranked = evaluation.ranked()
     middle = len(ranked) // 2
     places = _places(len(ranked), middle)
     names = {len(ranked) - 1: "best", middle: "median", 0: "worst"}
     box = head_box(experiment, [evaluation.frames[ranked[place]] for place in places])
-    rows = [_comparison_row(experiment, evaluation, ranked[place], names.get(place, ""), box) for place in places]
-    labels = f'<div class="labels"><span>Truth</span><span>Rendering</span><span>Error {error_scale()}</span></div>'
-    return labels + "".join(rows)
+    return [_compared_frame(experiment, evaluation, ranked[place], names.get(place, ""), box) for place in places]
 
 
 def _places(count: int, middle: int) -> list[int]:
@@ -69,7 +102,7 @@ def _places(count: int, middle: int) -> list[int]:
     return places[::-1]
 
 
-def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, name: str, box: Box) -> str:
+def _compared_frame(experiment: Experiment, evaluation: Evaluation, index: int, rank: str, box: Box) -> ComparedFrame:
     frame, scores = evaluation.frames[index], evaluation.scores[AVATAR][index]
     target, image = target_image(experiment, frame), avatar_image(experiment, frame)
     whole = (to_uint8(target), to_uint8(image), error_heat(image, target))
@@ -77,15 +110,14 @@ def _comparison_row(experiment: Experiment, evaluation: Evaluation, index: int, 
     figures = f"PSNR {scores['psnr']:.2f} dB, head {scores['head_psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
     if "perceptual" in scores:
         figures += f", ST-LPIPS {scores['perceptual']:.3f}"
-    tag = f"<strong>{name}</strong> · " if name else ""
-    images = "".join(map(_image, pictures, ("truth", "rendering", "error")))
-    return (
-        f'<figure class="row"><div class="triple">{images}</div>'
-        f"<figcaption>{tag}{escape(frame_name(experiment, frame))} · {figures}</figcaption></figure>"
-    )
+    shown = [
+        picture_of(picture, what, _PICTURE_SIZE)
+        for picture, what in zip(pictures, ("truth", "rendering", "error"), strict=True)
+    ]
+    return ComparedFrame(rank, frame_name(experiment, frame), figures, shown)
 
 
-def over_time(experiment: Experiment, evaluation: Evaluation) -> str:
+def over_time(experiment: Experiment, evaluation: Evaluation) -> list[Card]:
     """PSNR of the head crop over the timesteps of each sequence and camera, with held-out spans shaded."""
     pairs = sorted({(frame.sequence, frame.camera) for frame in evaluation.frames})
     charts = []
@@ -102,9 +134,9 @@ def over_time(experiment: Experiment, evaluation: Evaluation) -> str:
                     _series(label, timesteps, [evaluation.scores[subject][i]["head_psnr"] for i in there], style)
                 )
         axes = Axes("timestep", "PSNR, head crop, dB", 1080, 260, shaded=spans(timesteps))
-        title = escape(frame_name(experiment, Frame(sequence, -1, camera)))
-        charts.append(_card(f"PSNR on the head crop, dB · {title}", line_chart(series, axes)))
-    return "".join(charts)
+        title = frame_name(experiment, Frame(sequence, -1, camera))
+        charts.append(Card(f"PSNR on the head crop, dB · {title}", line_chart(series, axes)))
+    return charts
 
 
 def spans(timesteps: Sequence[int]) -> tuple[tuple[float, float], ...]:
@@ -118,7 +150,7 @@ def spans(timesteps: Sequence[int]) -> tuple[tuple[float, float], ...]:
     return tuple(found)
 
 
-def training_curves(curves: Mapping[str, np.ndarray]) -> str:
+def training_curves(curves: Mapping[str, np.ndarray]) -> list[Card]:
     """Loss, PSNR, number of Gaussians and step time over the steps of training."""
     steps = np.asarray(curves["step"], dtype=np.float64)
     kinds = (
@@ -136,9 +168,8 @@ def training_curves(curves: Mapping[str, np.ndarray]) -> str:
         series = [Series(title, steps, values)]
         if name in ("loss", "psnr"):
             series = [Series("single frames", steps, values, "quiet"), Series("mean", *_smooth(steps, values))]
-        chart = line_chart(series, Axes("step", title, from_zero=from_zero))
-        cards.append(_card(title, chart))
-    return f'<div class="grid2">{"".join(cards)}</div>'
+        cards.append(Card(title, line_chart(series, Axes("step", title, from_zero=from_zero))))
+    return cards
 
 
 def _smooth(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,39 +180,38 @@ def _smooth(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @torch.no_grad()
-def tracking_overlays(experiment: Experiment) -> str:
+def tracking_overlays(experiment: Experiment) -> list[TrackedSequence]:
     """The tracked mesh over evenly spread frames, and the landmark residuals over time."""
     parts = []
     for index, sequence in enumerate(experiment.sequences):
         usable = np.argwhere(sequence.usable())
         chosen = usable[np.linspace(0, len(usable) - 1, min(_OVERLAYS, len(usable))).round().astype(int)]
-        figures = "".join(_overlay(experiment, Frame(index, int(t), int(c))) for t, c in chosen)
-        parts.append(f'<div class="strip">{figures}</div>')
+        pictures = [_overlay(experiment, Frame(index, int(t), int(c))) for t, c in chosen]
         residuals = sequence.tracking.residuals.double().numpy()
         timesteps = np.arange(len(residuals), dtype=np.float64)
         lines = [Series("residual", timesteps, np.ascontiguousarray(residuals[:, 0]))]
         median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else float("nan")
-        title = f"Landmark residual, median of each frame, pixels · {escape(sequence.name)} · median {median:.2f} px"
+        title = f"Landmark residual, median of each frame, pixels · {sequence.name} · median {median:.2f} px"
         chart = line_chart(lines, Axes("timestep", "residual, pixels", 1080, 200, from_zero=True))
-        parts.append(_card(title, chart))
-    return "".join(parts)
+        parts.append(TrackedSequence(pictures, Card(title, chart)))
+    return parts
 
 
-def _overlay(experiment: Experiment, frame: Frame) -> str:
+def _overlay(experiment: Experiment, frame: Frame) -> Picture:
     sequence, camera = experiment.sequences[frame.sequence], experiment.camera(frame)
     picture = torch.from_numpy(sequence.capture.images[frame[1:]].astype(np.float32)) / 255
     face_model = experiment.avatar.face_model
     vertices = face_model(sequence.tracking.face[frame.timestep])[0]
     mesh, alpha = render_mesh(vertices, face_model.faces, camera, supersample=2)
     blended = picture * (1 - 0.6 * alpha[..., None]) + 0.6 * alpha[..., None] * mesh
-    image = picture_html(to_uint8(blended), "tracked mesh over the frame", _OVERLAY_SIZE)
-    return f"<figure>{image}<figcaption>timestep {frame.timestep}</figcaption></figure>"
+    caption = f"timestep {frame.timestep}"
+    return picture_of(to_uint8(blended), "tracked mesh over the frame", _OVERLAY_SIZE, caption)
 
 
-def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
-    """The median held-out frame as truth, mean training picture, coloured mesh and avatar."""
+def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> list[Picture]:
+    """The median held-out frame as truth, mean training picture, coloured mesh and avatar; none without baselines."""
     if evaluation.baselines is None:
-        return '<p class="note">This evaluation did not score the baselines.</p>'
+        return []
     frame = evaluation.frames[evaluation.ranked()[len(evaluation.frames) // 2]]
     pictures = {
         "truth": target_image(experiment, frame),
@@ -189,37 +219,31 @@ def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> str:
         BASELINE_NAMES["mesh"]: evaluation.baselines.mesh_image(experiment, frame),
         "avatar": avatar_image(experiment, frame),
     }
-    figures = (
-        f"<figure>{_image(to_uint8(picture), name)}<figcaption>{name}</figcaption></figure>"
-        for name, picture in pictures.items()
-    )
-    return f'<div class="strip">{"".join(figures)}</div>'
+    return [picture_of(to_uint8(picture), name, _PICTURE_SIZE, name) for name, picture in pictures.items()]
 
 
 @torch.no_grad()
-def confidence(avatar: Avatar, coverage: Coverage) -> str:
+def confidence(avatar: Avatar, coverage: Coverage) -> Filmed:
     """The neutral head coloured by how well training pictures show it, from the front, from aside and from behind."""
     neutral = avatar.face_model.head_vertices(avatar.subject)[0].cpu().float()
     model = avatar.face_model.to(neutral)
-    figures = []
+    pictures = []
     for yaw, name in _SIDES.items():
-        picture = picture_html(
-            to_uint8(confidence_picture(model, neutral, coverage, yaw, _OVERLAY_SIZE)), name, _OVERLAY_SIZE
-        )
-        figures.append(f"<figure>{picture}<figcaption>{name}</figcaption></figure>")
+        picture = confidence_picture(model, neutral, coverage, yaw, _OVERLAY_SIZE)
+        pictures.append(picture_of(to_uint8(picture), name, _OVERLAY_SIZE, name))
     note = f"{filmed_words(model, neutral, coverage)}. {_CONFIDENCE_NOTE}"
-    return f'<div class="strip">{"".join(figures)}</div><p class="note">{escape(note[0].upper() + note[1:])}</p>'
+    return Filmed(pictures, note[0].upper() + note[1:])
 
 
-def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder: Path) -> str:
-    """The table and the videos, as HTML."""
-    heads = "".join(f"<th>{name}</th>" for _, name, _ in _CROSS_COLUMNS)
-    rows = "".join(_driver_row(driver) for driver in entry["drivers"])
-    shown = "".join(video_html(path, page_folder, "Driver, avatar") for path in videos)
-    return (
-        '<h2>Cross-reenactment</h2><div class="card table"><div class="scroll"><table><thead><tr><th>Driver</th>'
-        f'{heads}</tr></thead><tbody>{rows}</tbody></table></div><p class="note">{escape(_CROSS_NOTE)}</p></div>{shown}'
-    )
+def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder: Path) -> CrossSection:
+    """The table and the videos of cross-reenactment."""
+    head = [Cell("Driver"), *(Cell(name) for _, name, _ in _CROSS_COLUMNS)]
+    rows = [
+        [Cell(driver["driver"]), *(Cell(figure_text(driver[key], digits)) for key, _, digits in _CROSS_COLUMNS)]
+        for driver in entry["drivers"]
+    ]
+    shown = [video_of(path, page_folder, "Driver, avatar") for path in videos]
+    return CrossSection(DataTable([head], rows, _CROSS_NOTE), shown)
 
 
 def frame_name(experiment: Experiment, frame: Frame) -> str:
@@ -235,20 +259,3 @@ def frame_name(experiment: Experiment, frame: Frame) -> str:
 
 def _series(label: str, x: Sequence[int], y: Sequence[float], style: str) -> Series:
     return Series(label, np.array(x, dtype=np.float64), np.array(y, dtype=np.float64), style, points=True)
-
-
-def _image(picture: np.ndarray, what: str) -> str:
-    return picture_html(picture, what, _PICTURE_SIZE)
-
-
-def _card(title: str, content: str) -> str:
-    return f'<div class="card wide"><h3>{title}</h3>{content}</div>'
-
-
-def _driver_row(driver: Mapping[str, Any]) -> str:
-    cells = "".join(_figure_cell(driver[key], digits) for key, _, digits in _CROSS_COLUMNS)
-    return f"<tr><td>{escape(driver['driver'])}</td>{cells}</tr>"
-
-
-def _figure_cell(value: float | int | None, digits: int) -> str:
-    return f"<td>{'–' if value is None else f'{value:.{digits}f}'}</td>"

@@ -23,26 +23,7 @@ if TYPE_CHECKING:
     from mien.export.webcam import WebcamFiles, find_webcam_files
     from mien.export.world_space import in_world
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "gaussian_avatars_folder": [
-                "GaussianAvatarsFolder", "read_gaussian_avatars_folder", "write_gaussian_avatars_folder",
-            ],
-            "world_space": ["in_world"],
-            "glb": ["MeshModel", "WrittenGlb", "write_glb"],
-            "glb_avatar": ["read_glb_avatar"],
-            "glb_file": ["Glb", "read_glb"],
-            "packed": ["Motion", "pack", "unpacked"],
-            "ply": ["read_ply", "write_ply"],
-            "pose_files": ["write_pose"],
-            "sog": ["read_sog", "write_sog"],
-            "spz": ["read_spz", "write_spz"],
-            "usd": ["read_usd", "write_usd"],
-            "web_page": ["WrittenPage", "write_packed", "write_page"],
-            "webcam": ["WebcamFiles", "find_webcam_files"],
-        },
-    )  # fmt: skip
+    __getattr__, __dir__ = lazy_names(__name__, __file__)  # fmt: skip
 
 __all__ = [
     "GaussianAvatarsFolder",

@@ -23,28 +23,7 @@ if TYPE_CHECKING:
     from mien.tracking.settings import PaperSettings, PhotometricSettings, SmoothnessSettings, TrackingSettings
     from mien.tracking.tracking import Appearance, Tracking
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "fitting": ["has_enough_faces"],
-            "files": ["check_tracking_of", "read_tracking", "write_tracking"],
-            "neck_cut": ["NeckCut", "NeckParts", "fit_neck_cut"],
-            "pipeline": ["track", "track_subject"],
-            "report": [
-                "draw_overlay",
-                "draw_overlay_grid",
-                "frontal_camera",
-                "overlay_stride",
-                "residual_report",
-                "write_overlay",
-                "write_residual_report",
-            ],
-            "scoring": ["Scoring", "head_crop", "head_cutter", "make_scoring"],
-            "scoring_files": ["read_scoring", "read_scoring_hash", "scoring_exists", "write_scoring"],
-            "settings": ["PaperSettings", "PhotometricSettings", "SmoothnessSettings", "TrackingSettings"],
-            "tracking": ["Appearance", "Tracking"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "Appearance",

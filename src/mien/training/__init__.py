@@ -33,38 +33,7 @@ if TYPE_CHECKING:
     )
     from mien.training.trainer import train
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "filmed": ["confidence_picture", "filmed_words", "read_coverage"],
-            "frames": ["held_out"],
-            "named_split": ["NAMED_SPLIT", "NamedSplit", "split_by_name", "with_named_split"],
-            "run": [
-                "check_data",
-                "check_run",
-                "check_untouched",
-                "filmed_range",
-                "outdated_sequences",
-                "read_curves",
-                "read_face_track",
-                "read_run_config",
-                "read_training_summary",
-                "run_camera",
-                "write_imported_run",
-            ],
-            "sequence": ["Sequence", "read_sequence"],
-            "settings": [
-                "MAIN_SETTINGS",
-                "PRESETS",
-                "Preset",
-                "Split",
-                "TrainSettings",
-                "check_held_out",
-                "doubly_held_out",
-            ],
-            "trainer": ["train"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "MAIN_SETTINGS",

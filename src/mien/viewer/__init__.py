@@ -16,17 +16,7 @@ if TYPE_CHECKING:
     from mien.viewer.server import serve
     from mien.viewer.session import Clip, Seen, Session
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "access": ["Door", "is_loopback"],
-            "drawing": ["Look", "Mesh", "View"],
-            "following": ["CameraSwitch"],
-            "loop": ["DrawingLoop"],
-            "server": ["serve"],
-            "session": ["Clip", "Seen", "Session"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "CameraSwitch",

@@ -15,16 +15,7 @@ if TYPE_CHECKING:
     from mien.analysis.study.settings import StudySettings
     from mien.analysis.study.tally import tally_content, tally_text
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "clips": ["StudyRuns"],
-            "files": ["Answers", "StudyKey", "read_answers", "read_key"],
-            "making": ["write_study"],
-            "settings": ["StudySettings"],
-            "tally": ["tally_content", "tally_text"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "Answers",

@@ -12,13 +12,6 @@ if TYPE_CHECKING:
     from mien.driving.live.landmark_fit import Fitted, LandmarkFit
     from mien.driving.live.one_euro import OneEuro
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "follower": ["FollowOptions", "Follower", "State"],
-            "landmark_fit": ["Fitted", "LandmarkFit"],
-            "one_euro": ["OneEuro"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = ["Fitted", "FollowOptions", "Follower", "LandmarkFit", "OneEuro", "State"]
