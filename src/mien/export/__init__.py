@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from mien.export.glb_file import Glb, read_glb
     from mien.export.packed import Motion, pack, unpacked
     from mien.export.ply import read_ply, write_ply
-    from mien.export.pose_files import write_pose
     from mien.export.sog import read_sog, write_sog
     from mien.export.spz import read_spz, write_spz
     from mien.export.usd import read_usd, write_usd
@@ -35,7 +34,6 @@ else:
             "glb_file": ["Glb", "read_glb"],
             "packed": ["Motion", "pack", "unpacked"],
             "ply": ["read_ply", "write_ply"],
-            "pose_files": ["write_pose"],
             "sog": ["read_sog", "write_sog"],
             "spz": ["read_spz", "write_spz"],
             "usd": ["read_usd", "write_usd"],
@@ -68,7 +66,6 @@ __all__ = [
     "write_packed",
     "write_page",
     "write_ply",
-    "write_pose",
     "write_sog",
     "write_spz",
     "write_usd",
