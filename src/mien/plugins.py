@@ -1,4 +1,4 @@
-"""Methods, formats and datasets of other packages: entry points (`importlib.metadata`) of the groups `mien.*`."""
+"""What other packages add to the registries: entry points (`importlib.metadata`) of groups such as `mien.formats`."""
 
 from functools import cache
 from importlib.metadata import entry_points
