@@ -1,6 +1,6 @@
 """`mien export`: avatars as files for other programs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -8,22 +8,18 @@ import tyro
 
 from mien.commands.options import check_driver, check_neutral
 from mien.errors import UserError
-from mien.export.usd_package import USD_ENDINGS, check_usd
-from mien.workspace import Workspace, open_workspace
+from mien.formats import Format, endings, find_format, format_of, formats, numbered
+from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
-    import mien.export
-    import mien.gaussians
-    import mien.runtime
+    from mien.formats import Options
 
-_POSES = (".ply", ".spz", ".sog", *USD_ENDINGS)
-_PAGES = (".html", ".packed")
-_ENDINGS = (".mien", *_PAGES, ".glb", *_POSES)
-_Format = Literal[
-    "mien", "html", "packed", "glb", "ply", "spz", "sog", "usd", "usda", "usdc", "usdz", "gaussian-avatars"
-]
-_FILES = (".mien", ".glb")
-"""Endings of avatars that can be read."""
+_REFUSED = {
+    "webgpu": "only an .html page draws with WebGPU; leave --webgpu out",
+    "sh": "only a .ply has a degree to choose; leave --sh out",
+    "webcam": "only an .html page has a webcam; leave --webcam out, or write a .html file",
+}
+"""What is told of an option that the format does not take."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +33,7 @@ class Command:
     """The file to write: .mien, .html, .packed, .glb, or Gaussians in a pose: .ply, .spz, .sog, .usd, .usda, .usdc or
     .usdz. With --series, .ply, .spz and .sog files get numbers: NAME_000000.ply; a USD file has all frames. With
     --format gaussian-avatars, a folder."""
-    format: _Format | None = None
+    format: str | None = None
     """Format of the output (default: by the ending of --out), or gaussian-avatars: a folder with point_cloud.ply, whose
     Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's training."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
@@ -69,29 +65,16 @@ class Command:
         """Check options and paths without heavy libraries."""
         from mien.files import check_writable
 
-        if self.webgpu and self.out.suffix.lower() != ".html":
-            raise UserError(f"{self.out}: only an .html page draws with WebGPU; leave --webgpu out")
-        if self.sh is not None and (self.out.suffix.lower() != ".ply" or self.format == "gaussian-avatars"):
-            raise UserError(f"{self.out}: only a .ply has a degree to choose; leave --sh out")
-        self._check_webcam()
-        if self.workspace.suffix.lower() in _FILES and not self.workspace.is_dir():
-            self._check_file()
+        kind = self._kind()
+        self._check_options(kind)
+        if self._is_file():
+            self._check_file(kind)
             return
         workspace = open_workspace(self.workspace)
         workspace.pick_run(self.run_name)
-        kind = self.out.suffix.lower()
-        if self.format == "gaussian-avatars":
-            self._check_folder()
-            return
-        self._check_ending(_ENDINGS, ", or --format gaussian-avatars for a folder")
-        if kind == ".mien" and (self.set or self.series):
-            raise UserError(f"{self.out}: a .mien file holds every expression; leave --set and --series out")
-        if kind == ".glb" and (self.set or self.series):
-            raise UserError(
-                f"{self.out}: a .glb file has a morph target for every expression; leave --set and --series out"
-            )
-        if kind in _PAGES and self.set:
-            raise UserError(f"{self.out}: a page sets every expression itself; leave --set out")
+        for option, given in (("set", self.set), ("series", self.series), ("every", self.every != 1)):
+            if given and option in kind.refusals:
+                raise UserError(f"{self.out}: {kind.refusals[option]}")
         if self.every < 1 or (self.every > 1 and self.series is None):
             raise UserError(f"--every {self.every}: give 1 or more, together with --series")
         if self.neutral is not None and self.series is None:
@@ -99,58 +82,74 @@ class Command:
         check_neutral(self.neutral)
         if self.series is not None and self.series not in workspace.sequence_names():
             check_driver(Path(self.series), None)
-        numbered = self.series is not None and kind in _POSES and kind not in USD_ENDINGS
-        check_writable(self._numbered(0) if numbered else self.out)
+        check_writable(self._first_path(kind), folder=kind.holds == "folder")
 
     def run(self) -> None:
         """Pose the avatar and write the files."""
-        from mien.avatar import load_avatar
+        from mien.commands.stages.exporting import RunContent, Series, convert, export
 
-        if self.workspace.suffix.lower() in _FILES and not self.workspace.is_dir():
-            self._convert()
+        kind = self._kind()
+        if self._is_file():
+            convert(self.workspace, self.out, kind, self._options())
             return
         workspace = open_workspace(self.workspace)
-        run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        avatar = load_avatar(run_dir)
-        if self.format == "gaussian-avatars":
-            self._write_folder(avatar, run_dir)
-        elif self.out.suffix.lower() == ".mien":
-            self._write_mien(avatar, run_dir)
-        elif self.out.suffix.lower() in _PAGES:
-            self._write_page(avatar, run_dir, workspace)
-        elif self.out.suffix.lower() == ".glb":
-            self._write_glb(avatar, run_dir)
-        elif self.series is None:
-            self._write_one(avatar)
-        else:
-            self._write_series(avatar, workspace, self.series)
+        series = None if self.series is None else Series(self.series, self.neutral, self.every)
+        content = RunContent(workspace, workspace.pick_run(self.run_name), self.set, series)
+        export(content, self.out, kind, self._options())
 
-    def _check_webcam(self) -> None:
+    def _is_file(self) -> bool:
+        """Whether the avatar comes from a file."""
+        kind = format_of(self.workspace)
+        return kind is not None and kind.reads_avatars and not self.workspace.is_dir()
+
+    def _kind(self) -> Format:
+        """The format that is written.
+
+        Raises:
+            UserError: there is none of this name or ending, or name and ending do not go together.
+        """
+        if self.format is None:
+            kind = format_of(self.out)
+            if kind is None:
+                raise self._unknown_ending()
+            return kind
+        kind = find_format(self.format)
+        if kind is None:
+            names = ", ".join(each.name for each in formats())
+            raise UserError(f"--format {self.format}: there is no such format; choose one of {names}")
+        if kind.holds == "folder":
+            if format_of(self.out) is not None:
+                raise UserError(f"{self.out}: --format {kind.name} writes a folder; give a name without an ending")
+        elif self.out.suffix.lower() != f".{self.format}":
+            raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
+        return kind
+
+    def _unknown_ending(self) -> UserError:
+        *others, last = endings(only_from_files=self._is_file())
+        folder = "" if self._is_file() else ", or --format gaussian-avatars for a folder"
+        ending = self.out.suffix.lower() or "a file without ending"
+        return UserError(f"{self.out}: cannot write {ending}; use {', '.join(others)} or {last}{folder}")
+
+    def _check_options(self, kind: Format) -> None:
         from mien.export.webcam import find_webcam_files
 
+        given = {"webgpu": self.webgpu, "sh": self.sh is not None, "webcam": self.webcam}
+        for option, is_given in given.items():
+            if is_given and option not in kind.options:
+                raise UserError(f"{self.out}: {_REFUSED[option]}")
         if self.webcam_model is not None and not self.webcam:
             raise UserError(f"--webcam-model {self.webcam_model}: give it together with --webcam")
-        if self.webcam and self.out.suffix.lower() != ".html":
-            raise UserError(f"{self.out}: only an .html page has a webcam; leave --webcam out, or write a .html file")
         if self.webcam:
             find_webcam_files(self.webcam_model)
+        kind.check(self.out)
 
-    def _webcam_files(self) -> "mien.export.WebcamFiles | None":
+    def _options(self) -> "Options":
         from mien.export import find_webcam_files
+        from mien.formats import Options
 
-        return find_webcam_files(self.webcam_model) if self.webcam else None
+        return Options(self.sh, self.webgpu, find_webcam_files(self.webcam_model) if self.webcam else None)
 
-    def _check_ending(self, endings: tuple[str, ...], others: str) -> None:
-        kind = self.out.suffix.lower()
-        if kind not in endings:
-            use = f"{', '.join(endings[:-1])} or {endings[-1]}"
-            raise UserError(f"{self.out}: cannot write {kind or 'a file without ending'}; use {use}{others}")
-        if self.format is not None and kind != f".{self.format}":
-            raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
-        if kind in USD_ENDINGS:
-            check_usd(self.out)
-
-    def _check_file(self) -> None:
+    def _check_file(self, kind: Format) -> None:
         from mien.files import check_writable
 
         if not self.workspace.is_file():
@@ -160,141 +159,12 @@ class Command:
                 f"{self.workspace}: a file holds one avatar at rest; leave --run, --set, --series, --neutral and "
                 "--every out, or give its workspace"
             )
-        self._check_ending(tuple(ending for ending in _ENDINGS if ending != ".glb"), "")
+        if not kind.from_files:
+            raise self._unknown_ending()
         if self.out.exists() and self.out.samefile(self.workspace):
             raise UserError(f"{self.out}: is the file that is read; choose another name")
         check_writable(self.out)
 
-    def _convert(self) -> None:
-        from mien.commands.stages.converting import convert
-
-        convert(self.workspace, self.out, self._webcam_files(), self.webgpu, self.sh)
-
-    def _check_folder(self) -> None:
-        from mien.files import check_writable
-
-        if self.out.suffix.lower() in _ENDINGS:
-            raise UserError(f"{self.out}: --format gaussian-avatars writes a folder; give a name without an ending")
-        if self.set or self.series or self.every != 1:
-            raise UserError(
-                f"{self.out}: GaussianAvatars' folder holds every timestep; leave --set, --series and --every out"
-            )
-        check_writable(self.out, folder=True)
-
-    def _write_folder(self, avatar, run_dir: Path) -> None:
-        from mien.export import write_gaussian_avatars_folder
-        from mien.progress import say
-        from mien.training import read_face_track
-
-        face = read_face_track(run_dir, avatar.face_model)
-        face = replace(face, identity=avatar.subject.identity, vertex_offsets=avatar.subject.vertex_offsets)
-        write_gaussian_avatars_folder(self.out, avatar, face)
-        say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians, {len(face)} timesteps")
-        if avatar.face_model.flame_origin is None:
-            say(
-                f"note: the folder has the face model {avatar.face_model.name!r} in it; `mien import` reads it, but "
-                "GaussianAvatars' viewer opens only avatars on FLAME with teeth"
-            )
-
-    def _portable(self, avatar, run_dir: Path) -> "mien.runtime.PortableAvatar":
-        """The avatar with everything that the run knows of it."""
-        from mien.avatar import as_array, make_portable
-        from mien.training import read_coverage, run_camera
-
-        portable = make_portable(avatar, run_camera(run_dir), self.workspace.resolve().name)
-        covered = read_coverage(run_dir, avatar.face_model)
-        return portable if covered is None else replace(portable, confidence=as_array(covered.seen))
-
-    def _write_mien(self, avatar, run_dir: Path) -> None:
-        from mien.progress import say
-        from mien.runtime import write_portable
-
-        write_portable(self.out, self._portable(avatar, run_dir))
-        say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB")
-
-    def _write_page(self, avatar, run_dir: Path, workspace: Workspace) -> None:
-        from mien.avatar import make_portable
-        from mien.export import Motion, write_packed, write_page
-        from mien.progress import say
-        from mien.training import run_camera
-
-        portable = make_portable(avatar, run_camera(run_dir), self.workspace.resolve().name)
-        motion = None
-        if self.series is not None:
-            driven, fps = self._driven(avatar, workspace, self.series, with_head_pose=True)
-            fields = (driven.expression, driven.joints, driven.head_rotation, driven.head_translation)
-            motion = Motion(*(tensor.detach().float().numpy() for tensor in fields), fps=fps / self.every)
-        if self.out.suffix.lower() == ".html":
-            page = write_page(self.out, portable, motion, self._webcam_files(), self.webgpu)
-        else:
-            page = write_packed(self.out, portable, motion)
-        moves = "" if motion is None else f", a motion of {len(motion):,} frames"
-        say(
-            f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians{moves}, {page.size / 1e6:.1f} MB; compression "
-            f"changes the picture little ({page.psnr:.0f} dB)"
-        )
-
-    def _write_glb(self, avatar, run_dir: Path) -> None:
-        from mien.avatar import as_array, bake_rig
-        from mien.export import MeshModel, write_glb
-        from mien.progress import say
-
-        portable, model = self._portable(avatar, run_dir), avatar.face_model
-        mesh = MeshModel(bake_rig(model, avatar.subject), *map(as_array, (model.faces, model.uv, model.uv_faces)))
-        written = write_glb(self.out, portable, mesh)
-        say(
-            f"{self.out}: a mesh with {len(written.targets)} morph targets and {len(model.joint_names)} joints, "
-            f"{len(avatar.gaussian_store()):,} Gaussians at rest, {written.size / 1e6:.1f} MB"
-        )
-
-    def _write_one(self, avatar) -> None:
-        from mien.commands.expression import with_expression
-        from mien.export import write_pose
-        from mien.progress import say
-
-        face = with_expression(avatar.subject, avatar.face_model, self.set)
-        write_pose(self.out, _posed(avatar, face), self.sh)
-        say(f"{self.out}: {len(avatar.gaussian_store()):,} Gaussians")
-
-    def _write_series(self, avatar, workspace: Workspace, series: str) -> None:
-        from mien.export import write_pose, write_usd
-        from mien.progress import say, track_progress
-
-        driven, fps = self._driven(avatar, workspace, series, with_head_pose=False)
-        indices = track_progress(range(len(driven)), "Exporting", len(driven))
-        if self.out.suffix.lower() in USD_ENDINGS:
-            count = write_usd(self.out, (_posed(avatar, driven[index]) for index in indices), fps / self.every)
-            say(f"{self.out}: {count} time samples, {self.out.stat().st_size / 1e6:.1f} MB")
-            return
-        for index in indices:
-            write_pose(self._numbered(index), _posed(avatar, driven[index]), self.sh)
-        say(f"{self._numbered(0)} ... {self._numbered(len(driven) - 1).name}: {len(driven)} files")
-
-    def _driven(self, avatar, workspace: Workspace, series: str, with_head_pose: bool):
-        """The face parameters of --series for this avatar, and the motion's frames per second before --every."""
-        from mien.commands.expression import with_expression
-        from mien.commands.stages.driving import open_driver
-        from mien.driving import drive, facing, rest_of
-        from mien.training import run_camera
-
-        own, model = series in workspace.sequence_names(), avatar.face_model
-        by = workspace.root if own else Path(series)
-        driver = open_driver(by, series if own else None, model, neutral=self.neutral)
-        camera = run_camera(workspace.run_dir(workspace.pick_run(self.run_name)))
-        person = rest_of(avatar.subject, model, facing(camera.viewmat)).face
-        driven = drive(driver.face, driver.at_rest, person, model.expression_bounds, with_head_pose, series)
-        return with_expression(driven[:: self.every], avatar.face_model, self.set), driver.fps
-
-    def _numbered(self, index: int) -> Path:
-        return self.out.with_name(f"{self.out.stem}_{index:06d}{self.out.suffix.lower()}")
-
-
-def _posed(avatar, face) -> "mien.gaussians.Gaussians":
-    """The Gaussians of one timestep in the world. The head is at the origin, +y up, +z out of the face."""
-    import torch
-
-    from mien.export import in_world
-
-    origin = torch.zeros_like(face.head_rotation)
-    gaussians = avatar.pose(replace(face, head_rotation=origin, head_translation=origin)).gaussians.detach()
-    return in_world(gaussians.timestep(0))
+    def _first_path(self, kind: Format) -> Path:
+        """The file that is written first."""
+        return self.out if self.series is None or kind.holds != "pose" else numbered(self.out, 0)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from mien.export.glb_file import Glb, read_glb
     from mien.export.packed import Motion, pack, unpacked
     from mien.export.ply import read_ply, write_ply
-    from mien.export.pose_files import write_pose
     from mien.export.sog import read_sog, write_sog
     from mien.export.spz import read_spz, write_spz
     from mien.export.usd import read_usd, write_usd
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from mien.export.webcam import WebcamFiles, find_webcam_files
     from mien.export.world_space import in_world
 else:
-    __getattr__, __dir__ = lazy_names(__name__, __file__)  # fmt: skip
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
     "GaussianAvatarsFolder",
@@ -49,7 +48,6 @@ __all__ = [
     "write_packed",
     "write_page",
     "write_ply",
-    "write_pose",
     "write_sog",
     "write_spz",
     "write_usd",

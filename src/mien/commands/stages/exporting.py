@@ -1,0 +1,208 @@
+"""What `mien export` writes: the avatar of a run, or one that comes from a file."""
+
+from collections.abc import Iterator
+from copy import copy
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from mien import runtime
+from mien.avatar import Avatar, as_array, bake_rig, load_avatar, make_portable
+from mien.commands.expression import with_expression
+from mien.commands.stages.driving import open_driver
+from mien.driving import drive, facing, rest_of
+from mien.errors import UserError
+from mien.export import MeshModel, Motion, in_world
+from mien.face import FaceParams
+from mien.formats import Format, Options, format_of, numbered
+from mien.gaussians import Gaussians
+from mien.progress import say, track_progress
+from mien.runtime import PortableAvatar
+from mien.training import read_coverage, read_face_track, run_camera
+from mien.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Series:
+    """A motion that is exported."""
+
+    by: str
+    """Name of a sequence of the workspace, or anything that `mien drive --by` takes."""
+    neutral: str | None = None
+    """The driver's face at rest, as for `mien drive`."""
+    every: int = 1
+    """Only every n-th frame is taken."""
+
+
+class RunContent:
+    """The avatar of a run, as `mien.formats.Content`."""
+
+    def __init__(self, workspace: Workspace, run: str, expression: tuple[str, ...] = (), series: Series | None = None):
+        """Load the avatar.
+
+        Args:
+            workspace: The workspace.
+            run: Name of the run.
+            expression: Settings of the face, NAME=VALUE, on top of the person's neutral and of the series.
+            series: The motion, if there is one.
+
+        Raises:
+            UserError: the run has no avatar, or it is damaged.
+        """
+        self._workspace, self._run_dir = workspace, workspace.run_dir(run)
+        self._expression, self._series = expression, series
+        self._avatar = load_avatar(self._run_dir)
+        self._still: Gaussians | None = None
+
+    def still(self, gaussians: Gaussians) -> "RunContent":
+        """Return a copy whose pose is a frame of the series."""
+        content = copy(self)
+        content._still = gaussians
+        return content
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self._avatar.gaussian_store())
+
+    def portable(self, confidence: bool = True) -> PortableAvatar:
+        """Return the whole avatar, with everything that the run knows of it."""
+        name = self._workspace.root.resolve().name
+        portable = make_portable(self._avatar, run_camera(self._run_dir), name)
+        covered = read_coverage(self._run_dir, self._avatar.face_model) if confidence else None
+        return portable if covered is None else replace(portable, confidence=as_array(covered.seen))
+
+    def mesh(self) -> MeshModel:
+        """Return the person's mesh with its texture coordinates."""
+        model = self._avatar.face_model
+        rig = bake_rig(model, self._avatar.subject)
+        return MeshModel(rig, *map(as_array, (model.faces, model.uv, model.uv_faces)))
+
+    def pose(self) -> Gaussians:
+        """Return the Gaussians with the expression that was asked for, or of the frame (`still`)."""
+        if self._still is not None:
+            return self._still
+        return self._posed(with_expression(self._avatar.subject, self._avatar.face_model, self._expression))
+
+    def poses(self) -> tuple[Iterator[Gaussians], float] | None:
+        """Return the Gaussians of every frame of the series, and frames per second."""
+        if self._series is None:
+            return None
+        driven, fps = self._driven(self._series, with_head_pose=False)
+        indices = track_progress(range(len(driven)), "Exporting", len(driven))
+        return (self._posed(driven[index]) for index in indices), fps
+
+    def motion(self) -> Motion | None:
+        """Return the series as face parameters with head poses."""
+        if self._series is None:
+            return None
+        driven, fps = self._driven(self._series, with_head_pose=True)
+        fields = (driven.expression, driven.joints, driven.head_rotation, driven.head_translation)
+        return Motion(*(tensor.detach().float().numpy() for tensor in fields), fps=fps)
+
+    def trained(self) -> tuple[Avatar, FaceParams]:
+        """Return the trained avatar, and the person at all timesteps of its training."""
+        face, subject = read_face_track(self._run_dir, self._avatar.face_model), self._avatar.subject
+        return self._avatar, replace(face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
+
+    def _driven(self, series: Series, with_head_pose: bool) -> tuple[FaceParams, float]:
+        """The face parameters of the series for this avatar, and frames per second."""
+        model, subject = self._avatar.face_model, self._avatar.subject
+        own = series.by in self._workspace.sequence_names()
+        by = self._workspace.root if own else Path(series.by)
+        driver = open_driver(by, series.by if own else None, model, neutral=series.neutral)
+        person = rest_of(subject, model, facing(run_camera(self._run_dir).viewmat)).face
+        driven = drive(driver.face, driver.at_rest, person, model.expression_bounds, with_head_pose, series.by)
+        return with_expression(driven[:: series.every], model, self._expression), driver.fps / series.every
+
+    def _posed(self, face: FaceParams) -> Gaussians:
+        """The Gaussians of one timestep in the world. The head is at the origin, +y up, +z out of the face."""
+        origin = torch.zeros_like(face.head_rotation)
+        posed = self._avatar.pose(replace(face, head_rotation=origin, head_translation=origin))
+        return in_world(posed.gaussians.detach().timestep(0))
+
+
+class FileContent:
+    """An avatar that comes from a file, as `mien.formats.Content`. It has no run and no mesh with a texture."""
+
+    def __init__(self, source: Path):
+        """Read the file.
+
+        Raises:
+            UserError: it is missing, damaged or foreign.
+        """
+        kind = format_of(source)
+        avatar = None if kind is None or kind.read is None else kind.read(source)
+        if not isinstance(avatar, PortableAvatar):
+            raise UserError(f"{source}: files of this format do not hold a whole avatar; give a .mien or a .glb file")
+        self._source, self._avatar = source, avatar
+
+    @property
+    def name(self) -> str:
+        """The avatar's name."""
+        return self._avatar.about.name
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.pose())
+
+    def portable(self, confidence: bool = True) -> PortableAvatar:
+        """Return the avatar as it was read."""
+        return self._avatar
+
+    def mesh(self) -> MeshModel:
+        """Refuse: the texture coordinates are only in a run."""
+        raise self._only_in_a_run()
+
+    def pose(self) -> Gaussians:
+        """Return the Gaussians at rest."""
+        posed = runtime.Avatar(self._avatar).pose(head_rotation=(0, 0, 0), head_translation=(0, 0, 0))
+        arrays = (posed.means, posed.quats, posed.scales, posed.opacities, posed.sh)
+        pose = None if posed.T_world_local is None else torch.from_numpy(posed.T_world_local.copy())
+        return in_world(Gaussians(*(torch.from_numpy(array.copy()) for array in arrays), T_world_local=pose))
+
+    def poses(self) -> None:
+        """Return None: a file is exported at rest."""
+
+    def motion(self) -> None:
+        """Return None: a file is exported at rest."""
+
+    def trained(self) -> tuple[Avatar, FaceParams]:
+        """Refuse: what was trained is only in a run."""
+        raise self._only_in_a_run()
+
+    def _only_in_a_run(self) -> UserError:
+        return UserError(f"{self._source}: does not have all that this format needs; export it from its workspace")
+
+
+def convert(source: Path, out: Path, kind: Format, options: Options) -> None:
+    """Write the avatar in a file in another format, at rest with the head at the origin, and report it.
+
+    Raises:
+        UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
+    """
+    content = FileContent(source)
+    kind.write(out, content, options)
+    say(f"{out}: {content.name!r} of {source}, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def export(content: RunContent, out: Path, kind: Format, options: Options) -> None:
+    """Write the avatar of a run in a format, and report it. A motion becomes numbered files if a file holds one pose.
+
+    Raises:
+        UserError: the avatar cannot be written so, or a file cannot be written.
+    """
+    moving = content.poses() if kind.holds == "pose" else None
+    if moving is None:
+        first, *notes = kind.write(out, content, options).splitlines()
+        say(f"{out}: {first}")
+        for note in notes:
+            say(note)
+        return
+    written = []
+    for index, gaussians in enumerate(moving[0]):
+        written.append(numbered(out, index))
+        kind.write(written[-1], content.still(gaussians), options)
+    say(f"{written[0]} ... {written[-1].name}: {len(written)} files")

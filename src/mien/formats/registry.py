@@ -1,0 +1,55 @@
+"""The list of formats. A new format is one file in this folder and one line here (CONTRIBUTING.md, "Add a format").
+
+Other packages add formats by entry points of the group `mien.formats`.
+"""
+
+from pathlib import Path
+
+from mien.errors import UserError
+from mien.formats.format import Format
+from mien.formats.gaussian_avatars import GAUSSIAN_AVATARS
+from mien.formats.glb import GLB
+from mien.formats.mien import MIEN
+from mien.formats.page import PACKED, PAGE
+from mien.formats.ply import PLY
+from mien.formats.sog import SOG
+from mien.formats.spz import SPZ
+from mien.formats.usd import USD
+from mien.plugins import plugins
+
+_OWN = (MIEN, PAGE, PACKED, GLB, PLY, SPZ, SOG, USD, GAUSSIAN_AVATARS)
+
+
+def formats() -> list[Format]:
+    """Return all formats: mien's own first, then those of other packages.
+
+    Raises:
+        UserError: a format of another package cannot be imported, or has the name or an ending of one before it.
+    """
+    found: list[Format] = list(_OWN)
+    for name, added in plugins("mien.formats", Format).items():
+        taken = {word for each in found for word in (each.name, *each.endings)}
+        if clash := taken & {added.name, *added.endings}:
+            raise UserError(f"the format {name!r}: {min(clash)} is taken by another format; uninstall its package")
+        found.append(added)
+    return found
+
+
+def endings(only_from_files: bool = False) -> list[str]:
+    """Return the endings of all formats, or of those that an avatar in a file can be written as."""
+    return [ending for each in formats() if each.from_files or not only_from_files for ending in each.endings]
+
+
+def format_of(path: Path) -> Format | None:
+    """Return the format of a file by its ending, in any case; None if there is none."""
+    return next((each for each in formats() if path.suffix.lower() in each.endings), None)
+
+
+def find_format(name: str) -> Format | None:
+    """Return a format by its name, or by an ending without its dot; None if there is none."""
+    return next((each for each in formats() if each.name == name or f".{name}" in each.endings), None)
+
+
+def numbered(path: Path, index: int) -> Path:
+    """Return the path of one frame of a motion, for formats that hold one pose: NAME_000000.ply."""
+    return path.with_name(f"{path.stem}_{index:06d}{path.suffix.lower()}")
