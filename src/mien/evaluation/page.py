@@ -170,7 +170,7 @@ def metric_groups() -> list[Cell]:
     return [Cell("Whole frame", "group", len(COLUMNS)), Cell("Head crop", "group head", len(COLUMNS))]
 
 
-def figure_text(value: float | None, digits: int) -> str:
+def figure_text(value: float | int | None, digits: int) -> str:
     """A figure of a table. A missing one is a dash."""
     return "–" if value is None else f"{value:.{digits}f}"
 
