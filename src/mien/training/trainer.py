@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from mien import _native
@@ -41,7 +42,6 @@ from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.contribution import tidy
 from mien.training.coverage import coverage, telling_frames
 from mien.training.density_control import density_strategy
-from mien.training.density_control.gradient import GradientStrategy
 from mien.training.face_track import FaceTrack, turns_from_mean
 from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
@@ -66,8 +66,6 @@ from mien.training.vertex_colors import vertex_colors
 _STEADY_EVERY = 25
 """Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
 
-_AFTER_RESET = 0.03
-"""Time after a reset of opacities in which nothing is judged by its contribution, as a fraction of the run."""
 _TELLING = 12
 """Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
 
@@ -338,19 +336,18 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
 
 def _tidy(state: TrainingState, data: TrainingData, settings: TrainSettings, *, changed: bool) -> None:
     """Remove Gaussians of a filled head that pictures do not show, after a round of density control and at the end."""
-    unseen, strategy, last = state.unseen, state.density, state.step >= settings.steps
+    unseen, last = state.unseen, state.step >= settings.steps
     if unseen is None or not unseen.fills or not (changed or last) or not data.telling:
         return
-    if not isinstance(strategy, GradientStrategy):
-        return
-    since = (state.step / settings.steps - time for time in strategy.resets)
-    if any(0 <= time < _AFTER_RESET for time in since) and not last:
-        return
-    views = [
-        (state.track.face(state.track.index_of(frame.sequence, frame.timestep)).detach(), data.camera(frame))
-        for frame in data.telling
-    ]
-    strategy.remove(state.avatar.gaussian_store(), tidy(state.avatar, unseen, views, close=not last))
+
+    def redundant() -> Bool[Tensor, " n"]:
+        views = [
+            (state.track.face(state.track.index_of(frame.sequence, frame.timestep)).detach(), data.camera(frame))
+            for frame in data.telling
+        ]
+        return tidy(state.avatar, unseen, views, close=not last)
+
+    state.density.thin(state.avatar.gaussian_store(), state.step / settings.steps, redundant)
 
 
 def passed(before: int, now: int, every: int) -> bool:

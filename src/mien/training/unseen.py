@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar, DensityControl, GaussianStore, GradientDensity, Photometric, SurfacePrior
+from mien.avatar import Avatar, DensityControl, GaussianStore, Photometric, SurfacePrior
 from mien.face import FaceModel, FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.rendering import Rendering
@@ -105,7 +105,7 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
 def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
     """The avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
     density = avatar.density()
-    if unseen is None or unseen.prior.closed is None or not isinstance(density, GradientDensity):
+    if unseen is None or unseen.prior.closed is None:
         return density
 
     def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
@@ -115,9 +115,7 @@ def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
         return ~closed[triangles]
 
     made_up = unseen.made_up(avatar)
-    fills = 0 if made_up is None else int(made_up.sum())
-    settings = replace(density.settings, max_gaussians=density.settings.max_gaussians + fills)
-    return replace(density, settings=settings, may_reset=may_reset)
+    return density.sparing(may_reset, 0 if made_up is None else int(made_up.sum()))
 
 
 @torch.no_grad()
