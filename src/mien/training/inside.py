@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mien.avatar import Avatar, Posed
+from mien.avatar import Avatar, BoundSurface, Posed
 from mien.gaussians import sh_from_rgb
 from mien.training.completion import complete_colors
 from mien.training.coverage import Coverage
@@ -34,10 +34,10 @@ class Inside:
     colors: Float[Tensor, "f 3"]
     """Colours that are plausible, 0..1: a dark mouth with light teeth."""
 
-    def furnish(self, avatar: Avatar, step: int, steps: int) -> None:
+    def furnish(self, surface: BoundSurface, step: int, steps: int) -> None:
         """Close the surface where it is open, if this is a step of a run of `steps` at which this is due."""
         if step == round(_FURNISH_AT * steps):
-            avatar.furnish(self.triangles, _OPAQUE, self.colors)
+            surface.furnish(self.triangles, _OPAQUE, self.colors)
 
     def to(self, like: Tensor) -> "Inside":
         """The same on the device of `like`, with colours of its dtype."""
@@ -63,10 +63,10 @@ def disguise(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None, ra
     places and sizes do have one, and so they leave where they do not belong. Gaussians of methods that bind none to
     triangles stay as they are.
     """
-    triangles = avatar.triangles()
-    if hidden is None or triangles is None:
+    surface = avatar.surface()
+    if hidden is None or surface is None:
         return posed
-    gaussians, own = posed.gaussians, hidden[triangles]
+    gaussians, own = posed.gaussians, hidden[surface.triangles()]
     color = sh_from_rgb(torch.rand(3, generator=random)).to(gaussians.sh, non_blocking=True)
     # Only on a CPU are rows found without waiting for the device.
     disguised = _Disguised.apply if gaussians.sh.device.type == "cpu" else disguised_reference

@@ -16,6 +16,7 @@ from mien import _native
 from mien.avatar import (
     Avatar,
     FaceTuning,
+    Lessons,
     MethodConfig,
     Progress,
     load_avatar,
@@ -116,7 +117,7 @@ def train(
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
         state = start(sequences, face_model, method_config, settings, like)
-        covers = settings.inside != "free" and state.avatar.triangles() is not None
+        covers = settings.inside != "free" and state.avatar.surface() is not None
         inside = inside_triangles(face_model) if covers else None
         parts_of = face_model if method_config.photometric.needs_parts or inside is not None else None
         settings = resolved(settings, filled=state.unseen is not None and state.unseen.fills)
@@ -151,8 +152,9 @@ def _train_to_the_end(
         targets_ahead(data.order, data.targets, settings) as ahead,
     ):
         data = replace(data, ahead=ahead)
-        if state.step == 0 and state.avatar.lesson_count > 0:
-            _teach(state, settings, progress, stop)
+        lessons = state.avatar.extras.lessons
+        if state.step == 0 and lessons is not None:
+            _teach(lessons, state, settings, progress, stop)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 before = state.step
@@ -170,12 +172,11 @@ def _train_to_the_end(
         _check_finite(run_dir, state)
 
 
-def _teach(state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put) -> None:
+def _teach(lessons: Lessons, state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put) -> None:
     """Give the avatar its lessons. A run that stops here starts again, as nothing was trained."""
-    avatar = state.avatar
-    with torch.random.fork_rng(devices=[]), progress("lessons in the face's motion", avatar.lesson_count, 0) as advance:
+    with torch.random.fork_rng(devices=[]), progress("lessons in the face's motion", lessons.count, 0) as advance:
         torch.manual_seed(settings.seed)
-        for _ in avatar.lessons(state.track.params()):
+        for _ in lessons.teach(state.track.params()):
             advance()
             stop.follow()
 
@@ -236,18 +237,20 @@ def start(
     seen = face[[starts[frame.sequence] + frame.timestep for frame in frames]]
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
     avatar.filmed = measure_filmed(seen, avatar.subject, eyes)
-    if avatar.wants_first_colors:
-        avatar.paint(vertex_colors(face_model, sequences, faces, frames))
+    surface = avatar.surface()
+    if surface is not None and surface.wants_first_colors:
+        surface.paint(vertex_colors(face_model, sequences, faces, frames))
     colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
-    unseen, filled = None, fills_sides(frames, settings, bound=avatar.triangles() is not None)
-    if filled or avatar.wants_surface:
+    unseen, filled = None, fills_sides(frames, settings, bound=surface is not None)
+    if filled or (surface is not None and surface.limited):
         unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
-        avatar.close(unseen.prior)
+        if surface is not None:
+            surface.close(unseen.prior)
         if unseen.coverage is not None:
             neutral = face_model.head_vertices(avatar.subject)[0].detach()
             avatar.filmed = with_shown_angles(avatar.filmed, face_model, neutral, unseen.coverage)
     inside = None
-    if settings.inside == "furnished" and avatar.triangles() is not None:
+    if settings.inside == "furnished" and surface is not None:
         known = None if unseen is None else unseen.coverage
         inside = inside_of(avatar, coverage(face_model, sequences, faces, frames) if known is None else known)
     away = turns_from_mean(face)
@@ -281,20 +284,21 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     """
     began = time.perf_counter()
     avatar, perceptual = state.avatar, state.avatar.config.photometric.perceptual
+    surface = avatar.surface()
     batch = next_batch(state, data, settings)
     epoch = data.order.at(state.step)[1]
     progress = Progress(state.step, settings.steps, epoch, data.extent, len(batch))
-    if state.inside is not None:
+    if state.inside is not None and surface is not None:
         for one in batch:
-            state.inside.furnish(avatar, one.number, settings.steps)
+            state.inside.furnish(surface, one.number, settings.steps)
     whole, posed, renderings = draw(state, data, settings, batch, progress)
     shown = [one.seen(rendering, state) for one, rendering in zip(batch, renderings, strict=True)]
     losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
     losses |= compare_features(state, batch, shown)
     losses |= compare_aside(state, data, settings, batch, progress)
     torch.autograd.backward(list(losses.values()))
-    if state.hair is not None:
-        state.hair.collect(avatar, state.step / settings.steps)
+    if state.hair is not None and surface is not None:
+        state.hair.collect(surface, state.step / settings.steps)
     if state.unseen is not None:
         state.unseen.guard(avatar, *renderings)
 
@@ -309,13 +313,13 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
         state.track.steady_pose()
     random = partial(density_random, settings, state.step)
     changed = state.density.adapt(avatar.gaussian_store(), posed[0], progress, random)
-    if state.unseen is not None:
-        avatar.keep_to(state.unseen.prior)
+    if state.unseen is not None and surface is not None:
+        surface.keep_to(state.unseen.prior)
 
     before = state.step
     state.step += len(batch)
     hair = state.hair if passed(before, state.step, EVERY) else None
-    if hair is not None and hair.correct(avatar, state.step / settings.steps, settings.hair_rate):
+    if hair and surface and hair.correct(surface, state.step / settings.steps, settings.hair_rate):
         state.follow_hair()
     _tidy(state, data, settings, changed=changed)
     elapsed = time.perf_counter() - began

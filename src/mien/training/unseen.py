@@ -68,8 +68,8 @@ class Unseen:
 
     def made_up(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
-        triangles = avatar.triangles()
-        return None if self.prior.made_up is None or triangles is None else self.prior.made_up[triangles]
+        surface = avatar.surface()
+        return None if self.prior.made_up is None or surface is None else self.prior.made_up[surface.triangles()]
 
     def guard(self, avatar: Avatar, *renderings: Rendering) -> None:
         """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
@@ -109,10 +109,10 @@ def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
         return density
 
     def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
-        closed, triangles = unseen.prior.closed, avatar.triangles()
+        closed, surface = unseen.prior.closed, avatar.surface()
         assert closed is not None
-        assert triangles is not None
-        return ~closed[triangles]
+        assert surface is not None
+        return ~closed[surface.triangles()]
 
     made_up = unseen.made_up(avatar)
     return density.sparing(may_reset, 0 if made_up is None else int(made_up.sum()))
@@ -136,7 +136,7 @@ def unseen_of(
     colors = complete_colors(model, neutral, seen, found.colors)
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
-    if avatar.triangles() is None:
+    if avatar.surface() is None:
         return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
     made_up = (shown < _RARE) & (found.above > 0.5)
     made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)
