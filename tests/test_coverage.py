@@ -155,7 +155,7 @@ def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> 
     unseen = known(toy, avatar)
     surface_of(avatar).close(unseen.prior)
     before = avatar.gaussian_store()["opacity_logits"].sigmoid()
-    control, fills = spare_fills(avatar, unseen), unseen.made_up(avatar)
+    control, fills = spare_fills(avatar, avatar.density(), unseen), unseen.made_up(avatar)
     assert isinstance(control, GradientDensity)
     assert fills is not None
     assert control.settings.max_gaussians == GaussianAvatarsConfig().density.max_gaussians + int(fills.sum())
@@ -178,7 +178,7 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
     weights = Photometric(alpha_weight=0.0)
     assert unseen.weights(weights) == weights
     density = avatar.density()
-    assert type(spare_fills(avatar, unseen)) is type(density)
+    assert type(spare_fills(avatar, avatar.density(), unseen)) is type(density)
     assert avatar.surface() is None
 
 

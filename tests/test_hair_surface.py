@@ -11,9 +11,12 @@ from mien.avatar.gaussian_avatars import GaussianAvatars
 from mien.face import FaceModel, load_face_model
 from mien.face.mirror import triangle_geometry
 from mien.training import PRESETS, Sequence, TrainSettings, read_training_summary, train
+from mien.training.frames import training_frames
 from mien.training.hair_surface import HairSurface, hair_surface
 from mien.training.head_parts import head_parts
+from mien.training.parts import Preparation
 from mien.training.trainer import start
+from mien.training.whole_head import prepare_whole_head
 from toy_scene import surface_of, toy_sequence
 
 _HAIR, _RATE = 0.02, 1e-3
@@ -134,16 +137,20 @@ def _toy_with_scalp() -> tuple[FaceModel, Sequence]:
 
 def test_limits_and_side_views_follow_the_hair():
     model, sequence = _toy_with_scalp()
-    state = start([sequence], model, CONFIG, replace(SETTINGS, side_weight=0.1))
-    assert state.hair is not None
-    assert state.unseen is not None
-    assert state.aside is not None
-    height = state.aside.height
-    state.hair.state["shift"] += 0.01
-    state.follow_hair()
+    settings = replace(SETTINGS, side_weight=0.1)
+    avatar = start([sequence], model, CONFIG, settings).avatar
+    faces, frames = [sequence.tracking.face], training_frames([sequence], settings)
+    make = prepare_whole_head(Preparation(avatar, model, [sequence], faces, frames, settings, torch.zeros(())))
+    assert make is not None
+    head = make()
+    assert head.hair is not None
+    assert head.aside is not None
+    height = head.aside.height
+    state = head.part().state()
+    head.part().load_state(state | {"shift": state["shift"] + 0.01})
     scalp = head_parts(model).scalp
-    torch.testing.assert_close(state.unseen.prior.hair[scalp], state.hair.start.hair[scalp] + 0.01)
-    assert float(state.aside.height.max()) > float(height.max())
+    torch.testing.assert_close(head.unseen.prior.hair[scalp], head.hair.start.hair[scalp] + 0.01)
+    assert float(head.aside.height.max()) > float(height.max())
 
 
 def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:

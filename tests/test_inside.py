@@ -119,7 +119,8 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
     assert (prior.looseness[inside] > 1).all()
     assert (prior.looseness[~inside] == 1).all()
     surface_of(avatar).close(prior)
-    density, store = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store()), avatar.gaussian_store()
+    store = avatar.gaussian_store()
+    density = density_strategy(spare_fills(avatar, avatar.density(), unseen), store)
     density.adapt(store, avatar.pose(sequence.tracking.face[0]), Progress(39, 100, 0, 1.0), torch.Generator)
     own = inside[store["face_index"]]
     assert (store["opacity_logits"].sigmoid()[own] > 0.9).all()

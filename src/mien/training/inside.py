@@ -16,7 +16,10 @@ from mien.avatar import Avatar, BoundSurface, Posed
 from mien.gaussians import sh_from_rgb
 from mien.training.completion import complete_colors
 from mien.training.coverage import Coverage
+from mien.training.frames import disguise_random
 from mien.training.head_parts import head_parts
+from mien.training.hidden import inside_triangles
+from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
 
 _FURNISH_AT = 0.5
 """Time at which an open surface inside the mouth is closed, as a fraction of the run: after the last opacity reset of
@@ -42,6 +45,27 @@ class Inside:
     def to(self, like: Tensor) -> "Inside":
         """The same on the device of `like`, with colours of its dtype."""
         return Inside(self.triangles.to(like.device), self.colors.to(like))
+
+
+def prepare_inside(given: Preparation) -> TrainingPart | None:
+    """The part of a training that covers and furnishes what is inside a head, if the settings ask for it."""
+    avatar, surface, settings = given.avatar, given.avatar.surface(), given.settings
+    if settings.inside == "free" or surface is None:
+        return None
+
+    def covered(posed: Posed, one: BatchFrame) -> Posed:
+        return disguise(posed, avatar, one.target.hidden, disguise_random(settings, one.number))
+
+    hideable = inside_triangles(given.face_model)
+    if settings.inside == "covered":
+        return TrainingPart("inside", hideable, posed=covered)
+    inside = inside_of(avatar, given.coverage).to(given.like)
+
+    def furnish(step: Step) -> None:
+        for one in step.batch:
+            inside.furnish(surface, one.number, settings.steps)
+
+    return TrainingPart("inside", hideable, posed=covered, before_step=furnish)
 
 
 @torch.no_grad()

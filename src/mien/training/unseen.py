@@ -102,10 +102,9 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
     return settings.unseen == "filled"
 
 
-def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
-    """The avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
-    density = avatar.density()
-    if unseen is None or unseen.prior.closed is None:
+def spare_fills(avatar: Avatar, density: DensityControl, unseen: Unseen) -> DensityControl:
+    """An avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
+    if unseen.prior.closed is None:
         return density
 
     def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
