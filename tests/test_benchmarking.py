@@ -132,7 +132,7 @@ def test_a_mono_gaussian_avatar_case_trains() -> None:
 
 def test_times_of_a_step_are_those_of_one_frame() -> None:
     state, _ = mono_step.mono_case(load_face_model(), 3000, (64, 48), frames=4)
-    assert state.avatar.frames_per_step == 4
+    assert state.avatar.extras.frames_per_step() == 4
     assert mono_step.per_frame(Timing(8.0, 12.0, 16.0), 4) == Timing(2.0, 3.0, 4.0)
 
 

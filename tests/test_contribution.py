@@ -17,6 +17,7 @@ from mien.training.contribution import contributions, tidy
 from mien.training.coverage import triangle_views
 from mien.training.head_parts import head_parts
 from mien.training.unseen import Unseen
+from toy_scene import surface_of
 
 _COLOR = 0.3
 
@@ -38,7 +39,7 @@ def _closed_avatar(model: FaceModel) -> GaussianAvatars:
     avatar = method_named("gaussian_avatars").avatar(config, model, _view(model)[0])
     assert isinstance(avatar, GaussianAvatars)
     every = torch.ones(len(model.faces), dtype=torch.bool)
-    avatar.furnish(every, 0.97, torch.full((len(model.faces), 3), 0.6))
+    surface_of(avatar).furnish(every, 0.97, torch.full((len(model.faces), 3), 0.6))
     return avatar
 
 
@@ -111,7 +112,7 @@ def test_hidden_copies_below_what_is_shown_go(anny):
     n = len(avatar.store)
     _doubled(avatar.store, rows)
     means = avatar.store["means"].detach()
-    means[n:, 1] -= 0.01 / avatar._sizes[rows]
+    means[n:, 1] -= 0.01 / surface_of(avatar).sizes[rows]
     removed = tidy(avatar, _unseen(anny, _none(anny)), [view], close=True)
     assert not removed[rows].any()
     assert float(removed[n:].float().mean()) > 0.8
@@ -127,7 +128,7 @@ def test_what_stays_becomes_a_surface_in_completed_colours(anny, close):
     tidy(avatar, unseen, [view], close=close)
     torch.testing.assert_close(rgb_from_sh(store["sh_constant"][back, 0]), torch.full((int(back.sum()), 3), _COLOR))
     shapes = triangle_ellipses(anny.head_vertices(avatar.subject)[0], anny.faces)[1]
-    height = store["means"].detach()[:, 1] * avatar._sizes
+    height = store["means"].detach()[:, 1] * surface_of(avatar).sizes
     if close:
         assert (store["opacity_logits"].detach()[back].sigmoid() > 0.9).all()
         wide = store["log_scales"].detach()[back] - shapes[back]

@@ -37,7 +37,7 @@ from mien.training.density_control import density_strategy
 from mien.training.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
 from mien.training.frames import Frame, training_frames
 from mien.training.unseen import Unseen, spare_fills, unseen_of
-from toy_scene import toy_face, toy_sequence
+from toy_scene import surface_of, toy_face, toy_sequence
 
 SETTINGS = TrainSettings(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)
 
@@ -124,7 +124,7 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     unseen = known(toy, avatar)
-    avatar.close(unseen.prior)
+    surface_of(avatar).close(unseen.prior)
     made_up = unseen.made_up(avatar)
     assert made_up is not None
     assert made_up.any()
@@ -153,9 +153,9 @@ def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> 
     model, sequence = toy
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     unseen = known(toy, avatar)
-    avatar.close(unseen.prior)
+    surface_of(avatar).close(unseen.prior)
     before = avatar.gaussian_store()["opacity_logits"].sigmoid()
-    control, fills = spare_fills(avatar, unseen), unseen.made_up(avatar)
+    control, fills = spare_fills(avatar, avatar.density(), unseen), unseen.made_up(avatar)
     assert isinstance(control, GradientDensity)
     assert fills is not None
     assert control.settings.max_gaussians == GaussianAvatarsConfig().density.max_gaussians + int(fills.sum())
@@ -178,11 +178,8 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
     weights = Photometric(alpha_weight=0.0)
     assert unseen.weights(weights) == weights
     density = avatar.density()
-    assert type(spare_fills(avatar, unseen)) is type(density)
-    before = avatar.gaussian_store()["means"].clone()
-    avatar.close(unseen.prior)
-    avatar.keep_to(unseen.prior)
-    assert torch.equal(avatar.gaussian_store()["means"], before)
+    assert type(spare_fills(avatar, avatar.density(), unseen)) is type(density)
+    assert avatar.surface() is None
 
 
 def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
@@ -191,7 +188,7 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     made_up = facing(model) <= 0
     colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(made_up), 3)
-    avatar.close(SurfacePrior(torch.zeros(len(made_up)), None, colors, made_up.float(), made_up))
+    surface_of(avatar).close(SurfacePrior(torch.zeros(len(made_up)), None, colors, made_up.float(), made_up))
     assert len(avatar.gaussian_store()) == len(made_up)
     vertices = model.head_vertices(avatar.subject)[0]
     camera = view_of_head(vertices, 180)
@@ -202,7 +199,7 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     color = rendering.image[middle, middle].reshape(-1, 3).mean(0)
     torch.testing.assert_close(color, colors[0], atol=0.03, rtol=0)
     hair = SurfacePrior(torch.full((len(made_up),), 0.02), None, colors, made_up.float(), made_up)
-    avatar.close(hair)
+    surface_of(avatar).close(hair)
     assert (avatar.gaussian_store()["means"][:, 1] > 0).all()
 
 
@@ -213,10 +210,10 @@ def test_colours_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Seque
     before = avatar.gaussian_store()["sh_constant"].detach().clone()
     prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt)
     for _ in range(200):
-        avatar.keep_to(replace(prior, made_up=doubt > 0))
+        surface_of(avatar).keep_to(replace(prior, made_up=doubt > 0))
     assert torch.equal(avatar.gaussian_store()["sh_constant"], before), "what is made up keeps its colours"
     for _ in range(200):
-        avatar.keep_to(prior)
+        surface_of(avatar).keep_to(prior)
     colors = avatar.gaussian_store()["sh_constant"].detach()
     assert torch.equal(colors[doubt == 0], before[doubt == 0])
     torch.testing.assert_close(rgb_from_sh(colors[doubt > 0][:, 0]), torch.ones(int(doubt.sum()), 3), atol=1e-3, rtol=0)
@@ -230,9 +227,11 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Seque
     hanging = 0.05 * (torch.arange(count) % 2).float()
     with torch.no_grad():
         avatar.gaussian_store()["means"][:, 1] = 1e3
-    avatar.keep_to(SurfacePrior(torch.zeros(count), hanging, None, None, torch.zeros(count, dtype=torch.bool)))
-    bound, limits = avatar.gaussian_store()["face_index"], avatar.config.surface
-    height = avatar.gaussian_store()["means"][:, 1] * avatar._sizes[bound]
+    surface_of(avatar).keep_to(
+        SurfacePrior(torch.zeros(count), hanging, None, None, torch.zeros(count, dtype=torch.bool))
+    )
+    bound, limits = avatar.gaussian_store()["face_index"], GaussianAvatarsConfig().surface
+    height = avatar.gaussian_store()["means"][:, 1] * surface_of(avatar).sizes[bound]
     torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
 
 

@@ -17,7 +17,7 @@ from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, world_means
 from mien.render import rasterize
 from mien.render.rendering import Rendering
-from toy_scene import toy_camera, toy_face, toy_face_model
+from toy_scene import surface_of, toy_camera, toy_face, toy_face_model
 
 
 def new_avatar(config: GaussianAvatarsConfig | None = None, face_model: FaceModel | None = None) -> GaussianAvatars:
@@ -43,11 +43,11 @@ def test_starts_with_one_grey_faint_gaussian_a_triangle() -> None:
 def test_first_colours_are_the_means_of_the_triangles_corners() -> None:
     """Every Gaussian gets its own triangle's colour, also if the Gaussians are in another order than the triangles."""
     avatar = new_avatar(GaussianAvatarsConfig(sh_degree=1, first_colors="pictures"))
-    assert avatar.wants_first_colors
-    assert not new_avatar().wants_first_colors
+    assert surface_of(avatar).wants_first_colors
+    assert not surface_of(new_avatar()).wants_first_colors
     avatar.store.select(torch.arange(len(avatar.store)).flip(0)[:20])
     colors = torch.rand(len(avatar.face_model.template), 3)
-    avatar.paint(colors)
+    surface_of(avatar).paint(colors)
     expected = colors[avatar.face_model.faces.flip(0)[:20]].mean(1)
     torch.testing.assert_close(rgb_from_sh(avatar.store["sh_constant"][:, 0]), expected)
     assert not avatar.store["sh_rest"].any()

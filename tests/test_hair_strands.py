@@ -11,6 +11,7 @@ from mien.gaussians import rgb_from_sh
 from mien.rotation import matrix_from_quaternion
 from mien.training import PRESETS
 from mien.training.head_parts import head_parts
+from toy_scene import surface_of
 
 _HEIGHT = 0.02
 
@@ -82,12 +83,12 @@ def test_a_closed_head_has_strands_that_keep_their_colours(anny):
     bald = len(avatar.store)
     chosen, color = _back(anny), torch.full((count, 3), 0.4)
     hair, doubt = torch.full((count,), _HEIGHT), chosen.float()
-    avatar.close(SurfacePrior(hair, colors=color, doubt=doubt, made_up=chosen, strands=chosen))
+    surface_of(avatar).close(SurfacePrior(hair, colors=color, doubt=doubt, made_up=chosen, strands=chosen))
     own = len(_strands(anny)["means"])
     assert len(avatar.store) == bald + own
     before = avatar.store["sh_constant"][bald:].detach().clone()
     for _ in range(20):
-        avatar.keep_to(SurfacePrior(hair, colors=color, doubt=doubt, made_up=chosen, strands=chosen))
+        surface_of(avatar).keep_to(SurfacePrior(hair, colors=color, doubt=doubt, made_up=chosen, strands=chosen))
     assert avatar.store["sh_constant"][bald:].equal(before)
 
 

@@ -11,10 +11,13 @@ from mien.avatar.gaussian_avatars import GaussianAvatars
 from mien.face import FaceModel, load_face_model
 from mien.face.mirror import triangle_geometry
 from mien.training import PRESETS, Sequence, TrainSettings, read_training_summary, train
+from mien.training.frames import training_frames
 from mien.training.hair_surface import HairSurface, hair_surface
 from mien.training.head_parts import head_parts
+from mien.training.parts import Preparation
 from mien.training.trainer import start
-from toy_scene import toy_sequence
+from mien.training.whole_head import prepare_whole_head
+from toy_scene import surface_of, toy_sequence
 
 _HAIR, _RATE = 0.02, 1e-3
 CONFIG = PRESETS["draft"].config("gaussian_avatars")
@@ -52,9 +55,9 @@ def _pull(avatar: GaussianAvatars, surface: HairSurface, slope: float, rounds: i
     for _ in range(rounds):
         means = avatar.store["means"]
         means.grad = torch.zeros_like(means)
-        means.grad[:, 1] = slope * avatar._sizes[avatar.store["face_index"]]
-        surface.collect(avatar, 0.1)
-        surface.correct(avatar, 0.1, _RATE)
+        means.grad[:, 1] = slope * surface_of(avatar).sizes[avatar.store["face_index"]]
+        surface.collect(surface_of(avatar), 0.1)
+        surface.correct(surface_of(avatar), 0.1, _RATE)
 
 
 def test_the_gradient_of_the_height_is_that_of_the_posed_gaussians(anny):
@@ -65,9 +68,9 @@ def test_the_gradient_of_the_height_is_that_of_the_posed_gaussians(anny):
     means = avatar.pose(avatar.subject).gaussians.means.reshape(-1, 3)
     assert len(face) == 1
     (means * normals).sum().backward()
-    gradient = avatar.height_gradient()
+    gradient = surface_of(avatar).height_gradient()
     assert gradient is not None
-    big = avatar._sizes > 1e-3
+    big = surface_of(avatar).sizes > 1e-3
     torch.testing.assert_close(gradient[big], torch.ones_like(gradient)[big], rtol=0.01, atol=0.01)
 
 
@@ -82,7 +85,7 @@ def test_hair_moves_against_the_slope(anny, slope):
     front = scalp & ~(prior.made_up if prior.made_up is not None else scalp)
     assert (shift[front] * slope < -0.5 * _RATE).all()
     assert float((shift[front] * slope).median()) < -3 * _RATE
-    moved = (avatar.store["means"].detach()[:, 1] - before) * avatar._sizes
+    moved = (avatar.store["means"].detach()[:, 1] - before) * surface_of(avatar).sizes
     torch.testing.assert_close(moved, shift, atol=1e-6, rtol=1e-4)
     torch.testing.assert_close(surface.prior().hair, (prior.hair + shift).clamp_min(0))
 
@@ -120,8 +123,8 @@ def test_outside_of_its_time_nothing_moves(anny):
     means = avatar.store["means"]
     for fraction, rate in ((0.01, _RATE), (0.7, _RATE), (0.2, 0.0)):
         means.grad = torch.ones_like(means)
-        surface.collect(avatar, 0.1)
-        surface.correct(avatar, fraction, rate)
+        surface.collect(surface_of(avatar), 0.1)
+        surface.correct(surface_of(avatar), fraction, rate)
         assert not surface.shift.any()
         assert not surface.state["gradient"].any()
 
@@ -134,16 +137,20 @@ def _toy_with_scalp() -> tuple[FaceModel, Sequence]:
 
 def test_limits_and_side_views_follow_the_hair():
     model, sequence = _toy_with_scalp()
-    state = start([sequence], model, CONFIG, replace(SETTINGS, side_weight=0.1))
-    assert state.hair is not None
-    assert state.unseen is not None
-    assert state.aside is not None
-    height = state.aside.height
-    state.hair.state["shift"] += 0.01
-    state.follow_hair()
+    settings = replace(SETTINGS, side_weight=0.1)
+    avatar = start([sequence], model, CONFIG, settings).avatar
+    faces, frames = [sequence.tracking.face], training_frames([sequence], settings)
+    make = prepare_whole_head(Preparation(avatar, model, [sequence], faces, frames, settings, torch.zeros(())))
+    assert make is not None
+    head = make()
+    assert head.hair is not None
+    assert head.aside is not None
+    height = head.aside.height
+    state = head.part().state()
+    head.part().load_state(state | {"shift": state["shift"] + 0.01})
     scalp = head_parts(model).scalp
-    torch.testing.assert_close(state.unseen.prior.hair[scalp], state.hair.start.hair[scalp] + 0.01)
-    assert float(state.aside.height.max()) > float(height.max())
+    torch.testing.assert_close(head.unseen.prior.hair[scalp], head.hair.start.hair[scalp] + 0.01)
+    assert float(head.aside.height.max()) > float(height.max())
 
 
 def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
@@ -171,4 +178,4 @@ def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     assert read_training_summary(tmp_path / "still")["steps"] == 64
     moved = (tmp_path / "whole" / "avatar/avatar.safetensors").read_bytes()
     assert moved != (tmp_path / "still" / "avatar/avatar.safetensors").read_bytes()
-    assert still.triangles() is not None
+    assert still.surface() is not None

@@ -223,4 +223,4 @@ def test_what_cannot_be_baked_says_so_in_one_line(variant: Variant) -> None:
     with pytest.raises(UserError, match=rf"^the variant {variant} of headgas: .*export a \.ply") as caught:
         make_portable(avatar, toy_camera(32), "toy")
     assert "\n" not in str(caught.value)
-    assert new_avatar("full").unbaked is None
+    assert new_avatar("full").extras.unbaked is None

@@ -19,6 +19,7 @@ from mien.training import PRESETS, TrainSettings
 from mien.training.frames import Frame, resolved
 from mien.training.side_views import SideViews, side_views, turned_aside
 from mien.training.unseen import fills_sides
+from toy_scene import surface_of
 
 _PROGRESS = Progress(0, 100, 0, 1.0, 1)
 _HAIR = 0.02
@@ -52,7 +53,9 @@ def _opaque_avatar(model: FaceModel, color: float):
     """One flat opaque Gaussian of one colour on each triangle."""
     torch.manual_seed(0)
     avatar = method_named("gaussian_avatars").avatar(PRESETS["paper"].config("gaussian_avatars"), model, _face(model))
-    avatar.furnish(torch.ones(len(model.faces), dtype=torch.bool), 0.97, torch.full((len(model.faces), 3), color))
+    surface_of(avatar).furnish(
+        torch.ones(len(model.faces), dtype=torch.bool), 0.97, torch.full((len(model.faces), 3), color)
+    )
     return avatar
 
 

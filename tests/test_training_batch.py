@@ -117,7 +117,7 @@ def test_many_points_mean_fewer_frames() -> None:
     store, found = state.avatar.gaussian_store(), []
     for count in (20, 25, 26, 60, 100, 101, 200, 500):
         store.select(torch.arange(count) % len(store))
-        found.append(state.avatar.frames_per_step)
+        found.append(state.avatar.extras.frames_per_step())
     assert found == [8, 8, 7, 3, 2, 1, 1, 1]
     with pytest.raises(UserError, match="frames-per-step 0"):
         replace(SMALL, frames_per_step=0).check()
@@ -127,7 +127,7 @@ def test_many_points_mean_fewer_frames() -> None:
 def test_other_methods_use_one_frame_and_have_no_such_setting(
     method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert new_avatar(method).frames_per_step == 1
+    assert new_avatar(method).extras.frames_per_step() == 1
     assert main(["train", str(tmp_path), "--method", method, "--method.frames-per-step", "4"]) == 2
     assert "frames-per-step" in capsys.readouterr().err
 
@@ -165,7 +165,7 @@ def test_a_stopped_run_ends_with_the_same_bytes(tmp_path: Path) -> None:
         def watch(avatar: Avatar, last: int = crash_after) -> None:
             nonlocal steps
             steps += 1
-            counts.append(avatar.frames_per_step)
+            counts.append(avatar.extras.frames_per_step())
             if steps == last:
                 raise StoppedError
 

@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mien.avatar import Avatar
+from mien.avatar.gaussian_surface import GaussianSurface
 from mien.camera import Camera
 from mien.capture import Capture
 from mien.face import FaceModel, FaceParams
@@ -113,6 +115,13 @@ def toy_sequence(timesteps: int = 10, size: int = 48) -> tuple[FaceModel, Sequen
     face_model = toy_face_model()
     capture, alpha = toy_capture(face_model, timesteps, size)
     return face_model, Sequence("toy", capture, toy_tracking(face_model, timesteps, size), alpha)
+
+
+def surface_of(avatar: Avatar) -> GaussianSurface:
+    """Return the surface of an avatar of GaussianAvatars."""
+    surface = avatar.surface()
+    assert isinstance(surface, GaussianSurface)
+    return surface
 
 
 def _facing(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -8,15 +8,17 @@ if TYPE_CHECKING:
     from mien.avatar.activation import sigmoid
     from mien.avatar.avatar import (
         Avatar,
+        Extras,
+        Lessons,
         ParameterGroup,
         Posed,
-        SurfacePrior,
         move_avatar,
         network_group,
         neutral_of,
         store_group,
     )
     from mien.avatar.baking import as_array, bake_rig, make_portable
+    from mien.avatar.bound_surface import BoundSurface, SurfacePrior
     from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
     from mien.avatar.files import load_avatar, write_avatar
     from mien.avatar.filmed import measure_filmed
@@ -46,8 +48,10 @@ __all__ = [
     "METHODS",
     "TRAINED",
     "Avatar",
+    "BoundSurface",
     "DensityControl",
     "DensityRules",
+    "Extras",
     "FaceTuning",
     "FixedDensity",
     "GaussianAvatars",
@@ -57,6 +61,7 @@ __all__ = [
     "GradientSettings",
     "HeadGas",
     "HeadGasConfig",
+    "Lessons",
     "Method",
     "MethodConfig",
     "Moments",

@@ -5,13 +5,15 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import final
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from mien.adam import FactoredGradient, FactoredMoments, Moments
+from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.density import DensityControl
 from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.settings import MethodConfig
@@ -34,38 +36,6 @@ class Posed:
     gaussians: Gaussians
     aux: Mapping[str, Tensor]
     """Tensors that the method's own regularizers need, computed once."""
-
-
-_FILL_HEIGHT = 0.9
-"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
-
-
-@dataclass(frozen=True, eq=False)
-class SurfacePrior:
-    """What is known of each of the f triangles of a head without training: from the mesh, the mattes and symmetry."""
-
-    hair: Float[Tensor, " f"]
-    """Height of hair along the triangle's normal, in metres; 0 on skin that no hair hangs over."""
-    hanging: Float[Tensor, " f"] | None = None
-    """How far hair that hangs beside skin and neck stands out along the normal, in metres. None means 0."""
-    colors: Float[Tensor, "f 3"] | None = None
-    """Colours, 0..1, completed where no picture shows any. None if nothing was completed."""
-    doubt: Float[Tensor, " f"] | None = None
-    """0 for triangles that pictures show well, 1 for those that none shows. None if nothing was completed."""
-    made_up: Bool[Tensor, " f"] | None = None
-    """Triangles that are filled rather than trained: no picture shows them, and they are above the cut at the neck."""
-    closed: Bool[Tensor, " f"] | None = None
-    """Triangles that are an opaque surface before the first step: the made-up ones, and the inside of the mouth, which
-    is trained where pictures show it. None if these are the made-up ones."""
-    strands: Bool[Tensor, " f"] | None = None
-    """Made-up triangles that are covered with strands of hair. None means none."""
-    looseness: Float[Tensor, " f"] | None = None
-    """Factors on the limits to the surface (`Avatar.keep_to`), for parts that the mesh fits less well. None means 1."""
-
-    @property
-    def fill_height(self) -> Float[Tensor, " f"]:
-        """Height at which a fill lies above its triangle, in metres."""
-        return _FILL_HEIGHT * self.hair
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +77,34 @@ def network_group(name: str, network: nn.Module, rate: Rate) -> ParameterGroup:
     return ParameterGroup(name, dict(network.named_parameters()), rate)
 
 
+def _one() -> int:
+    return 1
+
+
+@dataclass(frozen=True, eq=False)
+class Lessons:
+    """What a new avatar learns before the first step, without pictures."""
+
+    count: int
+    """Number of lessons."""
+    teach: Callable[[FaceParams], Iterator[None]]
+    """Teaches it, given all training timesteps. Yields after each lesson."""
+
+
+@dataclass(frozen=True, eq=False)
+class Extras:
+    """What only some methods have. The defaults are those of most methods."""
+
+    surface: BoundSurface | None = None
+    """The surface that the Gaussians are bound to."""
+    frames_per_step: Callable[[], int] = _one
+    """Returns the number of training frames that the next optimiser step uses."""
+    lessons: Lessons | None = None
+    """What the avatar learns before the first step."""
+    unbaked: str | None = None
+    """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
+
+
 class Avatar(nn.Module, ABC):
     """Canonical Gaussians and how they depend on the face. Results depend only on arguments, not on the order of calls.
 
@@ -114,11 +112,14 @@ class Avatar(nn.Module, ABC):
     timesteps, from which the method may take the subject's shape and statistics. Random numbers come from torch's
     default generator, which the caller seeds. Every tensor that `pose` needs is a parameter, a buffer or in the store.
     Loading is therefore generic: build an avatar with the stored `subject`, then overwrite its tensors.
+
+    Methods implement what is abstract and override nothing else. What only some methods have is in `extras`.
     """
 
-    def __init__(self, config: MethodConfig, face_model: FaceModel, face: FaceParams):
+    def __init__(self, config: MethodConfig, face_model: FaceModel, face: FaceParams, extras: Extras = Extras()):
         super().__init__()
         self.config = config
+        self.extras = extras
         self.face_model = face_model
         self.subject = neutral_of(face)
         """One timestep: this person's identity and offsets, and the face at rest."""
@@ -145,83 +146,18 @@ class Avatar(nn.Module, ABC):
     def density(self) -> DensityControl:
         """The density control, with this method's hooks."""
 
-    @property
-    def frames_per_step(self) -> int:
-        """Number of training frames that the next optimiser step uses. Most methods use one."""
-        return 1
-
-    @property
-    def lesson_count(self) -> int:
-        """Number of lessons before the first step. Most methods need none."""
-        return 0
-
-    def lessons(self, face: FaceParams) -> Iterator[None]:
-        """Teach a new avatar what needs no pictures, given all training timesteps; yields after each lesson."""
-        yield from ()
-
-    @property
-    def wants_first_colors(self) -> bool:
-        """Whether `paint` is to be called before the first step. Most methods learn their colours from nothing."""
-        return False
-
-    def paint(self, colors: Float[Tensor, "v 3"]) -> None:
-        """Take the face model's vertices' mean colours in the training pictures, 0..1, as first colours."""
-
-    def triangles(self) -> Int[Tensor, " n"] | None:
-        """The triangle that each Gaussian is bound to. None for methods that bind none, which train on all pixels."""
-        return None
-
-    @property
-    def wants_surface(self) -> bool:
-        """Whether `keep_to` is to be called after each step, also if nothing is filled."""
-        return False
-
-    def close(self, prior: SurfacePrior) -> None:
-        """Start from what is known of the surface, before the first step: colours, and fills of what nothing shows."""
-
-    def keep_to(self, prior: SurfacePrior) -> None:
-        """Bring Gaussians back that have left what is known of the surface, after each step."""
-
-    def restore(self, rows: Int[Tensor, " k"], prior: SurfacePrior, *, close: bool) -> None:
-        """Give some Gaussians the completed colours of their triangles, between two steps.
-
-        With `close`, they also get place, shape and opacity of fills, as at the start. Nothing happens for methods that
-        bind no Gaussians.
-        """
-
-    def height_gradient(self) -> Float[Tensor, " f"] | None:
-        """Derivative of the loss by the height of each triangle's Gaussians above it, per metre, after a backward pass.
-
-        It is the sum over the triangle's Gaussians. None if there is none, or for methods that bind no Gaussians.
-        """
-        return None
-
-    def raise_surface(self, shift: Float[Tensor, " f"]) -> None:
-        """Move Gaussians along the normals of their triangles, by metres, between two steps."""
-
-    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
-        """Close the surface of those of the chosen triangles that are less than half opaque, between two steps.
-
-        The number of Gaussians does not change. Nothing happens if `triangles` gives None.
-
-        Args:
-            chosen: Triangles that may be closed.
-            opacity: Opacity of closed triangles.
-            colors: Their colours, 0..1.
-        """
-
     @abstractmethod
     def bake(self) -> BakedAvatar:
         """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines.
 
         Raises:
-            UserError: there is no such record (`unbaked`).
+            UserError: there is no such record (`Extras.unbaked`).
         """
 
-    @property
-    def unbaked(self) -> str | None:
-        """Why `bake` refuses this avatar, with its name. None for all that have a record, which is nearly all."""
-        return None
+    @final
+    def surface(self) -> BoundSurface | None:
+        """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
+        return self.extras.surface
 
 
 def move_avatar(avatar: Avatar, like: Tensor) -> None:

@@ -5,7 +5,7 @@ these descriptions, never the method.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -58,6 +58,14 @@ class GradientDensity:
     may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]] | None = None
     """(store) -> Gaussians whose opacity resets lower. None if they all are."""
 
+    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "GradientDensity":
+        """The same control with `may_reset`, and with a limit that is higher by `extra` Gaussians."""
+        return replace(
+            self,
+            settings=replace(self.settings, max_gaussians=self.settings.max_gaussians + extra),
+            may_reset=may_reset,
+        )
+
 
 @dataclass(frozen=True)
 class RefillDensity:
@@ -72,10 +80,18 @@ class RefillDensity:
     may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = allow_all_prunes
     """(store, prunes requested) -> prunes allowed."""
 
+    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "RefillDensity":
+        """The same control, which resets no opacity and has no limit."""
+        return self
+
 
 @dataclass(frozen=True)
 class FixedDensity:
     """The number of Gaussians never changes."""
+
+    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "FixedDensity":
+        """The same control, which resets no opacity and has no limit."""
+        return self
 
 
 DensityControl = GradientDensity | RefillDensity | FixedDensity

@@ -8,35 +8,27 @@ Changes with the expression beside those of the mesh (`expression_rank`, `appear
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar.avatar import Avatar, ParameterGroup, Posed, SurfacePrior, store_group
+from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_gaussians import pose_bound_gaussians
 from mien.avatar.density import GradientDensity, highest_opacities_seen
 from mien.avatar.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
-from mien.avatar.hair_strands import shell_growth, strand_gaussians
+from mien.avatar.gaussian_surface import GaussianSurface
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
-from mien.avatar.surface_limits import keep_on_surface
-from mien.avatar.triangle_frames import triangle_ellipses, triangle_frames
 from mien.avatar.triangle_penalties import triangle_penalties
 from mien.face import FaceModel, FaceParams
-from mien.gaussians import sh_from_rgb, stack_timesteps
+from mien.gaussians import stack_timesteps
 from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
-_OPEN = 0.5
-"""Sum of the opacities of a triangle's Gaussians below which its surface is open."""
 _FEATURES = ("feature_colour", "feature_opacity")
 """Names of the changes by features."""
-_PULL = 0.05
-"""Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
-_OPAQUE = 0.97
-"""Opacity of a fill."""
 _BASES = ("colour_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
@@ -47,9 +39,8 @@ class GaussianAvatars(Avatar):
     config: GaussianAvatarsConfig
 
     def __init__(self, config: GaussianAvatarsConfig, face_model: FaceModel, face: FaceParams):
-        super().__init__(config, face_model, face)
+        super().__init__(config, face_model, face, Extras(surface=GaussianSurface(self, config)))
         like, n = face_model.template, face_model.faces.shape[0]
-        self._known_sizes: Tensor | None = None
         trained = {
             "means": like.new_zeros(n, 3),
             "quats": like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
@@ -178,137 +169,6 @@ class GaussianAvatars(Avatar):
             judged_opacities=highest_opacities_seen if self._opacity_changes else resting_opacities,
             may_prune=never_empty_a_triangle,
         )
-
-    @property
-    def wants_first_colors(self) -> bool:
-        """Whether the settings ask for colours from the pictures."""
-        return self.config.first_colors == "pictures"
-
-    @torch.no_grad()
-    def paint(self, colors: Float[Tensor, "v 3"]) -> None:
-        """Give every Gaussian the mean colour of its triangle's three vertices."""
-        own = colors.to(self.store["sh_constant"])[self.face_model.faces[self.store["face_index"]].long()].mean(1)
-        self.store.assign("sh_constant", sh_from_rgb(own)[:, None])
-
-    def triangles(self) -> Int[Tensor, " n"]:
-        """The triangle that each Gaussian is bound to."""
-        return self.store["face_index"]
-
-    @property
-    def wants_surface(self) -> bool:
-        """Whether the settings limit how far Gaussians may leave the surface."""
-        return self.config.surface.enabled
-
-    @torch.no_grad()
-    def close(self, prior: SurfacePrior) -> None:
-        """Completed colours everywhere, and an opaque flat Gaussian at the height of hair on what no picture shows.
-
-        Strands of hair are added where the prior says so.
-        """
-        closed = prior.made_up if prior.closed is None else prior.closed
-        if prior.colors is None or closed is None:
-            return
-        store, bound = self.store, self.store["face_index"]
-        filled, fills = closed[bound], {name: values[bound] for name, values in self._fills(prior).items()}
-        store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
-        store.assign("means", fills["means"])
-        for name in ("quats", "log_scales", "opacity_logits"):
-            chosen = filled.view(-1, *[1] * (store[name].ndim - 1))
-            store.assign(name, torch.where(chosen, fills[name], store[name]))
-        if prior.strands is not None and bool(prior.strands.any()):
-            vertices, faces = self.face_model.head_vertices(self.subject)[0], self.face_model.faces
-            own = strand_gaussians(vertices, faces, prior.strands, prior.fill_height, prior.colors)
-            rest = {name: store[name].new_zeros(len(own["means"]), *store[name].shape[1:]) for name in store.trained}
-            store.append(torch.zeros(len(own["means"]), dtype=torch.long), rest | own)
-
-    def _fills(self, prior: SurfacePrior) -> dict[str, Tensor]:
-        """Place, shape and opacity of each triangle's fill: opaque, flat, at the height of hair."""
-        vertices, faces = self.face_model.head_vertices(self.subject)[0], self.face_model.faces
-        quats, log_scales = triangle_ellipses(vertices, faces)
-        height = prior.fill_height
-        wider = shell_growth(vertices, faces, height).log()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
-        return {
-            "means": torch.stack([0 * height, height / self._sizes, 0 * height], 1),
-            "quats": quats,
-            "log_scales": log_scales + wider,
-            "opacity_logits": torch.logit(torch.full_like(height, _OPAQUE)),
-        }
-
-    @torch.no_grad()
-    def keep_to(self, prior: SurfacePrior) -> None:
-        """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
-        if self.config.surface.enabled or prior.made_up is not None:
-            hair = prior.hair if prior.hanging is None else torch.maximum(prior.hair, prior.hanging)
-            keep_on_surface(self.store, self.config.surface, self._sizes, hair, prior.looseness)
-        if prior.colors is not None and prior.doubt is not None:
-            bound, own = self.store["face_index"], self.store["sh_constant"].detach()[:, 0]
-            # What is made up has the colours that it was given, strand by strand.
-            doubt = prior.doubt if prior.made_up is None else prior.doubt.masked_fill(prior.made_up, 0)
-            pull = _PULL * doubt[bound, None]
-            own += pull * (sh_from_rgb(prior.colors)[bound] - own)
-
-    @torch.no_grad()
-    def restore(self, rows: Int[Tensor, " k"], prior: SurfacePrior, *, close: bool) -> None:
-        """Completed colours and, with `close`, what `close` gives to fills."""
-        if prior.colors is None or not len(rows):
-            return
-        store, bound = self.store, self.store["face_index"][rows]
-        values = {"sh_constant": sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None]}
-        if close:
-            values |= {name: own[bound] for name, own in self._fills(prior).items()}
-            rest = [name for name in store.trained if name not in values]
-            values |= {name: torch.zeros_like(store[name][rows]) for name in rest}
-        for name, own in values.items():
-            store.assign_rows(name, rows, own)
-
-    @torch.no_grad()
-    def height_gradient(self) -> Float[Tensor, " f"] | None:
-        """Derivative of the loss by the height of each triangle's Gaussians: that of their second local coordinate."""
-        gradient, bound = self.store["means"].grad, self.store["face_index"]
-        if gradient is None:
-            return None
-        return torch.zeros_like(self._sizes).index_add(0, bound, gradient[:, 1] / self._sizes[bound])
-
-    @torch.no_grad()
-    def raise_surface(self, shift: Float[Tensor, " f"]) -> None:
-        """Move Gaussians along the second axis of their triangles' frames, which is the normal."""
-        bound = self.store["face_index"]
-        self.store["means"].detach()[:, 1] += (shift / self._sizes)[bound]
-
-    @property
-    def _sizes(self) -> Float[Tensor, " f"]:
-        """Sizes of the triangles of the neutral head, in metres per triangle unit."""
-        if self._known_sizes is None:
-            vertices = self.face_model.head_vertices(self.subject)[0]
-            self._known_sizes = triangle_frames(vertices, self.face_model.faces).k.detach()
-        return self._known_sizes
-
-    @torch.no_grad()
-    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
-        """Replace the first Gaussian of each chosen triangle that is open by a flat one of the triangle's shape."""
-        store, bound = self.store, self.store["face_index"].long()
-        opacities = store["opacity_logits"].sigmoid()
-        total = opacities.new_zeros(len(chosen)).index_add(0, bound, opacities)
-        order = torch.arange(len(store), device=bound.device)
-        first = torch.full_like(chosen, len(store), dtype=torch.long).scatter_reduce(0, bound, order, "amin")
-        opened = (chosen & (total < _OPEN) & (first < len(store))).nonzero()[:, 0]
-        for name, values in self._flat(opened, total.new_full((len(chosen),), opacity), colors).items():
-            store.assign_rows(name, first[opened], values)
-
-    def _flat(
-        self, triangles: Int[Tensor, " k"], opacity: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]
-    ) -> dict[str, Tensor]:
-        """The tensors of flat Gaussians, one for each of the given triangles, which have the triangles' shapes."""
-        store, like = self.store, self.store["means"]
-        quats, log_scales = triangle_ellipses(self.face_model.head_vertices(self.subject)[0], self.face_model.faces)
-        return {
-            **{name: like.new_zeros(len(triangles), *store[name].shape[1:]) for name in store.trained},
-            "face_index": triangles,
-            "quats": quats[triangles],
-            "log_scales": log_scales[triangles],
-            "opacity_logits": torch.logit(opacity.to(like)[triangles].clamp(1e-6, 1 - 1e-6)),
-            "sh_constant": sh_from_rgb(colors.to(like)[triangles])[:, None],
-        }
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""

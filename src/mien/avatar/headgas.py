@@ -19,6 +19,7 @@ from mien.avatar.activation import sigmoid
 from mien.avatar.avatar import (
     UNBAKED_REMEDY,
     Avatar,
+    Extras,
     ParameterGroup,
     Posed,
     factored_group,
@@ -68,8 +69,10 @@ class HeadGas(Avatar):
     judged: Tensor
 
     def __init__(self, config: HeadGasConfig, face_model: FaceModel, face: FaceParams):
-        super().__init__(config, face_model, face)
         n, parts = config.points, VARIANTS[config.variant]
+        # Two of the ablations move Gaussians, and one averages, which no record of `mien.runtime` can say.
+        unbaked = parts.unbaked and f"the variant {config.variant} of headgas: {parts.unbaked}"
+        super().__init__(config, face_model, face, Extras(unbaked=unbaked))
         means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
         rest, directions = input_directions(face, self.subject, config.directions)
         self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
@@ -102,7 +105,12 @@ class HeadGas(Avatar):
         poses its baked form, if there is one, unless `face` is to have gradients.
         """
         store = self.store
-        if not self.training and progress is TRAINED and self.unbaked is None and can_pose_baked(store["means"], face):
+        if (
+            not self.training
+            and progress is TRAINED
+            and self.extras.unbaked is None
+            and can_pose_baked(store["means"], face)
+        ):
             baked = self._baked.of((*self.parameters(), *self.buffers()), self.bake)
             return Posed(pose_baked(baked, face), {})
         inputs = (expression_inputs(face) - self.rest) @ self.directions
@@ -163,19 +171,14 @@ class HeadGas(Avatar):
             highest = torch.maximum(highest, sigmoid(changes.opacity_logits))
         return highest
 
-    @property
-    def unbaked(self) -> str | None:
-        """Two of the ablations move Gaussians, and one averages, which no record of `mien.runtime` can say."""
-        return self._parts.unbaked and f"the variant {self.config.variant} of headgas: {self._parts.unbaked}"
-
     def bake(self) -> Static:
         """Static points, with the bases of the features and the network.
 
         Raises:
             UserError: the variant cannot be baked.
         """
-        if self.unbaked is not None:
-            raise UserError(f"{self.unbaked}; {UNBAKED_REMEDY}")
+        if self.extras.unbaked is not None:
+            raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         store = {name: as_array(self.store[name]) for name in self.store.names()}
         n = len(self.store)
         neutral, along = self._baked_features()

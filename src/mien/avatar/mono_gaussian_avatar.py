@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.avatar.activation import sigmoid
-from mien.avatar.avatar import Avatar, ParameterGroup, Posed, network_group, store_group
+from mien.avatar.avatar import Avatar, Extras, Lessons, ParameterGroup, Posed, network_group, store_group
 from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
@@ -64,7 +64,8 @@ class MonoGaussianAvatar(Avatar):
     config: MonoGaussianAvatarConfig
 
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
-        super().__init__(config, face_model, face)
+        lessons = Lessons(config.lessons, self._teach) if config.lessons > 0 else None
+        super().__init__(config, face_model, face, Extras(frames_per_step=self._frames_per_step, lessons=lessons))
         like = face_model.template
         e, k = face.expression.shape[1], len(face_model.joint_names)
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
@@ -106,8 +107,7 @@ class MonoGaussianAvatar(Avatar):
         sh = sh_from_rgb(sigmoid(raw["sh"]))[..., None, :]
         return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
 
-    @property
-    def frames_per_step(self) -> int:
+    def _frames_per_step(self) -> int:
         """Fewer than the settings' if there are many points."""
         return max(1, min(self.config.frames_per_step, self.config.points_per_step // len(self.store)))
 
@@ -156,12 +156,7 @@ class MonoGaussianAvatar(Avatar):
             losses["pose_correctives"] = 10 * _mean_square(10 * (found.pose - correctives))
         return losses
 
-    @property
-    def lesson_count(self) -> int:
-        """Number of lessons in the face model's motion."""
-        return self.config.lessons
-
-    def lessons(self, face: FaceParams) -> Iterator[None]:
+    def _teach(self, face: FaceParams) -> Iterator[None]:
         """Teach the deformation network the face model's motion in training frames.
 
         The published network starts without any motion, and needs some hundred thousand steps to find it.

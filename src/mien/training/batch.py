@@ -24,13 +24,11 @@ from mien.training.frames import (
     MIN_EXTENT,
     Frame,
     FrameOrder,
-    aside_random,
     background_at,
     crop_random,
-    disguise_random,
 )
-from mien.training.inside import disguise
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
+from mien.training.parts import BatchFrame
 from mien.training.sequence import Target, Targets
 from mien.training.settings import TrainSettings
 
@@ -72,30 +70,10 @@ class TrainingData:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class BatchFrame:
-    """One frame of a step."""
-
-    number: int
-    """Number of frames that the run used before it."""
-    frame: Frame
-    index: int
-    """Its timestep in the track."""
-    target: Target
-    goal: Callable[[], PerceptualGoal] | None
-    """Makes the goal of the perceptual loss. None if the frame is compared without that loss."""
-
-    def seen(self, rendering: Rendering, state: TrainingState) -> Rendering:
-        """The rendering in the colours of the frame's camera."""
-        return (
-            rendering if state.colors is None else state.colors.seen_by(rendering, self.target.background, self.frame)
-        )
-
-
 def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings) -> list[BatchFrame]:
     """The frames of the next step: as many as the avatar asks for and the run has left."""
     perceptual = state.avatar.config.photometric.perceptual
-    count, batch = max(1, min(state.avatar.frames_per_step, settings.steps - state.step)), []
+    count, batch = max(1, min(state.avatar.extras.frames_per_step(), settings.steps - state.step)), []
     for number in range(state.step, state.step + count):
         frame, _ = data.order.at(number)
         target, due = data.target(number, settings), perceptual.due(number, settings.steps)
@@ -105,16 +83,14 @@ def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings
 
 
 def draw(
-    state: TrainingState, data: TrainingData, settings: TrainSettings, batch: Items[BatchFrame], progress: Progress
+    state: TrainingState, data: TrainingData, batch: Items[BatchFrame], progress: Progress
 ) -> tuple[Posed, list[Posed], list[Rendering]]:
     """The Gaussians of all frames, posed together; the same frame by frame, as they are drawn; and their pictures."""
     faces = [state.track.face(one.index) for one in batch]
     posed = state.avatar.pose(faces[0] if len(faces) == 1 else concatenate(faces), progress)
     each = [posed] if len(batch) == 1 else [replace(posed, gaussians=own) for own in posed.gaussians.timesteps()]
-    each = [
-        disguise(own, state.avatar, one.target.hidden, disguise_random(settings, one.number))
-        for one, own in zip(batch, each, strict=True)
-    ]
+    for part in state.parts:
+        each = [part.posed(own, one) for one, own in zip(batch, each, strict=True)]
     views = [
         (own.gaussians.timestep(0), data.targets[one.frame.sequence].camera(one.frame.camera))
         for one, own in zip(batch, each, strict=True)
@@ -126,10 +102,20 @@ def draw(
     return whole, each, rasterize_each(views, backgrounds)
 
 
+def seen(state: TrainingState, batch: Items[BatchFrame], renderings: Items[Rendering]) -> list[Rendering]:
+    """The pictures as they are compared, for example in the colours of their cameras."""
+    shown = list(renderings)
+    for part in state.parts:
+        shown = [part.seen(rendering, one) for one, rendering in zip(batch, shown, strict=True)]
+    return shown
+
+
 def compare(state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering]) -> dict[str, Float[Tensor, ""]]:
     """The losses that compare pictures, by name: means over the frames."""
     weights = state.avatar.config.photometric
-    weights = (weights if state.unseen is None else state.unseen.weights(weights)).scaled(1 / len(batch))
+    for part in state.parts:
+        weights = part.weights(weights)
+    weights = weights.scaled(1 / len(batch))
     return _summed(picture_losses(image, one.target, weights) for one, image in zip(batch, shown, strict=True))
 
 
@@ -143,19 +129,6 @@ def compare_features(
         for one, image in zip(batch, shown, strict=True)
         if one.goal is not None
     )
-
-
-def compare_aside(
-    state: TrainingState, data: TrainingData, settings: TrainSettings, batch: Items[BatchFrame], progress: Progress
-) -> dict[str, Float[Tensor, ""]]:
-    """The loss of a side view, if one of the frames is due for it: that of the first such frame."""
-    aside = state.aside
-    due = [] if aside is None else [one for one in batch if aside.due(one.number)]
-    if aside is None or not due:
-        return {}
-    one = due[0]
-    camera, random = data.targets[one.frame.sequence].camera(one.frame.camera), aside_random(settings, one.number)
-    return {"aside": aside.loss(state.avatar, state.track.face(one.index), camera, progress, one.number, random)}
 
 
 def _summed(losses: Iterable[dict[str, Float[Tensor, ""]]]) -> dict[str, Float[Tensor, ""]]:

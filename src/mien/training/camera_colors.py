@@ -15,6 +15,7 @@ from mien.avatar import ParameterGroup, Rate
 from mien.errors import UserError
 from mien.render.rendering import Rendering
 from mien.training.frames import Frame
+from mien.training.parts import TrainingPart
 from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
 
@@ -91,3 +92,23 @@ def camera_colors(
         UserError: only one camera is trained on.
     """
     return None if settings.camera_colors == "none" else CameraColors(sequences, frames, settings, like)
+
+
+def camera_colors_part(
+    sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor
+) -> TrainingPart | None:
+    """`camera_colors` as a part of a training.
+
+    Raises:
+        UserError: only one camera is trained on.
+    """
+    colors = camera_colors(sequences, frames, settings, like)
+    if colors is None:
+        return None
+    return TrainingPart(
+        "colors",
+        seen=lambda rendering, one: colors.seen_by(rendering, one.target.background, one.frame),
+        parameter_groups=colors.parameter_groups,
+        state=colors.state,
+        load_state=colors.load_state,
+    )

@@ -1,7 +1,7 @@
 """Checkpoints: everything that the rest of a run depends on. Each is one file, written atomically."""
 
 import resource
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -14,13 +14,10 @@ from mien.errors import UserError
 from mien.progress import say
 from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.adam import Adam
-from mien.training.camera_colors import CameraColors
+from mien.training.coverage import Coverage
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
-from mien.training.hair_surface import HairSurface
-from mien.training.inside import Inside
-from mien.training.side_views import SideViews
-from mien.training.unseen import Unseen
+from mien.training.parts import TrainingPart
 
 _KEPT_CHECKPOINTS = 2
 CURVES = {"step", "loss", "psnr", "gaussians", "step_ms"}
@@ -36,36 +33,21 @@ class TrainingState:
     density: DensityStrategy
     track: FaceTrack
     curves: dict[str, list[float]]
-    colors: CameraColors | None = None
-    """Colour transforms of the cameras, if the settings ask for them."""
+    parts: tuple[TrainingPart, ...] = ()
+    """What joins this training."""
+    covered: Coverage | None = None
+    """What the training pictures show of the head, if a part has asked for it."""
     step: int = 0
     """Number of steps done."""
     seconds: float = 0.0
     """Time spent on these steps, in seconds, by all processes that have trained the run."""
     peak_memory_mb: float = 0.0
     """Most memory that one of these processes has taken, in MB, when it was last measured."""
-    unseen: Unseen | None = None
-    """What no training picture shows, if it is filled. It depends on the data alone, so checkpoints lack it."""
-    inside: Inside | None = None
-    """What is inside the mouth, if it is furnished. Checkpoints lack it for the same reason."""
-    aside: SideViews | None = None
-    """Views from aside, if sides are filled. Checkpoints lack it for the same reason."""
-    hair: HairSurface | None = None
-    """The surface of the hair, if sides are filled."""
 
     def measure_memory(self) -> None:
         """Bring `peak_memory_mb` up to date."""
         own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         self.peak_memory_mb = max(self.peak_memory_mb, own)
-
-    def follow_hair(self) -> None:
-        """Let what is known of the surface follow the hair."""
-        if self.hair is None or self.unseen is None:
-            return
-        prior = self.hair.prior()
-        self.unseen = replace(self.unseen, prior=prior)
-        if self.aside is not None:
-            self.aside = self.aside.at_height(prior.fill_height)
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
@@ -74,10 +56,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     tensors = {f"avatar.{name}": tensor for name, tensor in state.avatar.state_dict().items()}
     tensors |= {f"density.{name}": tensor for name, tensor in state.density.state().items()}
     tensors |= {f"track.{name}": tensor for name, tensor in state.track.state().items()}
-    if state.colors is not None:
-        tensors |= {f"colors.{name}": tensor for name, tensor in state.colors.state().items()}
-    if state.hair is not None:
-        tensors |= {f"hair.{name}": tensor for name, tensor in state.hair.state.items()}
+    for part in state.parts:
+        tensors |= {f"{part.name}.{name}": tensor for name, tensor in part.state().items()}
     tensors |= {f"curves.{name}": torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     for owner, moments in (("store", state.avatar.gaussian_store().moments), ("adam", state.adam.state())):
         for name, own in moments.items():
@@ -146,13 +126,11 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor], first
     state.density.load_state(part("density."))
     _check_like(part("track."), state.track.state(), None)
     state.track.load_state(part("track."))
-    if state.colors is not None:
-        _check_like(part("colors."), state.colors.state(), None)
-        state.colors.load_state(part("colors."))
-    if state.hair is not None:
-        _check_like(part("hair."), state.hair.state, None)
-        state.hair.load_state(part("hair."))
-        state.follow_hair()
+    for joined in state.parts:
+        own, stored = joined.state(), part(f"{joined.name}.")
+        if own:
+            _check_like(stored, own, None)
+            joined.load_state(stored)
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
     state.peak_memory_mb = float(tensors["peak_memory_mb"])
     curves = part("curves.")

@@ -58,8 +58,9 @@ def tidy(avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]]
         views: Views of the training, as for `contributions`.
         close: Whether what stays becomes a surface, which training then fits to the pictures.
     """
-    triangles, prior = avatar.triangles(), unseen.prior
-    assert triangles is not None
+    surface, prior = avatar.surface(), unseen.prior
+    assert surface is not None
+    triangles = surface.triangles()
     kept = prior.made_up if prior.closed is None else prior.closed
     assert kept is not None
     hidden = (contributions(avatar, views) < _HIDDEN) & ~kept[triangles]
@@ -68,5 +69,5 @@ def tidy(avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]]
     first = torch.full_like(kept, len(hidden), dtype=torch.long)
     first = first.scatter_reduce(0, triangles[hidden].long(), order[hidden], "amin")
     stays = hidden & ~shown[triangles] & (order == first[triangles])
-    avatar.restore(stays.nonzero()[:, 0], prior, close=close)
+    surface.restore(stays.nonzero()[:, 0], prior, close=close)
     return hidden & ~stays

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.avatar import Avatar, SurfacePrior
+from mien.avatar import Avatar, BoundSurface, SurfacePrior
 from mien.face.mirror import triangle_geometry
 from mien.training.head_parts import head_parts
 
@@ -52,22 +52,22 @@ class HairSurface:
     """Tensors that training changes, by name: `shift` in metres along the normals, its moments, and the gradient since
     the last correction, [k] each; `count`, the number of corrections."""
 
-    def collect(self, avatar: Avatar, fraction: float) -> None:
+    def collect(self, surface: BoundSurface, fraction: float) -> None:
         """Add the gradients of a step, after its backward pass, unless no correction follows.
 
         Args:
-            avatar: The avatar.
+            surface: The surface of the avatar.
             fraction: How far the run was before the step, 0..1.
         """
-        gradient = avatar.height_gradient() if fraction < _END else None
+        gradient = surface.height_gradient() if fraction < _END else None
         if gradient is not None:
             self.state["gradient"] += gradient[self.scalp].to(self.kernel) * self.shown
 
-    def correct(self, avatar: Avatar, fraction: float, rate: float) -> bool:
+    def correct(self, surface: BoundSurface, fraction: float, rate: float) -> bool:
         """Move the avatar's Gaussians along the normals if it is time for that. Return whether they moved.
 
         Args:
-            avatar: The avatar.
+            surface: The surface of the avatar.
             fraction: How far the run is, 0..1.
             rate: Size of a first correction in metres, where all gradients agree.
         """
@@ -77,7 +77,7 @@ class HairSurface:
             before = self.state["shift"].clone()
             lowest = _LOWEST - self.start.hair[self.scalp]
             self.state["shift"] = (before - step).clamp(-_FURTHEST, _FURTHEST).maximum(lowest)
-            avatar.raise_surface(self._on_all(self.state["shift"] - before))
+            surface.raise_by(self._on_all(self.state["shift"] - before))
         self.state["gradient"] = torch.zeros_like(self.state["gradient"])
         return moves
 

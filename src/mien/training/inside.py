@@ -12,11 +12,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mien.avatar import Avatar, Posed
+from mien.avatar import Avatar, BoundSurface, Posed
 from mien.gaussians import sh_from_rgb
 from mien.training.completion import complete_colors
 from mien.training.coverage import Coverage
+from mien.training.frames import disguise_random
 from mien.training.head_parts import head_parts
+from mien.training.hidden import inside_triangles
+from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
 
 _FURNISH_AT = 0.5
 """Time at which an open surface inside the mouth is closed, as a fraction of the run: after the last opacity reset of
@@ -34,14 +37,35 @@ class Inside:
     colors: Float[Tensor, "f 3"]
     """Colours that are plausible, 0..1: a dark mouth with light teeth."""
 
-    def furnish(self, avatar: Avatar, step: int, steps: int) -> None:
+    def furnish(self, surface: BoundSurface, step: int, steps: int) -> None:
         """Close the surface where it is open, if this is a step of a run of `steps` at which this is due."""
         if step == round(_FURNISH_AT * steps):
-            avatar.furnish(self.triangles, _OPAQUE, self.colors)
+            surface.furnish(self.triangles, _OPAQUE, self.colors)
 
     def to(self, like: Tensor) -> "Inside":
         """The same on the device of `like`, with colours of its dtype."""
         return Inside(self.triangles.to(like.device), self.colors.to(like))
+
+
+def prepare_inside(given: Preparation) -> TrainingPart | None:
+    """The part of a training that covers and furnishes what is inside a head, if the settings ask for it."""
+    avatar, surface, settings = given.avatar, given.avatar.surface(), given.settings
+    if settings.inside == "free" or surface is None:
+        return None
+
+    def covered(posed: Posed, one: BatchFrame) -> Posed:
+        return disguise(posed, avatar, one.target.hidden, disguise_random(settings, one.number))
+
+    hideable = inside_triangles(given.face_model)
+    if settings.inside == "covered":
+        return TrainingPart("inside", hideable, posed=covered)
+    inside = inside_of(avatar, given.coverage).to(given.like)
+
+    def furnish(step: Step) -> None:
+        for one in step.batch:
+            inside.furnish(surface, one.number, settings.steps)
+
+    return TrainingPart("inside", hideable, posed=covered, before_step=furnish)
 
 
 @torch.no_grad()
@@ -63,10 +87,10 @@ def disguise(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None, ra
     places and sizes do have one, and so they leave where they do not belong. Gaussians of methods that bind none to
     triangles stay as they are.
     """
-    triangles = avatar.triangles()
-    if hidden is None or triangles is None:
+    surface = avatar.surface()
+    if hidden is None or surface is None:
         return posed
-    gaussians, own = posed.gaussians, hidden[triangles]
+    gaussians, own = posed.gaussians, hidden[surface.triangles()]
     color = sh_from_rgb(torch.rand(3, generator=random)).to(gaussians.sh, non_blocking=True)
     # Only on a CPU are rows found without waiting for the device.
     disguised = _Disguised.apply if gaussians.sh.device.type == "cpu" else disguised_reference

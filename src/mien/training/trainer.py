@@ -9,13 +9,16 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
 from mien.avatar import (
     Avatar,
     FaceTuning,
+    Lessons,
     MethodConfig,
+    Posed,
     Progress,
     load_avatar,
     measure_filmed,
@@ -30,20 +33,18 @@ from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.perceptual import load_training_features
 from mien.progress import Advance, progress_bar
+from mien.render.rendering import Rendering
 from mien.render.validation import CannotDrawError
 from mien.stops import Put, stops_put_off
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.ahead import targets_ahead
-from mien.training.batch import TrainingData, compare, compare_aside, compare_features, draw, face_groups, next_batch
+from mien.training.batch import TrainingData, compare, compare_features, draw, face_groups, next_batch, seen
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.contribution import tidy
 from mien.training.coverage import coverage, telling_frames
 from mien.training.density_control import density_strategy
-from mien.training.density_control.gradient import GradientStrategy
 from mien.training.face_track import FaceTrack, turns_from_mean
-from mien.training.filmed import with_shown_angles
 from mien.training.frames import (
     FrameOrder,
     camera_extent,
@@ -52,22 +53,17 @@ from mien.training.frames import (
     resolved,
     training_frames,
 )
-from mien.training.hair_surface import EVERY, hair_surface
-from mien.training.hidden import inside_triangles
-from mien.training.inside import inside_of
+from mien.training.joining import prepare_parts
 from mien.training.losses import train_psnr
+from mien.training.parts import Preparation, Step, passed
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
-from mien.training.side_views import side_views_of
-from mien.training.unseen import fills_sides, moved, spare_fills, unseen_of
 from mien.training.vertex_colors import vertex_colors
 
 _STEADY_EVERY = 25
 """Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
 
-_AFTER_RESET = 0.03
-"""Time after a reset of opacities in which nothing is judged by its contribution, as a fraction of the run."""
 _TELLING = 12
 """Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
 
@@ -118,10 +114,11 @@ def train(
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
         state = start(sequences, face_model, method_config, settings, like)
-        covers = settings.inside != "free" and state.avatar.triangles() is not None
-        inside = inside_triangles(face_model) if covers else None
+        inside = next((part.hideable for part in state.parts if part.hideable is not None), None)
         parts_of = face_model if method_config.photometric.needs_parts or inside is not None else None
-        settings = resolved(settings, filled=state.unseen is not None and state.unseen.fills)
+        for part in state.parts:
+            settings = part.settings(settings)
+        settings = resolved(settings, filled=False)
         cleaned = settings.edges == "cleaned"
         targets = [
             Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside, cleaned=cleaned)
@@ -131,8 +128,7 @@ def train(
         telling = telling_frames(faces, sequences, frames, _TELLING, _TELLING)
         data = TrainingData(order, tuple(targets), extent, tuple(telling))
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
-        covered = None if state.unseen is None else state.unseen.coverage
-        write_results(run_dir, state, covered or coverage(face_model, sequences, faces, frames))
+        write_results(run_dir, state, state.covered or coverage(face_model, sequences, faces, frames))
     return state.avatar
 
 
@@ -153,8 +149,9 @@ def _train_to_the_end(
         targets_ahead(data.order, data.targets, settings) as ahead,
     ):
         data = replace(data, ahead=ahead)
-        if state.step == 0 and state.avatar.lesson_count > 0:
-            _teach(state, settings, progress, stop)
+        lessons = state.avatar.extras.lessons
+        if state.step == 0 and lessons is not None:
+            _teach(lessons, state, settings, progress, stop)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 before = state.step
@@ -172,12 +169,11 @@ def _train_to_the_end(
         _check_finite(run_dir, state)
 
 
-def _teach(state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put) -> None:
+def _teach(lessons: Lessons, state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put) -> None:
     """Give the avatar its lessons. A run that stops here starts again, as nothing was trained."""
-    avatar = state.avatar
-    with torch.random.fork_rng(devices=[]), progress("lessons in the face's motion", avatar.lesson_count, 0) as advance:
+    with torch.random.fork_rng(devices=[]), progress("lessons in the face's motion", lessons.count, 0) as advance:
         torch.manual_seed(settings.seed)
-        for _ in avatar.lessons(state.track.params()):
+        for _ in lessons.teach(state.track.params()):
             advance()
             stop.follow()
 
@@ -235,38 +231,28 @@ def start(
         torch.manual_seed(settings.seed)
         avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
     starts = [sum(map(len, faces[:index])) for index in range(len(faces))]
-    seen = face[[starts[frame.sequence] + frame.timestep for frame in frames]]
+    trained = face[[starts[frame.sequence] + frame.timestep for frame in frames]]
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
-    avatar.filmed = measure_filmed(seen, avatar.subject, eyes)
-    if avatar.wants_first_colors:
-        avatar.paint(vertex_colors(face_model, sequences, faces, frames))
-    colors = camera_colors(sequences, frames, settings, torch.zeros(()) if like is None else like)
-    unseen, filled = None, fills_sides(frames, settings, bound=avatar.triangles() is not None)
-    if filled or avatar.wants_surface:
-        unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
-        avatar.close(unseen.prior)
-        if unseen.coverage is not None:
-            neutral = face_model.head_vertices(avatar.subject)[0].detach()
-            avatar.filmed = with_shown_angles(avatar.filmed, face_model, neutral, unseen.coverage)
-    inside = None
-    if settings.inside == "furnished" and avatar.triangles() is not None:
-        known = None if unseen is None else unseen.coverage
-        inside = inside_of(avatar, coverage(face_model, sequences, faces, frames) if known is None else known)
+    avatar.filmed = measure_filmed(trained, avatar.subject, eyes)
+    surface = avatar.surface()
+    if surface is not None and surface.wants_first_colors:
+        surface.paint(vertex_colors(face_model, sequences, faces, frames))
+    given = Preparation(
+        avatar, face_model, sequences, faces, frames, settings, torch.zeros(()) if like is None else like
+    )
+    make_parts = prepare_parts(given)
     away = turns_from_mean(face)
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
-        unseen = None if unseen is None else moved(unseen, like)
-        inside = None if inside is None else inside.to(like)
-    aside = side_views_of(avatar, unseen, settings.side_weight)
-    hair = hair_surface(avatar, unseen.prior) if unseen is not None and unseen.fills else None
-    density = density_strategy(spare_fills(avatar, unseen), avatar.gaussian_store())
+    parts, density = make_parts(), avatar.density()
+    for part in parts:
+        density = part.density(density)
+    strategy = density_strategy(density, avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     tuning = tuning_for(method_config.face_tuning, sequences)
     track = FaceTrack(face, tuning, lengths, face_model.expression_bounds, away)
-    return TrainingState(
-        avatar, Adam(), density, track, {}, colors, unseen=unseen, inside=inside, aside=aside, hair=hair
-    )
+    return TrainingState(avatar, Adam(), strategy, track, {}, parts, covered=given.known_coverage)
 
 
 def tuning_for(tuning: FaceTuning, sequences: Items[Sequence]) -> FaceTuning:
@@ -282,80 +268,62 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     many.
     """
     began = time.perf_counter()
-    avatar, perceptual = state.avatar, state.avatar.config.photometric.perceptual
+    avatar, parts = state.avatar, state.parts
     batch = next_batch(state, data, settings)
-    epoch = data.order.at(state.step)[1]
-    progress = Progress(state.step, settings.steps, epoch, data.extent, len(batch))
-    if state.inside is not None:
-        for one in batch:
-            state.inside.furnish(avatar, one.number, settings.steps)
-    whole, posed, renderings = draw(state, data, settings, batch, progress)
-    shown = [one.seen(rendering, state) for one, rendering in zip(batch, renderings, strict=True)]
+    progress = Progress(state.step, settings.steps, data.order.at(state.step)[1], data.extent, len(batch))
+    now = Step(avatar, state.track, state.density, settings, tuple(batch), progress, data.camera, data.telling)
+    for part in parts:
+        part.before_step(now)
+    whole, posed, renderings = draw(state, data, batch, progress)
+    shown = seen(state, batch, renderings)
     losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
     losses |= compare_features(state, batch, shown)
-    losses |= compare_aside(state, data, settings, batch, progress)
+    for part in parts:
+        losses |= part.losses(now)
     torch.autograd.backward(list(losses.values()))
-    if state.hair is not None:
-        state.hair.collect(avatar, state.step / settings.steps)
-    if state.unseen is not None:
-        state.unseen.guard(avatar, *renderings)
+    for part in parts:
+        part.after_backward(now, renderings)
 
-    groups = [*avatar.parameter_groups(), *face_groups(state, batch)]
-    groups += [] if state.colors is None else state.colors.parameter_groups()
-    for own, rendering in zip(posed, renderings, strict=True):
-        state.density.observe(own, rendering)
-    state.adam.step(groups, progress)
-    for one in batch:
-        state.track.confine(one.index)
-    if passed(state.step, state.step + len(batch), _STEADY_EVERY):
-        state.track.steady_pose()
-    random = partial(density_random, settings, state.step)
-    changed = state.density.adapt(avatar.gaussian_store(), posed[0], progress, random)
-    if state.unseen is not None:
-        avatar.keep_to(state.unseen.prior)
-
-    before = state.step
-    state.step += len(batch)
-    hair = state.hair if passed(before, state.step, EVERY) else None
-    if hair is not None and hair.correct(avatar, state.step / settings.steps, settings.hair_rate):
-        state.follow_hair()
-    _tidy(state, data, settings, changed=changed)
+    changed = _update(state, now, posed, renderings)
+    for part in parts:
+        part.after_update(now)
+    state.step = now.done
+    for part in parts:
+        part.after_step(replace(now, changed=changed))
     elapsed = time.perf_counter() - began
     state.seconds += elapsed
-    if not passed(before, state.step, settings.record_every) and state.step != settings.steps:
+    if not now.reaches(settings.record_every) and state.step != settings.steps:
         return ""
+    return _record(state, losses, train_psnr(shown[0], batch[0].target), elapsed * 1000 / len(batch))
+
+
+def _update(state: TrainingState, now: Step, posed: Items[Posed], renderings: Items[Rendering]) -> bool:
+    """Update all trained tensors, then add and prune Gaussians. Returns whether the Gaussians may have changed."""
+    groups = [*state.avatar.parameter_groups(), *face_groups(state, now.batch)]
+    groups += [group for part in state.parts for group in part.parameter_groups()]
+    for own, rendering in zip(posed, renderings, strict=True):
+        state.density.observe(own, rendering)
+    state.adam.step(groups, now.progress)
+    for one in now.batch:
+        state.track.confine(one.index)
+    if now.reaches(_STEADY_EVERY):
+        state.track.steady_pose()
+    random = partial(density_random, now.settings, state.step)
+    return state.density.adapt(state.avatar.gaussian_store(), posed[0], now.progress, random)
+
+
+def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: float, step_ms: float) -> str:
+    """Add an entry to the curves, and return a text for the progress bar."""
     entry = {name: float(value.detach()) for name, value in losses.items()}
-    if perceptual.weight > 0:
-        entry.setdefault("perceptual", 0.0)
-    if state.aside is not None:
-        entry.setdefault("aside", 0.0)
-    entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": train_psnr(shown[0], batch[0].target)}
-    entry |= {"gaussians": len(avatar.gaussian_store()), "step_ms": elapsed * 1000 / len(batch)}
+    rare = [name for part in state.parts for name in part.rare_losses]
+    rare += ["perceptual"] if state.avatar.config.photometric.perceptual.weight > 0 else []
+    for name in rare:
+        entry.setdefault(name, 0.0)
+    entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": psnr}
+    entry |= {"gaussians": len(state.avatar.gaussian_store()), "step_ms": step_ms}
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
-
-
-def _tidy(state: TrainingState, data: TrainingData, settings: TrainSettings, *, changed: bool) -> None:
-    """Remove Gaussians of a filled head that pictures do not show, after a round of density control and at the end."""
-    unseen, strategy, last = state.unseen, state.density, state.step >= settings.steps
-    if unseen is None or not unseen.fills or not (changed or last) or not data.telling:
-        return
-    if not isinstance(strategy, GradientStrategy):
-        return
-    since = (state.step / settings.steps - time for time in strategy.resets)
-    if any(0 <= time < _AFTER_RESET for time in since) and not last:
-        return
-    views = [
-        (state.track.face(state.track.index_of(frame.sequence, frame.timestep)).detach(), data.camera(frame))
-        for frame in data.telling
-    ]
-    strategy.remove(state.avatar.gaussian_store(), tidy(state.avatar, unseen, views, close=not last))
-
-
-def passed(before: int, now: int, every: int) -> bool:
-    """Whether a multiple of `every` was reached since `before`."""
-    return now // every > before // every
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar, DensityControl, GaussianStore, GradientDensity, Photometric, SurfacePrior
+from mien.avatar import Avatar, DensityControl, GaussianStore, Photometric, SurfacePrior
 from mien.face import FaceModel, FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.rendering import Rendering
@@ -68,8 +68,8 @@ class Unseen:
 
     def made_up(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
-        triangles = avatar.triangles()
-        return None if self.prior.made_up is None or triangles is None else self.prior.made_up[triangles]
+        surface = avatar.surface()
+        return None if self.prior.made_up is None or surface is None else self.prior.made_up[surface.triangles()]
 
     def guard(self, avatar: Avatar, *renderings: Rendering) -> None:
         """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
@@ -102,22 +102,19 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
     return settings.unseen == "filled"
 
 
-def spare_fills(avatar: Avatar, unseen: Unseen | None) -> DensityControl:
-    """The avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
-    density = avatar.density()
-    if unseen is None or unseen.prior.closed is None or not isinstance(density, GradientDensity):
+def spare_fills(avatar: Avatar, density: DensityControl, unseen: Unseen) -> DensityControl:
+    """An avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
+    if unseen.prior.closed is None:
         return density
 
     def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
-        closed, triangles = unseen.prior.closed, avatar.triangles()
+        closed, surface = unseen.prior.closed, avatar.surface()
         assert closed is not None
-        assert triangles is not None
-        return ~closed[triangles]
+        assert surface is not None
+        return ~closed[surface.triangles()]
 
     made_up = unseen.made_up(avatar)
-    fills = 0 if made_up is None else int(made_up.sum())
-    settings = replace(density.settings, max_gaussians=density.settings.max_gaussians + fills)
-    return replace(density, settings=settings, may_reset=may_reset)
+    return density.sparing(may_reset, 0 if made_up is None else int(made_up.sum()))
 
 
 @torch.no_grad()
@@ -138,7 +135,7 @@ def unseen_of(
     colors = complete_colors(model, neutral, seen, found.colors)
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
-    if avatar.triangles() is None:
+    if avatar.surface() is None:
         return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
     made_up = (shown < _RARE) & (found.above > 0.5)
     made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)

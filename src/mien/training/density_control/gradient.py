@@ -34,7 +34,10 @@ from mien import _native
 from mien.arrays import unpacked
 from mien.avatar import GaussianStore, GradientDensity, Posed, Progress
 from mien.render.rendering import Rendering
-from mien.training.density_control.strategy import DensityStrategy, Random
+from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
+
+_AFTER_RESET = 0.03
+"""Time after a reset of opacities in which nothing is judged by its contribution, as a fraction of the run."""
 
 
 class GradientStrategy(DensityStrategy):
@@ -67,7 +70,7 @@ class GradientStrategy(DensityStrategy):
             self._grow_and_prune(store, posed, progress, random())
             self._restart(len(store))
         name = self._density.opacity_logits
-        if name is not None and progress.completes(max(1, round(time * progress.steps)) for time in self.resets):
+        if name is not None and progress.completes(max(1, round(time * progress.steps)) for time in self._resets):
             ceiling = torch.logit(torch.tensor(settings.reset_opacity))
             logits = store[name].detach()
             lowered = logits.clamp_max(float(ceiling))
@@ -76,16 +79,18 @@ class GradientStrategy(DensityStrategy):
             store.assign(name, lowered)
         return changed
 
+    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
+        """Remove redundant Gaussians, but not soon after a reset of opacities. The statistics start again."""
+        if fraction < 1 and any(0 <= fraction - time < _AFTER_RESET for time in self._resets):
+            return
+        store.select(~redundant())
+        self._restart(len(store))
+
     @property
-    def resets(self) -> tuple[float, ...]:
+    def _resets(self) -> tuple[float, ...]:
         """The times at which opacities are lowered, as fractions of the run."""
         settings = self._density.settings
         return settings.opacity_resets if settings.rules.reset_opacities else ()
-
-    def remove(self, store: GaussianStore, removed: Bool[Tensor, " n"]) -> None:
-        """Remove Gaussians between two rounds. The statistics start again."""
-        store.select(~removed)
-        self._restart(len(store))
 
     def state(self) -> dict[str, Tensor]:
         """The statistics since the last round, under the names that checkpoints have always used."""

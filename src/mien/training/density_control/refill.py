@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mien.avatar import GaussianStore, Posed, Progress, RefillDensity
 from mien.render.rendering import Rendering
-from mien.training.density_control.strategy import DensityStrategy, Random
+from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
 
 
 class RefillStrategy(DensityStrategy):
@@ -60,6 +60,9 @@ class RefillStrategy(DensityStrategy):
             store.append(parents, self._density.refill(store, parents, noise, progress.fraction))
         self._highest_opacities = torch.zeros(len(store), device=self._highest_opacities.device)
         return True
+
+    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
+        """Do nothing, because the rounds remove what no view has shown."""
 
     def state(self) -> dict[str, Tensor]:
         """The statistics since the last round."""

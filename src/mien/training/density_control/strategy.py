@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from mien.avatar import GaussianStore, Posed, Progress
@@ -11,6 +12,8 @@ from mien.render.rendering import Rendering
 
 Random = Callable[[], torch.Generator]
 """Creates the generator for a step's random numbers. Few steps need one."""
+Redundant = Callable[[], Bool[Tensor, " n"]]
+"""Finds the Gaussians that hardly add to any picture. It takes as long as a dozen pictures."""
 
 
 class DensityStrategy(ABC):
@@ -25,6 +28,16 @@ class DensityStrategy(ABC):
         """Add and remove Gaussians if it is time for that. Called after the optimiser's step.
 
         Returns whether the number or the order of the Gaussians may have changed.
+        """
+
+    @abstractmethod
+    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
+        """Remove redundant Gaussians between two rounds, if the strategy removes any and it is time for that.
+
+        Args:
+            store: The store.
+            fraction: How far the run is, 0..1.
+            redundant: Is called only if its result is used.
         """
 
     @abstractmethod
@@ -45,6 +58,9 @@ class FixedStrategy(DensityStrategy):
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Return False, because the store never changes."""
         return False
+
+    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
+        """Do nothing."""
 
     def state(self) -> dict[str, Tensor]:
         """An empty dict."""
