@@ -144,7 +144,7 @@ class GaussianSurface(BoundSurface):
         """Sizes of the triangles of the neutral head, in metres per triangle unit."""
         if self._known is None:
             self._known = triangle_frames(*self._mesh()).k.detach()
-        return self._known
+        return self._known.to(self._store["means"])  # the avatar may have moved since
 
     @torch.no_grad()
     def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
