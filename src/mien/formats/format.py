@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from mien.avatar import Avatar
-    from mien.export import MeshModel, Motion, WebcamFiles
-    from mien.face import FaceParams
-    from mien.gaussians import Gaussians
-    from mien.runtime import PortableAvatar
+    # By their full names: several rooms have a class of the same name, and the reference tells them apart so.
+    import mien.avatar
+    import mien.export
+    import mien.face
+    import mien.gaussians
+    import mien.runtime
 
 Holds = Literal["pose", "sequence", "avatar", "folder"]
 """What a file of a format holds: Gaussians in one pose, or in many, a whole avatar, or a folder with a whole run."""
@@ -28,30 +29,30 @@ class Content(Protocol):
         """Number of Gaussians."""
         ...
 
-    def portable(self, confidence: bool = True) -> "PortableAvatar":
+    def portable(self, confidence: bool = True) -> "mien.runtime.PortableAvatar":
         """Return the whole avatar. `confidence` asks for what was filmed of each triangle, if that is known."""
         ...
 
-    def mesh(self) -> "MeshModel":
+    def mesh(self) -> "mien.export.MeshModel":
         """Return the person's mesh with its texture coordinates. Avatars that come from a file have none."""
         ...
 
-    def pose(self) -> "Gaussians":
+    def pose(self) -> "mien.gaussians.Gaussians":
         """Return the Gaussians with the expression that was asked for.
 
         The head is at the origin, +y up, +z out of the face.
         """
         ...
 
-    def poses(self) -> "tuple[Iterator[Gaussians], float] | None":
+    def poses(self) -> "tuple[Iterator[mien.gaussians.Gaussians], float] | None":
         """Return the Gaussians of every frame of the motion, as in `pose`, and frames per second; None without one."""
         ...
 
-    def motion(self) -> "Motion | None":
+    def motion(self) -> "mien.export.Motion | None":
         """Return the motion that was asked for, as face parameters with head poses."""
         ...
 
-    def trained(self) -> "tuple[Avatar, FaceParams]":
+    def trained(self) -> "tuple[mien.avatar.Avatar, mien.face.FaceParams]":
         """Return the trained avatar, and the person at all timesteps of its training."""
         ...
 
@@ -64,7 +65,7 @@ class Options:
     """Degree of the spherical harmonics in the file."""
     webgpu: bool = False
     """Whether a page draws with WebGPU where the browser has it."""
-    webcam: "WebcamFiles | None" = None
+    webcam: "mien.export.WebcamFiles | None" = None
     """Files of the face landmarker, with which a webcam drives a page."""
 
 
@@ -86,7 +87,7 @@ class Format:
     write: Callable[[Path, Content, Options], str]
     endings: tuple[str, ...] = ()
     """Endings of the files, in lower case with the dot. Only folders have none."""
-    read: "Callable[[Path], PortableAvatar | Gaussians] | None" = None
+    read: "Callable[[Path], mien.runtime.PortableAvatar | mien.gaussians.Gaussians] | None" = None
     """Function that reads a file: a whole avatar, or Gaussians in one pose (the first of a sequence). It raises
     UserError in one line that names the path. None if files of this format are not read."""
     options: frozenset[str] = frozenset()
