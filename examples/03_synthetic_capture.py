@@ -7,7 +7,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mien.capture import write_capture
+from mien.capture import read_capture_hash, write_capture
 from mien.face import load_face_model
 from mien.synthetic import RECIPES, synthesize
 from mien.tracking import make_scoring, write_overlay, write_scoring, write_tracking
@@ -31,7 +31,8 @@ def main() -> None:
     face_model = load_face_model(truth.face_model)
     write_capture(folder / "capture", capture)
     write_tracking(folder / "tracking", truth)
-    write_scoring(folder / "scoring", make_scoring(capture, truth, face_model))  # what is trained on and scored
+    scoring = make_scoring(capture, truth, face_model)  # what is trained on and scored
+    write_scoring(folder / "scoring", scoring, read_capture_hash(folder / "capture"))
     write_overlay(folder / "tracking" / "overlay.mp4", capture, truth, face_model)
     print(f"wrote {folder}; look at tracking/overlay.mp4")
 

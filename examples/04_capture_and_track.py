@@ -7,7 +7,7 @@ import argparse
 import math
 from pathlib import Path
 
-from mien.capture import CaptureSettings, capture_video
+from mien.capture import CaptureSettings, capture_video, read_capture_hash
 from mien.face import load_face_model
 from mien.tracking import make_scoring, track, write_overlay, write_scoring, write_tracking
 from mien.workspace import Workspace
@@ -33,7 +33,8 @@ def main() -> None:
     )
 
     write_tracking(folder / "tracking", tracking)
-    write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model))
+    scoring = make_scoring(capture, tracking, face_model)
+    write_scoring(folder / "scoring", scoring, read_capture_hash(folder / "capture"))
     write_overlay(folder / "tracking" / "overlay.mp4", capture, tracking, face_model)
     print(f"look at {folder / 'tracking' / 'overlay.mp4'}, then train: mien train {options.out}")
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from mien.avatar import load_avatar
 from mien.camera import Camera
-from mien.capture import Capture, CaptureSettings, capture_video, write_capture
+from mien.capture import Capture, CaptureSettings, capture_video, read_capture_hash, write_capture
 from mien.capture.video import write_video
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render import rasterize
@@ -83,7 +83,8 @@ def write_clip(name: str, out: Path) -> Path:
         )
         write_capture(folder / "capture", capture)
         write_tracking(folder / "tracking", scene.tracking())
-        write_scoring(folder / "scoring", make_scoring(capture, scene.tracking(), scene.model))
+        scoring = make_scoring(capture, scene.tracking(), scene.model)
+        write_scoring(folder / "scoring", scoring, read_capture_hash(folder / "capture"))
     return folder
 
 
