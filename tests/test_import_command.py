@@ -87,6 +87,7 @@ def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFix
     refused(["export", str(made / "I"), "--out", f"{out}.ply", *as_folder], "writes a folder", capsys)
     refused(["export", str(made / "I"), "--out", out, *as_folder, "--every", "2"], "holds every timestep", capsys)
     refused(["export", str(made / "I"), "--out", f"{out}.mien", "--format", "ply"], "does not end in .ply", capsys)
+    refused(["export", str(made / "I"), "--out", f"{out}.ply", "--format", "usd"], "in .usd or .usda or .usdc", capsys)
     assert not list(tmp_path.iterdir())
 
 

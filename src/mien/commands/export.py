@@ -120,8 +120,11 @@ class Command:
         if kind.holds == "folder":
             if format_of(self.out) is not None:
                 raise UserError(f"{self.out}: --format {kind.name} writes a folder; give a name without an ending")
-        elif self.out.suffix.lower() != f".{self.format}":
-            raise UserError(f"{self.out}: does not end in .{self.format}, as --format {self.format} asks; rename it")
+        else:
+            asked = kind.endings if self.format == kind.name else (f".{self.format}",)
+            if self.out.suffix.lower() not in asked:
+                use = " or ".join(asked)
+                raise UserError(f"{self.out}: does not end in {use}, as --format {self.format} asks; rename it")
         return kind
 
     def _unknown_ending(self) -> UserError:
@@ -159,6 +162,8 @@ class Command:
                 f"{self.workspace}: a file holds one avatar at rest; leave --run, --set, --series, --neutral and "
                 "--every out, or give its workspace"
             )
+        if not kind.from_files and kind.holds == "folder":
+            raise UserError(f"{self.workspace}: a file has no training, which a folder holds; give its workspace")
         if not kind.from_files:
             raise self._unknown_ending()
         if self.out.exists() and self.out.samefile(self.workspace):
