@@ -1,7 +1,9 @@
 """Share fixtures, divide the tests among processes, and list the skipped ones at the end."""
 
 import os
+import signal
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,16 @@ MOST_WORKERS = 4
 """Largest number of worker processes. More gain little, since the longest files take a quarter of the time."""
 MEMORY_OF_A_WORKER = 3 << 30
 """Memory that a worker needs, in bytes."""
+
+
+@pytest.fixture(autouse=True)
+def _hear_signals() -> Iterator[None]:
+    """Let Ctrl-C and SIGHUP be heard, also where the tests run in the background or under nohup, which ignore them."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -14,15 +13,6 @@ from mien import stops
 from mien.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Put, Terminated, orderly_stops, stops_put_off
 
 KINDS = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, HungUp)]
-
-
-@pytest.fixture(autouse=True)
-def _hear_ctrl_c() -> Iterator[None]:
-    """Let Ctrl-C and SIGHUP be heard, also where the tests were started in the background and ignore them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGINT, before[0])
-    signal.signal(signal.SIGHUP, before[1])
 
 
 @pytest.mark.parametrize(("number", "kind"), KINDS)
