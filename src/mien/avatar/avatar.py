@@ -83,7 +83,7 @@ def _one() -> int:
 
 @dataclass(frozen=True, eq=False)
 class Lessons:
-    """What a new avatar learns before the first step, without pictures."""
+    """Lessons that a new avatar gets before the first step, without pictures."""
 
     count: int
     """Number of lessons."""
@@ -93,14 +93,14 @@ class Lessons:
 
 @dataclass(frozen=True, eq=False)
 class Extras:
-    """What only some methods have. The defaults are those of most methods."""
+    """Properties that only some methods have. The defaults are those of most methods."""
 
     surface: BoundSurface | None = None
     """The surface that the Gaussians are bound to."""
     frames_per_step: Callable[[], int] = _one
     """Returns the number of training frames that the next optimiser step uses."""
     lessons: Lessons | None = None
-    """What the avatar learns before the first step."""
+    """Lessons before the first step. None if the avatar needs none."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
 
@@ -124,7 +124,7 @@ class Avatar(nn.Module, ABC):
         self.subject = neutral_of(face)
         """One timestep: this person's identity and offsets, and the face at rest."""
         self.filmed: Filmed | None = None
-        """What training saw of the face. None if it is not known, as for imported avatars."""
+        """The part of the face that training saw. None if it is not known, as for imported avatars."""
 
     @abstractmethod
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:

@@ -16,7 +16,7 @@ _FILL_HEIGHT = 0.9
 
 @dataclass(frozen=True, eq=False)
 class SurfacePrior:
-    """What is known of each of the f triangles of a head without training: from the mesh, the mattes and symmetry."""
+    """Knowledge of each of the f triangles of a head without training: from the mesh, the mattes and symmetry."""
 
     hair: Float[Tensor, " f"]
     """Height of hair along the triangle's normal, in metres; 0 on skin that no hair hangs over."""
@@ -44,7 +44,7 @@ class SurfacePrior:
 
 
 class BoundSurface(ABC):
-    """What training does with Gaussians that are bound to the f triangles of a face model, between two steps."""
+    """Operations of training on Gaussians that are bound to the f triangles of a face model, between two steps."""
 
     @abstractmethod
     def triangles(self) -> Int[Tensor, " n"]:

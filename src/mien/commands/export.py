@@ -19,7 +19,7 @@ _REFUSED = {
     "sh": "only a .ply has a degree to choose; leave --sh out",
     "webcam": "only an .html page has a webcam; leave --webcam out, or write a .html file",
 }
-"""What is told of an option that the format does not take."""
+"""Messages for options that the format does not take."""
 
 
 @dataclass(frozen=True)

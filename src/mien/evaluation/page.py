@@ -1,4 +1,4 @@
-"""What report.html, compare.html and analysis.html share: the templates, explanations, tables, pictures and videos.
+"""Parts of report.html, compare.html and analysis.html: the templates, explanations, tables, pictures and videos.
 
 A page is one file that can be sent around. It needs no network and no scripts, and works in light, in dark and on
 paper. Its HTML is in `templates/`, which escapes every text. Python code prepares what the templates show.

@@ -54,7 +54,7 @@ class RunRecord:
     """Content of training.json: steps, seconds, gaussians, step_ms_median, peak_memory_mb."""
     curves: Mapping[str, np.ndarray]
     coverage: Coverage | None = None
-    """What the training pictures show of the head, if the run kept it."""
+    """The part of the head that the training pictures show, if the run kept it."""
 
 
 def write_report(

@@ -61,7 +61,7 @@ class ComparedFrame:
 
 @dataclass(frozen=True)
 class Filmed:
-    """What the training pictures show of the head."""
+    """The part of the head that the training pictures show."""
 
     pictures: Sequence[Picture]
     note: str

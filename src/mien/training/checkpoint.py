@@ -36,7 +36,7 @@ class TrainingState:
     parts: tuple[TrainingPart, ...] = ()
     """What joins this training."""
     covered: Coverage | None = None
-    """What the training pictures show of the head, if a part has asked for it."""
+    """The part of the head that the training pictures show, if a part has asked for it."""
     step: int = 0
     """Number of steps done."""
     seconds: float = 0.0

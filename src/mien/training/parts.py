@@ -89,7 +89,7 @@ class Preparation:
 
     @property
     def coverage(self) -> Coverage:
-        """What the training pictures show of the head, computed at its first use."""
+        """The part of the head that the training pictures show, computed at its first use."""
         if self.known_coverage is None:
             self.known_coverage = coverage(self.face_model, self.sequences, self.faces, self.frames)
         return self.known_coverage

@@ -1,4 +1,4 @@
-"""What `mien export` writes: the avatar of a run, or one that comes from a file."""
+"""The content that `mien export` writes: the avatar of a run, or one that comes from a file."""
 
 from collections.abc import Iterator
 from copy import copy
