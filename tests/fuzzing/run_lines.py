@@ -34,7 +34,8 @@ PARTS = (
 )
 LINES, LIGHT, HEAVY = "command lines", "line", "heavy line"
 """Name of the format in the table, and prefixes of the names of its cases."""
-FINE = frozenset({0, 2, 130, 141, 143})
+FINE = frozenset({0, 2, 129, 130, 141, 143})
+"""Exit codes of success, of a mistake of the user, and of SIGHUP, SIGINT, SIGPIPE and SIGTERM."""
 TESTS = str(Path(__file__).parent.parent)
 APART = 0.08
 """Share of the lines that run in a new process instead of a fork, whether or not they need one."""
