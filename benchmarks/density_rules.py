@@ -22,13 +22,13 @@ from mien.avatar import Avatar, DensityRules, FaceTuning, GaussianAvatarsConfig,
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit, evenly_spread
 from mien.face import FaceParams, load_face_model
+from mien.lab.synthetic import Segment, SyntheticRecipe, synthesize
 from mien.render import rasterize
 from mien.storage import read_tensors
-from mien.synthetic import Segment, SyntheticRecipe, synthesize
 from mien.tracking import Scoring, make_scoring
 from mien.training import PRESETS, Sequence, TrainSettings, held_out, read_curves, train
-from mien.training.frames import Frame
-from mien.training.sequence import composite
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import composite
 
 RECIPE = SyntheticRecipe(
     name="rules", width=256, height=256, fps=10.0, cameras="ring", ring_size=6, glasses=False,

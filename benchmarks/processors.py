@@ -23,8 +23,8 @@ import torch
 from mien.avatar import Avatar, GaussianAvatarsConfig, load_avatar
 from mien.capture import Capture, read_capture, write_capture
 from mien.face import load_face_model
+from mien.lab.synthetic import RECIPES, synthesize
 from mien.render import rasterize
-from mien.synthetic import RECIPES, synthesize
 from mien.tracking import Tracking, read_tracking, track, write_tracking
 from mien.training import Sequence, TrainSettings, train
 

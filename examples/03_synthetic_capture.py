@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mien.capture import read_capture_hash, write_capture
 from mien.face import load_face_model
-from mien.synthetic import RECIPES, synthesize
+from mien.lab.synthetic import RECIPES, synthesize
 from mien.tracking import make_scoring, write_overlay, write_scoring, write_tracking
 from mien.workspace import Workspace
 

@@ -1,4 +1,4 @@
-// Changes of Gaussians with the expression, of low rank (src/mien/avatar/expression_changes.py has the same in
+// Changes of Gaussians with the expression, of low rank (src/mien/avatar/ops/expression_changes.py has the same in
 // PyTorch).
 #pragma once
 

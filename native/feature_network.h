@@ -1,4 +1,4 @@
-// HeadGaS' features (src/mien/avatar/feature_network.py has the same in PyTorch): every Gaussian blends a basis of
+// HeadGaS' features (src/mien/avatar/ops/feature_network.py has the same in PyTorch): every Gaussian blends a basis of
 // features by the inputs of a face, and a network of two layers, the same for all Gaussians, turns the blended features
 // and some numbers of its own into outputs.
 #pragma once

@@ -1,5 +1,5 @@
 // A dense network, the same for many points, whose layers may read an earlier layer a second time
-// (src/mien/avatar/point_network.py has the same in PyTorch).
+// (src/mien/avatar/ops/point_network.py has the same in PyTorch).
 #pragma once
 
 #include <cstdint>

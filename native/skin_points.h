@@ -1,4 +1,4 @@
-// Points from their places in one pose of a skeleton to those in others (src/mien/avatar/skin_points.py has the same in
+// Points from their places in one pose of a skeleton to those in others (src/mien/avatar/ops/skin_points.py has the same in
 // PyTorch): skinning undone, displacements added, skinned again.
 #pragma once
 

@@ -15,8 +15,8 @@ from mien.pictures import to_uint8
 from mien.render import rasterize
 from mien.tracking import Scoring, Tracking
 from mien.training import Split, held_out
-from mien.training.frames import Frame
-from mien.training.sequence import Sequence
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence
 from small_face_model import make_small_face_model
 
 SIZE = 72

@@ -14,7 +14,7 @@ from mien.render import rasterize
 from mien.render.camera_paths import orbit
 from mien.tracking import write_scoring, write_tracking
 from mien.training import TrainSettings, read_sequence, train
-from mien.training.sequence import Sequence
+from mien.training.footage.sequence import Sequence
 
 
 def two_cameras(experiment: Experiment, name: str) -> Sequence:

@@ -6,9 +6,9 @@
 import json
 from pathlib import Path
 
-from mien.synthetic import ReferenceCapture
-from mien.synthetic.references import REFERENCES
-from mien.synthetic.signature import signature_of
+from mien.lab.synthetic import ReferenceCapture
+from mien.lab.synthetic.references import REFERENCES
+from mien.lab.synthetic.signature import signature_of
 
 _FILE = Path(__file__).with_suffix(".json")
 

@@ -7,7 +7,7 @@ import torch
 
 from instruction_sets import ISAS, each_isa
 from mien import _native
-from mien.avatar.activation import sigmoid
+from mien.avatar.ops.activation import sigmoid
 
 
 @pytest.fixture(params=ISAS)

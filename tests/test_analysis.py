@@ -17,7 +17,13 @@ import toy_scene
 import train_toy
 from capture_helpers import tree_bytes
 from damage import edit_json
-from mien.analysis import (
+from mien.capture.video import write_video
+from mien.cli import main
+from mien.commands.analyze import AnalysisName, Command
+from mien.errors import UserError
+from mien.evaluation.plots import Axes, Series
+from mien.face import FaceModel
+from mien.lab.analysis import (
     ANALYSES,
     Analysis,
     AnalysisOptions,
@@ -30,14 +36,8 @@ from mien.analysis import (
     chosen_parts,
     run_analysis,
 )
-from mien.analysis.gaussian_avatars import growth, speed
-from mien.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
-from mien.capture.video import write_video
-from mien.cli import main
-from mien.commands.analyze import AnalysisName, Command
-from mien.errors import UserError
-from mien.evaluation.plots import Axes, Series
-from mien.face import FaceModel
+from mien.lab.analysis.gaussian_avatars import growth, speed
+from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
 from mien.storage import write_tensors
 from mien.training import read_curves
 from toy_workspace import write_toy_workspace

@@ -13,16 +13,16 @@ import torch
 
 import train_toy
 from capture_helpers import tree_bytes
-from mien.analysis import ANALYSES, AnalysisOptions
-from mien.analysis.context import Context
-from mien.analysis.headgas import ablations, beyond, layers, sizes
-from mien.analysis.headgas.basis import start_of_bases
-from mien.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
-from mien.analysis.views import head_camera, labelled, mouth_camera
 from mien.avatar import GradientSettings, HeadGasConfig, PerceptualLoss, Photometric
 from mien.capture.video import count_frames
 from mien.cli import main
 from mien.gaussians import Gaussians
+from mien.lab.analysis import ANALYSES, AnalysisOptions
+from mien.lab.analysis.context import Context
+from mien.lab.analysis.headgas import ablations, beyond, layers, sizes
+from mien.lab.analysis.headgas.basis import start_of_bases
+from mien.lab.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
+from mien.lab.analysis.views import head_camera, labelled, mouth_camera
 from mien.runtime.filmed import head_angles
 from toy_scene import toy_camera, toy_face, toy_face_model
 from toy_workspace import write_toy_workspace

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import train_toy
-from mien.analysis import ANALYSES
-from mien.analysis.mono_gaussian_avatar import times
-from mien.analysis.mono_gaussian_avatar.subsets import Measured, frontal_quarter, masks, measure, mixed_half, ranges
 from mien.avatar import MonoGaussianAvatarConfig
 from mien.cli import main
+from mien.lab.analysis import ANALYSES
+from mien.lab.analysis.mono_gaussian_avatar import times
+from mien.lab.analysis.mono_gaussian_avatar.subsets import Measured, frontal_quarter, masks, measure, mixed_half, ranges
 from mien.training import TrainSettings
-from mien.training.frames import training_frames
+from mien.training.footage.frames import training_frames
 from toy_scene import toy_sequence
 from toy_workspace import write_toy_workspace
 

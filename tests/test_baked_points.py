@@ -8,7 +8,7 @@ import torch
 
 from mien import _native, runtime
 from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig
-from mien.avatar.mono_networks import AttributeChangeNet, AttributeNet, DeformationNet
+from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, DeformationNet
 from mien.runtime import posing
 from mien.runtime.baked import BlendSkinned
 from test_point_network import NETWORKS, Sizes, arguments, isa, layers_of, point_network

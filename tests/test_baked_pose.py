@@ -8,7 +8,7 @@ import torch
 
 from mien.avatar import Avatar, HeadGas, load_avatar
 from mien.avatar.files import write_avatar
-from mien.avatar.headgas_settings import HeadGasConfig
+from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.schedules import Progress
 from mien.face import FaceParams
 from test_mono_gaussian_avatar import new_avatar

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from mien.avatar import METHODS
-from mien.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
 from mien.cli import main
 from mien.commands.stages import comparing
 from mien.commands.stages.comparing import Budget, CompareSettings
 from mien.face import add_face_model
+from mien.lab.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
 from mien.training import read_run_config, read_training_summary
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mien.benchmarking.following import (
+from mien.face import FaceParams
+from mien.lab.benchmarking.following import (
     LIDS,
     blink_following,
     eye_opening,
@@ -16,9 +17,8 @@ from mien.benchmarking.following import (
     still_timesteps,
     turn_following,
 )
-from mien.face import FaceParams
+from mien.lab.synthetic import Truth
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.synthetic import Truth
 from mien.tracking import Tracking
 from small_face_model import make_small_face_model
 from tracking_case import still_camera

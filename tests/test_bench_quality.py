@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from mien.benchmarking.following import Following
-from mien.benchmarking.quality import (
+from mien.capture import Capture
+from mien.cli import main
+from mien.commands.bench import CaptureName
+from mien.lab.benchmarking.following import Following
+from mien.lab.benchmarking.quality import (
     QualityRow,
     TrackingErrors,
     aligned_distance,
@@ -17,10 +20,7 @@ from mien.benchmarking.quality import (
     tracking_cells,
     tracking_errors,
 )
-from mien.capture import Capture
-from mien.cli import main
-from mien.commands.bench import CaptureName
-from mien.synthetic import RECIPES, REFERENCES, Segment, SyntheticScene, truth_of
+from mien.lab.synthetic import RECIPES, REFERENCES, Segment, SyntheticScene, truth_of
 
 RECIPE = replace(
     RECIPES["demo"], width=128, height=128, fps=10.0, glasses=False, hair="none",

@@ -12,15 +12,15 @@ import pytest
 import torch
 
 from mien import _native
-from mien.avatar.headgas_settings import PRESETS as HEADGAS_PRESETS
-from mien.benchmarking import device as device_benchmark
-from mien.benchmarking import headgas_step, mono_step, train_step
-from mien.benchmarking import render as render_benchmark
-from mien.benchmarking.charts import write_scaling_chart
-from mien.benchmarking.scenes import head_scene
-from mien.benchmarking.timing import BenchmarkRow, Timing, measure_machine, time_function
+from mien.avatar.headgas.settings import PRESETS as HEADGAS_PRESETS
 from mien.cli import main
 from mien.face import load_face_model
+from mien.lab.benchmarking import device as device_benchmark
+from mien.lab.benchmarking import headgas_step, mono_step, train_step
+from mien.lab.benchmarking import render as render_benchmark
+from mien.lab.benchmarking.charts import write_scaling_chart
+from mien.lab.benchmarking.scenes import head_scene
+from mien.lab.benchmarking.timing import BenchmarkRow, Timing, measure_machine, time_function
 from mien.render import rasterize
 from mien.training.trainer import step
 from needs import HAS_GPU

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.avatar.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
+from mien.avatar.ops.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.gaussians import Gaussians

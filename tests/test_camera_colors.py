@@ -17,7 +17,7 @@ from mien.training import Sequence, TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
-from mien.training.frames import Frame, training_frames
+from mien.training.footage.frames import Frame, training_frames
 from mien.training.trainer import start
 from toy_scene import toy_sequence
 

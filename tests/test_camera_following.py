@@ -18,9 +18,9 @@ from mien.cli import main
 from mien.driving.live import Follower, FollowOptions, LandmarkFit, OneEuro
 from mien.errors import UserError
 from mien.face import load_face_model
+from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime import write_portable
-from mien.synthetic import RECIPES, Segment, SyntheticScene
 from mien.viewer import CameraSwitch, DrawingLoop, Seen, Session, View
 from mien.viewer.meters import Meters
 from web_case import drawn_head

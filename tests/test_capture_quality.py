@@ -14,8 +14,8 @@ from mien.capture.quality import measure_face, quality_report, relative_quality,
 from mien.capture.tone import srgb_signal
 from mien.capture.video import read_lazily, read_video_frames, write_video
 from mien.cli import main
-from mien.synthetic.captures import write_synthetic_video
-from mien.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.captures import write_synthetic_video
+from mien.lab.synthetic.recipe import SyntheticRecipe
 from test_capture_pictures import light_of
 
 SIDE = 240

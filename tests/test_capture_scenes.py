@@ -11,7 +11,7 @@ from mien.avatar import DEFAULT_METHOD
 from mien.capture import read_capture
 from mien.capture.video import write_video
 from mien.cli import main
-from mien.synthetic import SyntheticRecipe, SyntheticScene
+from mien.lab.synthetic import SyntheticRecipe, SyntheticScene
 
 FPS = 10.0
 WIDTH, HEIGHT = 400, 240

@@ -6,17 +6,17 @@ import pytest
 import torch
 
 from mien.avatar import GaussianStore, SurfacePrior, method_named
-from mien.avatar.gaussian_avatars import GaussianAvatars
-from mien.avatar.triangle_frames import triangle_ellipses
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
+from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face.head_parts import head_parts
 from mien.gaussians import rgb_from_sh, sh_from_rgb
 from mien.render import rasterize
 from mien.training import PRESETS
-from mien.training.contribution import contributions, tidy
-from mien.training.coverage import triangle_views
-from mien.training.head_parts import head_parts
-from mien.training.unseen import Unseen
+from mien.training.footage.coverage import triangle_views
+from mien.training.whole_head.contribution import contributions, tidy
+from mien.training.whole_head.unseen import Unseen
 from toy_scene import surface_of
 
 _COLOR = 0.3

@@ -21,9 +21,9 @@ from mien.avatar import (
     make_portable,
 )
 from mien.avatar.density import GradientDensity
-from mien.avatar.gaussian_avatars_settings import SurfaceLimits
-from mien.avatar.surface_limits import keep_on_surface
-from mien.avatar.triangle_frames import triangle_ellipses
+from mien.avatar.gaussian_avatars.settings import SurfaceLimits
+from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface
+from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.errors import UserError
 from mien.export import MeshModel, read_glb, read_ply, write_glb, write_page, write_ply
 from mien.face import FaceModel
@@ -32,11 +32,11 @@ from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
 from mien.runtime.baked import Filmed
 from mien.training import Sequence, TrainSettings, filmed_words, read_coverage, train
-from mien.training.coverage import Coverage, coverage, drawn_share, smoothstep
 from mien.training.density_control import density_strategy
-from mien.training.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
-from mien.training.frames import Frame, training_frames
-from mien.training.unseen import Unseen, spare_fills, unseen_of
+from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
+from mien.training.footage.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
+from mien.training.footage.frames import Frame, training_frames
+from mien.training.whole_head.unseen import Unseen, spare_fills, unseen_of
 from toy_scene import surface_of, toy_face, toy_sequence
 
 SETTINGS = TrainSettings(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)
@@ -49,7 +49,7 @@ def toy() -> tuple[FaceModel, Sequence]:
 
 def covered(toy: tuple[FaceModel, Sequence]) -> Coverage:
     model, sequence = toy
-    return coverage(model, [sequence], [sequence.tracking.face], training_frames([sequence], SETTINGS))
+    return measure_coverage(model, [sequence], [sequence.tracking.face], training_frames([sequence], SETTINGS))
 
 
 def facing(model: FaceModel) -> torch.Tensor:
@@ -67,7 +67,9 @@ def test_the_front_is_seen_and_the_back_is_not(toy: tuple[FaceModel, Sequence]) 
     assert (found.colors[found.seen == 0] == 0.5).all()
     between = (found.seen > 0.02) & (found.seen < 0.98)
     assert between.any(), "confidence fades"
-    threaded = coverage(model, [sequence], [sequence.tracking.face], [Frame(0, t, 0) for t in range(5)], threads=3)
+    threaded = measure_coverage(
+        model, [sequence], [sequence.tracking.face], [Frame(0, t, 0) for t in range(5)], threads=3
+    )
     assert torch.equal(threaded.seen, found.seen)
 
 
@@ -276,7 +278,7 @@ def test_needles_grow_wider_and_not_shorter() -> None:
 def test_ellipses_have_the_moments_of_their_triangles() -> None:
     torch.manual_seed(0)
     vertices, faces = torch.randn(9, 3), torch.arange(9).view(3, 3)
-    from mien.avatar.triangle_frames import bind_to_world
+    from mien.avatar.ops.triangle_frames import bind_to_world
     from mien.rotation import matrix_from_quaternion
 
     quats, log_scales = triangle_ellipses(vertices, faces)

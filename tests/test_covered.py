@@ -8,15 +8,15 @@ import torch
 
 from mien.capture import Capture
 from mien.evaluation.load import held_out_by_protocol
-from mien.synthetic import SyntheticRecipe, SyntheticScene, synthesize
+from mien.lab.synthetic import SyntheticRecipe, SyntheticScene, synthesize
 from mien.tracking import Tracking, read_tracking, residual_report, write_tracking
 from mien.tracking.landmarks import LEFT_EYELIDS, RIGHT_EYELIDS
 from mien.tracking.pixels.covered import covered_parts, the_face, usual_look
 from mien.tracking.report.page import findings
 from mien.tracking.tracking import PARTS
 from mien.training import TrainSettings
-from mien.training.frames import held_out, training_frames
-from mien.training.sequence import Sequence
+from mien.training.footage.frames import held_out, training_frames
+from mien.training.footage.sequence import Sequence
 from occlusion_case import with_hand, with_slab
 
 RECIPE = SyntheticRecipe(

@@ -9,7 +9,7 @@ import torch
 
 from mien.errors import UserError
 from mien.face import load_face_model
-from mien.synthetic.detector_calibration import Sightings, fit_response
+from mien.lab.synthetic.detector_calibration import Sightings, fit_response
 from mien.tracking.fitting import CameraBatch, Fit, SequenceFit, Views, batch_of, layout_of
 from mien.tracking.landmarks import DetectorResponse, all_landmarks, read_response, reduce_face_model, write_response
 from mien.tracking.landmarks.detector_response import unknown_response

@@ -15,8 +15,8 @@ from mien.camera import Camera
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.training import TrainSettings, batch, trainer
-from mien.training.frames import FrameOrder, training_frames
-from mien.training.sequence import Targets
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from toy_scene import toy_sequence
 
 META = torch.zeros((), device="meta")

@@ -27,8 +27,8 @@ from mien.face import FaceModel
 from mien.progress import Advance
 from mien.training import TrainSettings, train
 from mien.training.checkpoint import TrainingState
-from mien.training.frames import FrameOrder, training_frames
-from mien.training.sequence import Sequence, Targets
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Sequence, Targets
 from mien.training.trainer import TrainingData, start, step
 from toy_scene import toy_sequence
 from toy_workspace import write_toy_workspace

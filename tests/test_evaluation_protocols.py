@@ -27,7 +27,7 @@ from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.pictures import to_uint8
 from mien.storage import write_json
 from mien.training import TrainSettings
-from mien.training.frames import Frame, spread_frames
+from mien.training.footage.frames import Frame, spread_frames
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=40)
 STEPS = 12

@@ -12,12 +12,12 @@ from mien import exact
 from mien.avatar import DEFAULT_METHOD, METHODS
 from mien.files import file_digest, write_json
 from mien.gaussians import Gaussians
+from mien.lab.synthetic import RECIPES, SyntheticScene
+from mien.lab.synthetic.light import Visibility
 from mien.render import rasterize
-from mien.synthetic import RECIPES, SyntheticScene
-from mien.synthetic.light import Visibility
 from mien.training import TrainSettings, trainer
-from mien.training.frames import FrameOrder, background_at, training_frames
-from mien.training.sequence import Targets
+from mien.training.footage.frames import FrameOrder, background_at, training_frames
+from mien.training.footage.sequence import Targets
 from rasterize_scenes import random_scene
 from toy_scene import toy_sequence
 

@@ -13,7 +13,7 @@ from mien.cli import main
 from mien.commands.stages.viewing import _of_file
 from mien.runtime import read_portable
 from mien.training import read_coverage
-from mien.training.filmed import FILE
+from mien.training.footage.filmed import FILE
 from toy_workspace import write_toy_workspace
 
 

@@ -17,7 +17,8 @@ import train_toy
 from instruction_sets import ISAS, each_isa
 from mien import _native, runtime
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, make_portable
-from mien.avatar.expression_changes import (
+from mien.avatar.gaussian_avatars.avatar import resting_opacities
+from mien.avatar.ops.expression_changes import (
     MARGIN,
     activations_reference,
     expression_change,
@@ -25,7 +26,6 @@ from mien.avatar.expression_changes import (
     principal_directions,
     within_reach,
 )
-from mien.avatar.gaussian_avatars import resting_opacities
 from mien.errors import UserError
 from mien.progress import Advance
 from mien.render.rendering import Rendering

@@ -14,7 +14,7 @@ import train_toy
 from mien import runtime
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, make_portable
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.feature_network import Layers, feature_network_reference
+from mien.avatar.ops.feature_network import Layers, feature_network_reference
 from mien.avatar.settings import GradientSettings
 from mien.errors import UserError
 from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
@@ -23,8 +23,8 @@ from mien.progress import Advance
 from mien.render.rendering import Rendering
 from mien.runtime.checks import baked_fault
 from mien.training import train
-from mien.training.frames import FrameOrder, training_frames
-from mien.training.sequence import Targets
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.adam import FactoredGradient, FactoredMoments
-from mien.avatar.feature_network import Layers, feature_network, feature_network_reference
+from mien.avatar.ops.feature_network import Layers, feature_network, feature_network_reference
 from mien.training.adam import FactoredUpdate, factored_update, factored_update_reference
 
 Sizes = tuple[int, int, int, int, int, int]

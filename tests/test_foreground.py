@@ -8,8 +8,8 @@ import pytest
 
 import train_toy
 from mien.training import train
-from mien.training.foreground import foreground_colors, soft_pixels
-from mien.training.sequence import Targets, composite
+from mien.training.footage.foreground import foreground_colors, soft_pixels
+from mien.training.footage.sequence import Targets, composite
 from toy_scene import toy_sequence
 
 WALL = np.array([210.0, 220.0, 235.0])
@@ -84,7 +84,7 @@ def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch: pyt
         cleaned.append(1)
         return foreground_colors(*pictures)
 
-    monkeypatch.setattr("mien.training.sequence.foreground_colors", counted)
+    monkeypatch.setattr("mien.training.footage.sequence.foreground_colors", counted)
     for keep in (True, False):
         targets = Targets(sequence, 0, cleaned=True)
         cleaned.clear()
@@ -106,7 +106,7 @@ def test_training_reads_the_setting(edges: str, tmp_path: Path, monkeypatch: pyt
         asked.append(1)
         return foreground_colors(*pictures)
 
-    monkeypatch.setattr("mien.training.sequence.foreground_colors", counted)
+    monkeypatch.setattr("mien.training.footage.sequence.foreground_colors", counted)
     settings = replace(train_toy.SETTINGS, edges=edges)  # type: ignore[arg-type]
     train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
     assert bool(asked) == (edges == "cleaned")

@@ -9,10 +9,10 @@ from torch import Tensor
 from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, GaussianStore, Progress
-from mien.avatar.gaussian_avatars import (
+from mien.avatar.gaussian_avatars.avatar import (
     never_empty_a_triangle,
 )
-from mien.avatar.triangle_penalties import triangle_penalties, triangle_penalties_reference
+from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, world_means
 from mien.render import rasterize

@@ -5,11 +5,11 @@ import torch
 
 from mien.camera import camera_from_fov
 from mien.face import FaceModel, load_face_model
+from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.tracking import NeckParts, fit_neck_cut
 from mien.tracking.neck_cut import above_neck_cut
-from mien.training.hair_curtain import hair_curtain
-from mien.training.head_parts import head_parts
+from mien.training.whole_head.hair_curtain import hair_curtain
 
 _HAIR = 0.02
 

@@ -7,12 +7,12 @@ import torch
 from mien.camera import camera_from_fov
 from mien.capture import Capture
 from mien.face import FaceModel, load_face_model
+from mien.face.head_parts import head_parts
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.tracking import Tracking
 from mien.training import Sequence
-from mien.training.frames import Frame
-from mien.training.hair_height import hair_height, hanging_hair
-from mien.training.head_parts import head_parts
+from mien.training.footage.frames import Frame
+from mien.training.whole_head.hair_height import hair_height, hanging_hair
 
 _SIZE, _TIMESTEPS = 160, 7
 

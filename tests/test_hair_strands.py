@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from mien.avatar import SurfacePrior, method_named
-from mien.avatar.hair_strands import strand_gaussians
-from mien.avatar.triangle_frames import frames_to_world, triangle_frames
+from mien.avatar.gaussian_avatars.hair_strands import strand_gaussians
+from mien.avatar.ops.triangle_frames import frames_to_world, triangle_frames
 from mien.face import FaceModel, load_face_model
+from mien.face.head_parts import head_parts
 from mien.gaussians import rgb_from_sh
 from mien.rotation import matrix_from_quaternion
 from mien.training import PRESETS
-from mien.training.head_parts import head_parts
 from toy_scene import surface_of
 
 _HEIGHT = 0.02

@@ -7,16 +7,16 @@ import pytest
 import torch
 
 from mien.avatar import SurfacePrior, method_named
-from mien.avatar.gaussian_avatars import GaussianAvatars
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.face import FaceModel, load_face_model
+from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.training import PRESETS, Sequence, TrainSettings, read_training_summary, train
-from mien.training.frames import training_frames
-from mien.training.hair_surface import HairSurface, hair_surface
-from mien.training.head_parts import head_parts
+from mien.training.footage.frames import training_frames
 from mien.training.parts import Preparation
 from mien.training.trainer import start
-from mien.training.whole_head import prepare_whole_head
+from mien.training.whole_head.hair_surface import HairSurface, hair_surface
+from mien.training.whole_head.part import prepare_whole_head
 from toy_scene import surface_of, toy_sequence
 
 _HAIR, _RATE = 0.02, 1e-3

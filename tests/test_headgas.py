@@ -9,8 +9,8 @@ from torch import Tensor
 from mien.avatar import HeadGas, HeadGasConfig, Progress
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.headgas import input_directions, neighbour_distances, sample_surface, spread_out
-from mien.avatar.headgas_settings import PRESET_STEPS, PRESETS
+from mien.avatar.headgas.avatar import input_directions, neighbour_distances, sample_surface, spread_out
+from mien.avatar.headgas.settings import PRESET_STEPS, PRESETS
 from mien.avatar.settings import Photometric
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.runtime import pose

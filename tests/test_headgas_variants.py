@@ -11,8 +11,8 @@ import torch
 from mien import runtime
 from mien.avatar import GradientSettings, HeadGas, HeadGasConfig, Progress, load_avatar, make_portable, write_avatar
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.headgas_settings import Variant
-from mien.avatar.headgas_variants import MOVED, SHIFT_LENGTH, VARIANTS, averaging_weights
+from mien.avatar.headgas.settings import Variant
+from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, VARIANTS, averaging_weights
 from mien.config import decode, encode
 from mien.errors import UserError
 from mien.face import FaceParams
@@ -20,8 +20,8 @@ from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
 from mien.training import TrainSettings
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.frames import FrameOrder, training_frames
-from mien.training.sequence import Targets
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
 

@@ -13,11 +13,11 @@ from mien.gaussians import rgb_from_sh, sh_from_rgb
 from mien.render import rasterize
 from mien.training import Sequence, TrainSettings, train
 from mien.training.density_control import density_strategy
-from mien.training.frames import training_frames
-from mien.training.hidden import hidden_triangles, inside_triangles
-from mien.training.inside import Inside, disguise, disguised_reference
-from mien.training.sequence import Targets
-from mien.training.unseen import spare_fills, unseen_of
+from mien.training.footage.frames import training_frames
+from mien.training.footage.hidden import hidden_triangles, inside_triangles
+from mien.training.footage.sequence import Targets
+from mien.training.whole_head.mouth_interior import Inside, disguise, disguised_reference
+from mien.training.whole_head.unseen import spare_fills, unseen_of
 from toy_scene import surface_of, toy_face, toy_sequence
 
 SETTINGS = TrainSettings(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)

@@ -28,8 +28,8 @@ from mien.render import rasterize
 from mien.training import TrainSettings
 from mien.training.checkpoint import resume, write_checkpoint
 from mien.training.density_control import density_strategy
-from mien.training.frames import FrameOrder, training_frames
-from mien.training.sequence import Targets
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from toy_scene import runtime_face, toy_camera, toy_sequence
 

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, Rate
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.mono_gaussian_avatar import (
+from mien.avatar.mono_gaussian_avatar.avatar import (
     CANONICAL_JAW,
     canonical_face,
     nearest_vertices,
 )
-from mien.avatar.mono_gaussian_avatar_settings import LENGTH_UNIT, PRESETS
-from mien.avatar.mono_networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
-from mien.avatar.mono_schedule import Schedule, ScheduleName
+from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
+from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, PRESETS
 from mien.avatar.surface_places import at_places, random_places
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, head_poses

@@ -15,8 +15,8 @@ from mien.commands.stages.evaluating import _driver_folders
 from mien.errors import UserError
 from mien.tracking import write_tracking
 from mien.training import PRESETS, TrainSettings, doubly_held_out, split_by_name, with_named_split
-from mien.training.frames import training_frames
-from mien.training.named_split import SEQUENCES, driving_sequences
+from mien.training.footage.frames import training_frames
+from mien.training.footage.named_split import SEQUENCES, driving_sequences
 from toy_scene import toy_sequence
 
 FOLDERS = (

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate
-from mien.avatar.mono_schedule import Schedule, ScheduleName
+from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.camera import Camera
 from mien.training import PRESETS, TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import _round_steps
-from mien.training.frames import MIN_EXTENT, Frame, camera_extent
+from mien.training.footage.frames import MIN_EXTENT, Frame, camera_extent
 from toy_scene import toy_face, toy_face_model, toy_sequence
 
 PAGE = Path(__file__).parent.parent / "docs" / "paper_preset.md"

@@ -18,9 +18,9 @@ from mien.perceptual.weights import weights_path
 from mien.progress import Advance
 from mien.render.rendering import Rendering
 from mien.training import Sequence, TrainSettings, read_curves, train
-from mien.training.frames import crop_random
+from mien.training.footage.frames import crop_random
+from mien.training.footage.sequence import Target, Targets
 from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss
-from mien.training.sequence import Target, Targets
 from toy_scene import toy_sequence
 
 RESULTS = ("avatar/avatar.safetensors", "face_track.safetensors")

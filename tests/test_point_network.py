@@ -8,7 +8,7 @@ from torch import Tensor
 
 from instruction_sets import ISAS, each_isa
 from mien import _native
-from mien.avatar.point_network import Activation, Layer, point_network, point_network_reference
+from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
 
 Sizes = tuple[int, int, tuple[tuple[int, Activation, int | None], ...]]
 """Points, inputs, and outputs, activation and extra values of each layer."""

@@ -16,9 +16,9 @@ from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import NeckParts, head_cutter
 from mien.training import PRESETS, TrainSettings
-from mien.training.frames import Frame, resolved
-from mien.training.side_views import SideViews, side_views, turned_aside
-from mien.training.unseen import fills_sides
+from mien.training.footage.frames import Frame, resolved
+from mien.training.whole_head.side_views import SideViews, side_views, turned_aside
+from mien.training.whole_head.unseen import fills_sides
 from toy_scene import surface_of
 
 _PROGRESS = Progress(0, 100, 0, 1.0, 1)

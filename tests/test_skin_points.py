@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.avatar.skin_points import blend_transforms, skin_points, skin_points_reference, unskin
+from mien.avatar.ops.skin_points import blend_transforms, skin_points, skin_points_reference, unskin
 from toy_scene import toy_face, toy_face_model
 
 SIZES = [(3000, 1, 6), (7, 3, 2), (1, 1, 1), (0, 2, 3)]

@@ -14,7 +14,18 @@ from mien.cli import COMMANDS
 from mien.commands.options import MethodName
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
-LAZY_ROOMS = ["analysis", "avatar", "capture", "driving", "export", "tracking", "training", "viewer"]
+LAZY_ROOMS = [
+    "avatar",
+    "capture",
+    "driving",
+    "export",
+    "lab.analysis",
+    "tracking",
+    "training",
+    "training.footage",
+    "training.whole_head",
+    "viewer",
+]
 SCRIPT = """
 import json, os, sys
 from mien.cli import main

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import train_toy
-from mien.analysis.study import StudySettings, read_key, tally_content
-from mien.analysis.study.clips import spans
-from mien.analysis.study.files import QUESTIONS, Answer, Answers, KeyClip, StudyKey, read_all_answers
-from mien.analysis.study.shuffling import shuffled
-from mien.analysis.study.tally import interval, student_quantile, tally_text, wilson
 from mien.avatar import METHODS
 from mien.capture.video import read_video_frames
 from mien.cli import main
+from mien.lab.analysis.study import StudySettings, read_key, tally_content
+from mien.lab.analysis.study.clips import spans
+from mien.lab.analysis.study.files import QUESTIONS, Answer, Answers, KeyClip, StudyKey, read_all_answers
+from mien.lab.analysis.study.shuffling import shuffled
+from mien.lab.analysis.study.tally import interval, student_quantile, tally_text, wilson
 from mien.training import read_sequence, train
 from toy_workspace import write_toy_workspace
 from web_case import browse, chromium, node
@@ -138,8 +138,8 @@ def test_the_budget_is_kept(workspace: Path, tmp_path: Path, capsys: pytest.Capt
     assert make(workspace, page, "--side", "1024") == 0
     assert page.stat().st_size <= 1_000_000
     assert "of 1 MB" in capsys.readouterr().err
-    from mien.analysis.study.drawing import encode
     from mien.errors import UserError
+    from mien.lab.analysis.study.drawing import encode
 
     noise = np.random.default_rng(0).integers(0, 255, (4, 64, 256, 3), dtype=np.uint8)
     best, small = encode(noise, 25.0, 1 << 20, "it"), encode(noise, 25.0, 30_000, "it")

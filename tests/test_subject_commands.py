@@ -9,7 +9,7 @@ import torch
 from mien.avatar import DEFAULT_METHOD
 from mien.capture.video import read_video_frames, write_video
 from mien.cli import main
-from mien.synthetic import SyntheticRecipe, write_synthetic_video
+from mien.lab.synthetic import SyntheticRecipe, write_synthetic_video
 from mien.tracking import read_tracking
 
 TRACKING = (

@@ -8,13 +8,13 @@ import torch
 
 from mien import exact
 from mien.capture.video import read_video_frames
+from mien.lab.synthetic import RECIPES, SyntheticScene, synthesize, write_synthetic_video
+from mien.lab.synthetic.light import studio_lighting
+from mien.lab.synthetic.motion import generate_motion
+from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
+from mien.lab.synthetic.shading import turn_light
 from mien.render.mesh import shade, vertex_normals
 from mien.rotation import matrix_from_axis_angle
-from mien.synthetic import RECIPES, SyntheticScene, synthesize, write_synthetic_video
-from mien.synthetic.light import studio_lighting
-from mien.synthetic.motion import generate_motion
-from mien.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
-from mien.synthetic.shading import turn_light
 from mien.tracking.neck_line import bottom_vertices
 
 SMALL = replace(RECIPES["demo"], width=192, height=192, seconds=0.6, fps=10.0, texture_size=256, noise=0.0)

@@ -10,7 +10,7 @@ import torch
 from exact_guard import exact_guard
 from mien.capture import read_capture
 from mien.errors import UserError
-from mien.synthetic import (
+from mien.lab.synthetic import (
     RECIPES,
     REFERENCES,
     Segment,
@@ -20,8 +20,8 @@ from mien.synthetic import (
     truth_of,
     write_synthetic_capture,
 )
-from mien.synthetic.captures import _Pictures, hash_scene, inputs_hash, read_synthetic_hash, scene_key
-from mien.synthetic.signature import TOLERANCES, signature_distance, signature_of
+from mien.lab.synthetic.captures import _Pictures, hash_scene, inputs_hash, read_synthetic_hash, scene_key
+from mien.lab.synthetic.signature import TOLERANCES, signature_distance, signature_of
 from reference_signatures import drawn_signatures, stored_signatures
 
 KEYS = {

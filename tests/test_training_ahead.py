@@ -14,8 +14,8 @@ from bounded_memory import MIB, allocating_at_most
 from mien.progress import Advance
 from mien.training import train
 from mien.training.ahead import _AHEAD, targets_ahead
-from mien.training.frames import FrameOrder, background_at, training_frames
-from mien.training.sequence import Sequence, Target, Targets, composite, composite_reference
+from mien.training.footage.frames import FrameOrder, background_at, training_frames
+from mien.training.footage.sequence import Sequence, Target, Targets, composite, composite_reference
 from mien.training.settings import TrainSettings
 from test_training_resume import RESULTS
 from toy_scene import toy_sequence
@@ -137,7 +137,7 @@ def test_the_worker_ends_with_an_interrupted_run(tmp_path: Path) -> None:
 
 def test_the_pictures_of_a_long_capture_are_never_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = large_sequence(160, 256)
-    monkeypatch.setattr("mien.training.sequence._CACHE_BYTES", 4 * MIB)
+    monkeypatch.setattr("mien.training.footage.sequence._CACHE_BYTES", 4 * MIB)
     settings = replace(SETTINGS, steps=160, background="white")
     order = FrameOrder(training_frames([sequence], settings), 0)
     targets = Targets(sequence, 0)

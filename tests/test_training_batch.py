@@ -20,8 +20,8 @@ from mien.render.rasterize import rasterize_each
 from mien.training import TrainSettings, read_curves, train
 from mien.training.batch import TrainingData, next_batch
 from mien.training.checkpoint import TrainingState, checkpoint_files
-from mien.training.frames import FrameOrder, training_frames
-from mien.training.sequence import Targets
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from mien.training.trainer import passed, start, step
 from test_methods import new_avatar
 from test_training_resume import assert_same_results

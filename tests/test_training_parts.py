@@ -24,16 +24,16 @@ from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
 from mien.training import TrainSettings, held_out
 from mien.training.adam import Adam
-from mien.training.frames import (
+from mien.training.footage.frames import (
     FrameOrder,
     background_at,
     density_random,
     expression_rarity,
     training_frames,
 )
+from mien.training.footage.sequence import Target, Targets, composite
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
-from mien.training.sequence import Target, Targets, composite
 from mien.training.trainer import start
 from toy_scene import toy_sequence
 

@@ -15,10 +15,10 @@ import torch
 import train_toy
 from mien import _native
 from mien.avatar import METHODS, Avatar, MethodConfig
-from mien.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
-from mien.benchmarking.train_step import training_case
 from mien.errors import UserError
 from mien.face import load_face_model
+from mien.lab.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
+from mien.lab.benchmarking.train_step import training_case
 from mien.stops import Terminated
 from mien.storage import read_tensors, write_tensors
 from mien.training import read_curves, read_training_summary, train

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.avatar.triangle_frames import DEGENERATE_LENGTH, bind_to_world, frames_to_world, triangle_frames
+from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, frames_to_world, triangle_frames
 from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from mien.benchmarking.quality import unseen_lines
 from mien.camera import Camera, camera_from_fov, look_at
-from mien.evaluation.unseen_views import Front, angle_names, camera_beside, write_unseen_chart
+from mien.lab.benchmarking.quality import unseen_lines
+from mien.lab.benchmarking.unseen_views import Front, angle_names, camera_beside, write_unseen_chart
+from mien.lab.synthetic import REFERENCES
+from mien.lab.synthetic.recipe import SIDES
 from mien.rotation import matrix_from_axis_angle
-from mien.synthetic import REFERENCES
-from mien.synthetic.recipe import SIDES
 
 
 def test_the_front_camera_is_that_of_the_tracking() -> None:

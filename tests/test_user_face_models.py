@@ -16,9 +16,9 @@ from mien.commands.stages import face_models as stage
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
 from mien.face.cache import cache_folder
+from mien.lab.synthetic import SyntheticRecipe, synthesize
 from mien.runtime import load as load_portable
 from mien.storage import file_digest, write_json
-from mien.synthetic import SyntheticRecipe, synthesize
 from mien.tracking import TrackingSettings, read_tracking, track
 from mien.tracking.settings import PaperSettings
 from tracking_case import capture_of, still_camera

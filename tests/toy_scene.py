@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mien.avatar import Avatar
-from mien.avatar.gaussian_surface import GaussianSurface
+from mien.avatar.gaussian_avatars.surface import GaussianSurface
 from mien.camera import Camera
 from mien.capture import Capture
 from mien.face import FaceModel, FaceParams

@@ -27,7 +27,7 @@ WORK = {
     "train": ("mien.training.trainer", "_train_to_the_end"),
     "capture": ("mien.capture.from_video", "survey_source"),
     "evaluate": ("mien.evaluation.evaluate", "_evaluate"),
-    "analyze": ("mien.analysis.running", "write_page"),
+    "analyze": ("mien.lab.analysis.running", "write_page"),
     "import": ("mien.commands.stages.importing", "write_imported_run"),
 }
 """Module and function that each command runs while it writes."""

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien.synthetic import SyntheticRecipe, SyntheticScene
-from mien.synthetic.painter import develop, draw, to_uint8
-from mien.synthetic.posing import head_pose
-from mien.synthetic.subject import pose_subject
+from mien.lab.synthetic import SyntheticRecipe, SyntheticScene
+from mien.lab.synthetic.painter import develop, draw, to_uint8
+from mien.lab.synthetic.posing import head_pose
+from mien.lab.synthetic.subject import pose_subject
 
 FPS = 4.0
 """Frames per second. Few, because software WebGL leaves the detector four to eight on a busy machine."""

@@ -21,8 +21,8 @@ from mien.camera import Camera
 from mien.capture import Capture, CaptureSettings, capture_video, read_capture_hash, write_capture
 from mien.capture.video import write_video
 from mien.face import FaceModel, FaceParams, load_face_model
+from mien.lab.synthetic import RECIPES, Segment, SyntheticRecipe, SyntheticScene, write_synthetic_video
 from mien.render import rasterize
-from mien.synthetic import RECIPES, Segment, SyntheticRecipe, SyntheticScene, write_synthetic_video
 from mien.tracking import (
     SmoothnessSettings,
     TrackingSettings,

@@ -1,6 +1,6 @@
 """The public API, found in the code: what the doors of rooms export.
 
-A door is a package or module directly in `mien` that has an `__all__`.
+A door is a package or module directly in `mien`, or in `mien.lab`, that has an `__all__`.
 """
 
 import ast
@@ -48,9 +48,9 @@ class PublicName:
 @cache
 def doors() -> dict[str, list[PublicName]]:
     """The names of each door, in the order of its `__all__`."""
-    mien = importlib.import_module("mien")
     found = {}
-    for module in pkgutil.iter_modules(mien.__path__, "mien."):
+    houses = [importlib.import_module(name) for name in ("mien", "mien.lab")]
+    for module in (room for house in houses for room in pkgutil.iter_modules(house.__path__, f"{house.__name__}.")):
         if _has_all(module.name):
             exported = importlib.import_module(module.name).__all__
             found[module.name] = [PublicName(module.name, name, home_of(module.name, name)) for name in exported]

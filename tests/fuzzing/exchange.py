@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 
 from fuzzing import content, uses
-from mien.analysis.study.files import read_all_answers, read_key
-from mien.analysis.study.tally import tally_content, tally_text
 from mien.avatar import METHODS
 from mien.capture.calibration import CalibratedCamera, read_calibration
 from mien.capture.readings import readings_of
@@ -23,6 +21,8 @@ from mien.driving.speech import read_speech
 from mien.errors import UserError
 from mien.export import read_glb, read_glb_avatar, read_sog, read_spz, read_usd
 from mien.gaussians import Gaussians
+from mien.lab.analysis.study.files import read_all_answers, read_key
+from mien.lab.analysis.study.tally import tally_content, tally_text
 
 _READER = Path(__file__).parents[2] / "web" / "tests" / "read.mjs"
 _NODE_SECONDS = 60

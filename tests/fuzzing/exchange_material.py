@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from mien import runtime
-from mien.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, write_key
-from mien.analysis.study.shuffling import shuffled
 from mien.avatar import METHODS, Avatar, as_array, bake_rig, make_portable
 from mien.capture.sound import RATE
 from mien.config import encode
 from mien.export import MeshModel, in_world, pack, write_glb, write_sog, write_spz, write_usd
 from mien.gaussians import Gaussians
+from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, write_key
+from mien.lab.analysis.study.shuffling import shuffled
 from recordings import LAYOUTS
 from test_runtime import new_avatar
 from toy_scene import toy_camera

@@ -90,7 +90,7 @@ class Place:
 
     def make_reference(self) -> None:
         """Draw a clip and run all stages undisturbed; keep the files before and after each."""
-        from mien.synthetic import RECIPES, write_synthetic_video
+        from mien.lab.synthetic import RECIPES, write_synthetic_video
 
         recipe = RECIPES["demo"]
         self.box.mkdir(parents=True)

@@ -12,7 +12,6 @@ import torch
 
 import train_toy
 from fuzzing.archive_faults import npy_of, npz_of
-from mien.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
 from mien.avatar import METHODS, load_avatar
 from mien.avatar.baking import make_portable
 from mien.capture.video import write_video
@@ -23,6 +22,7 @@ from mien.face import Landmarks
 from mien.face.cache import cache_folder
 from mien.face.flame import flame_face_model, read_flame
 from mien.face.loading import load_face_model, write_face_model, write_landmarks
+from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
 from mien.runtime import write_portable
 from mien.storage import write_json
 from mien.training import read_face_track

@@ -10,7 +10,6 @@ import numpy as np
 
 from fuzzing import pieces
 from fuzzing.material import ANALYSIS, CONFIG, GROWTH, RUN, SEQUENCE, SETTINGS
-from mien.analysis import AnalysisOptions, run_analysis
 from mien.avatar import load_avatar
 from mien.capture import read_capture as read_whole_capture
 from mien.capture.crop import whole_picture
@@ -28,6 +27,7 @@ from mien.export import read_ply as read_gaussians
 from mien.face import FaceParams, available_face_models, load_face_model
 from mien.face.flame import flame_face_model
 from mien.face.flame import read_flame as read_flame_file
+from mien.lab.analysis import AnalysisOptions, run_analysis
 from mien.render.camera_paths import read_cameras as read_camera_path
 from mien.runtime import read_portable as read_mien
 from mien.storage import read_tensors

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.avatar.activation import sigmoid
     from mien.avatar.avatar import (
         Avatar,
         Extras,
@@ -22,13 +21,14 @@ if TYPE_CHECKING:
     from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
     from mien.avatar.files import load_avatar, write_avatar
     from mien.avatar.filmed import measure_filmed
-    from mien.avatar.gaussian_avatars import GaussianAvatars
-    from mien.avatar.gaussian_avatars_settings import GaussianAvatarsConfig
-    from mien.avatar.headgas import HeadGas
-    from mien.avatar.headgas_settings import HeadGasConfig
+    from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
+    from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
+    from mien.avatar.headgas.avatar import HeadGas
+    from mien.avatar.headgas.settings import HeadGasConfig
     from mien.avatar.methods import DEFAULT_METHOD, METHODS, Method, method_named, method_of
-    from mien.avatar.mono_gaussian_avatar import MonoGaussianAvatar
-    from mien.avatar.mono_gaussian_avatar_settings import MonoGaussianAvatarConfig
+    from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
+    from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
+    from mien.avatar.ops.activation import sigmoid
     from mien.avatar.schedules import TRAINED, Progress, Rate
     from mien.avatar.settings import (
         DensityRules,

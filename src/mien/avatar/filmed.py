@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.avatar.expression_changes import expression_inputs
+from mien.avatar.ops.expression_changes import expression_inputs
 from mien.face import FaceParams
 from mien.runtime.baked import Filmed
 from mien.runtime.filmed import head_angles

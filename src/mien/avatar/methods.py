@@ -52,10 +52,12 @@ class Method:
 
 
 METHODS = {
-    "gaussian_avatars": Method("mien.avatar.gaussian_avatars:GaussianAvatars", "mien.avatar.gaussian_avatars_settings"),
-    "headgas": Method("mien.avatar.headgas:HeadGas", "mien.avatar.headgas_settings"),
+    "gaussian_avatars": Method(
+        "mien.avatar.gaussian_avatars.avatar:GaussianAvatars", "mien.avatar.gaussian_avatars.settings"
+    ),
+    "headgas": Method("mien.avatar.headgas.avatar:HeadGas", "mien.avatar.headgas.settings"),
     "mono_gaussian_avatar": Method(
-        "mien.avatar.mono_gaussian_avatar:MonoGaussianAvatar", "mien.avatar.mono_gaussian_avatar_settings"
+        "mien.avatar.mono_gaussian_avatar.avatar:MonoGaussianAvatar", "mien.avatar.mono_gaussian_avatar.settings"
     ),
 }
 """All methods by name. A method whose settings import torch comes last: looking for the method of a config goes

@@ -19,8 +19,8 @@ class Progress:
     epoch: int = 0
     """Number of passes over the training frames that were completed before this step."""
     extent: float = 1.0
-    """Extent of the training cameras, in metres (`mien.training.frames.camera_extent`). The unit of some rates and
-    sizes."""
+    """Extent of the training cameras, in metres (`camera_extent` in `mien.training.footage`). The unit of some rates
+    and sizes."""
     frames: int = 1
     """Number of training frames that this step uses. It counts as so many steps."""
 

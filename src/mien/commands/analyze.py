@@ -9,7 +9,7 @@ import tyro
 from mien.workspace import Workspace, open_workspace
 
 AnalysisName = Literal["gaussian-avatars", "headgas", "mono-gaussian-avatar"]
-"""The keys of `mien.analysis.ANALYSES`, written out for options. A test compares them."""
+"""The keys of `mien.lab.analysis.ANALYSES`, written out for options. A test compares them."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.analysis import ANALYSES, AnalysisOptions, chosen_parts
         from mien.files import check_writable
         from mien.inside import check_subtrees
+        from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts
 
         AnalysisOptions(self.steps, self.seconds).check()
         chosen_parts(ANALYSES[self.method], self.parts, self.train)
@@ -67,8 +67,8 @@ class Command:
         """Measure the parts and write the page."""
         import json
 
-        from mien.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
         from mien.commands.stages.evaluating import run_sequences
+        from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
         from mien.progress import say
         from mien.terminal import show
 

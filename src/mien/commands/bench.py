@@ -19,14 +19,15 @@ from mien.workspace import open_workspace
 if TYPE_CHECKING:
     import torch
 
-    from mien.benchmarking.timing import BenchmarkRow, Machine
+    from mien.lab.benchmarking.timing import BenchmarkRow, Machine
 
 
 CaptureName = Literal[
     "mono-short", "mono-long", "ring-16", "ring-16-large", "beard", "long-hair", "glasses", "off-model", "mono-sides",
     "mono-sides-long-hair",
 ]  # fmt: skip
-"""The keys of `mien.synthetic.REFERENCES`, written out because options are read before torch. A test compares them."""
+"""The keys of `REFERENCES` in `mien.lab.synthetic`. They are written out because options are read before torch. A test
+compares them."""
 _MOST_MINUTES = 100_000
 
 
@@ -48,13 +49,13 @@ class Render:
 
     def run(self) -> None:
         """Measure and print the rows."""
-        from mien.benchmarking.render import render_suite
+        from mien.lab.benchmarking.render import render_suite
 
         like = _gpu(self.device)
         if like is None:
             show_rows(render_suite(self.seconds), self.as_json)
             return
-        from mien.benchmarking.device import render_rows
+        from mien.lab.benchmarking.device import render_rows
 
         show_rows(render_rows(like, self.seconds), self.as_json, gpu=True)
 
@@ -72,7 +73,7 @@ class Scaling:
 
     def check(self) -> None:
         """Check before any measurement that the chart can be written and that there is time to measure."""
-        from mien.benchmarking.chart_path import check_chart_path
+        from mien.lab.benchmarking.chart_path import check_chart_path
 
         _check_seconds(self.seconds)
         if self.plot is not None:
@@ -80,8 +81,8 @@ class Scaling:
 
     def run(self) -> None:
         """Measure and print the rows, then draw the chart."""
-        from mien.benchmarking.charts import write_scaling_chart
-        from mien.benchmarking.render import scaling_suite
+        from mien.lab.benchmarking.charts import write_scaling_chart
+        from mien.lab.benchmarking.render import scaling_suite
 
         machine, rows = show_rows(scaling_suite(self.seconds), self.as_json)
         if self.plot is not None:
@@ -112,9 +113,9 @@ class TrainStep:
 
     def run(self) -> None:
         """Measure and print the rows."""
-        from mien.benchmarking.headgas_step import headgas_suite
-        from mien.benchmarking.mono_step import mono_suite
-        from mien.benchmarking.train_step import train_step_suite
+        from mien.lab.benchmarking.headgas_step import headgas_suite
+        from mien.lab.benchmarking.mono_step import mono_suite
+        from mien.lab.benchmarking.train_step import train_step_suite
 
         suites = {"headgas": headgas_suite, "mono_gaussian_avatar": mono_suite}
         if self.method in suites:
@@ -124,7 +125,7 @@ class TrainStep:
         if like is None:
             show_rows(train_step_suite(self.seconds), self.as_json)
             return
-        from mien.benchmarking.device import train_step_rows
+        from mien.lab.benchmarking.device import train_step_rows
 
         show_rows(train_step_rows(like, self.seconds), self.as_json, gpu=True)
 
@@ -262,7 +263,7 @@ def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) 
     """Print the machine, and each row once it is measured, or everything as json. Torch uses one thread."""
     import torch
 
-    from mien.benchmarking.timing import format_machine, format_row, measure_machine
+    from mien.lab.benchmarking.timing import format_machine, format_row, measure_machine
 
     torch.set_num_threads(1)
     machine, shown = measure_machine(gpu), []

@@ -39,8 +39,8 @@ class Command:
         """Write the video unless it exists, then run `mien create` on it."""
         from dataclasses import replace
 
+        from mien.lab.synthetic import RECIPES, write_synthetic_video
         from mien.locks import hold
-        from mien.synthetic import RECIPES, write_synthetic_video
 
         recipe = RECIPES["demo"]
         if self.seconds:

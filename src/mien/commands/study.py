@@ -12,7 +12,7 @@ from mien.terminal import show
 from mien.workspace import Workspace, open_workspace
 
 if TYPE_CHECKING:
-    from mien.analysis.study import StudyRuns, StudySettings
+    from mien.lab.analysis.study import StudyRuns, StudySettings
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Make:
 
     def run(self) -> None:
         """Write the page and the key."""
-        from mien.analysis.study import write_study
+        from mien.lab.analysis.study import write_study
         from mien.progress import say
 
         opened = [open_workspace(folder) for folder in self.workspaces]
@@ -71,13 +71,13 @@ class Make:
         say(f"Look at {self.out} and send it; keep {key}, then: mien study tally {key} ANSWERS.json ...")
 
     def _settings(self) -> "StudySettings":
-        from mien.analysis.study import StudySettings
+        from mien.lab.analysis.study import StudySettings
 
         return StudySettings(self.clips, self.seconds, self.side, self.megabytes, self.seed)
 
     def _labels(self, workspaces: list[Workspace]) -> list[str]:
         """The names of the runs: those asked for, or those that all workspaces have."""
-        from mien.analysis.study.files import MOST_RUNS
+        from mien.lab.analysis.study.files import MOST_RUNS
 
         if self.runs:
             for workspace in workspaces:
@@ -109,8 +109,8 @@ class Tally:
 
     def check(self) -> None:
         """Read the key and all answers, and check that the result can be written, without heavy libraries."""
-        from mien.analysis.study.files import read_all_answers, read_key
         from mien.files import check_writable
+        from mien.lab.analysis.study.files import read_all_answers, read_key
 
         if not self.answers:
             raise UserError("no answers to tally; give the files that participants saved, or a folder of them")
@@ -120,9 +120,9 @@ class Tally:
 
     def run(self) -> None:
         """Print the percentages."""
-        from mien.analysis.study.files import read_all_answers, read_key
-        from mien.analysis.study.tally import FORMAT, VERSION, tally_content, tally_text
         from mien.files import write_json
+        from mien.lab.analysis.study.files import read_all_answers, read_key
+        from mien.lab.analysis.study.tally import FORMAT, VERSION, tally_content, tally_text
 
         key = read_key(self.key)
         content = tally_content(key, read_all_answers(self.answers, key))
@@ -154,8 +154,8 @@ class Command:
 
 
 def _study_runs(workspace: Workspace, labels: list[str]) -> "StudyRuns":
-    from mien.analysis.study import StudyRuns
     from mien.commands.stages.evaluating import run_sequences
+    from mien.lab.analysis.study import StudyRuns
 
     folders = {label: workspace.run_dir(label) for label in labels}
     runs = {label: (folder, tuple(run_sequences(workspace, folder))) for label, folder in folders.items()}

@@ -10,8 +10,7 @@ from torch import Tensor
 from mien.evaluation.experiment import Experiment, target_image
 from mien.parallel import stream_in_threads
 from mien.render.mesh import render_mesh
-from mien.training.frames import Frame
-from mien.training.vertex_colors import vertex_colors
+from mien.training.footage import Frame, vertex_colors
 
 
 @dataclass(frozen=True, eq=False)

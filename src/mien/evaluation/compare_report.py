@@ -25,7 +25,7 @@ from mien.evaluation.report_sections import frame_name
 from mien.pictures import Box, error_heat, to_uint8
 from mien.progress import track_progress
 from mien.storage import write_atomically
-from mien.training.frames import Frame
+from mien.training.footage import Frame
 
 _FRAMES = 5
 _PICTURE_SIZE = 320

@@ -26,7 +26,7 @@ from mien.progress import track_progress
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import Tracking, check_tracking_of, read_tracking
-from mien.training.frames import evenly_spread
+from mien.training.footage import evenly_spread
 
 _MAX_FRAMES = 100
 _MEANS = (

@@ -16,8 +16,7 @@ from mien.pictures import Box
 from mien.render import rasterize
 from mien.render.validation import drawable
 from mien.tracking import Scoring
-from mien.training.frames import Frame
-from mien.training.sequence import Sequence, composite
+from mien.training.footage import Frame, Sequence, composite
 
 FaceSource = Literal["as_tracked", "corrected"]
 """Face parameters of held-out frames: as the tracker left them, or corrected by what training changed in neighbouring

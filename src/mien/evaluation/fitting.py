@@ -16,7 +16,7 @@ from mien.face import FaceParams
 from mien.render import rasterize
 from mien.training.adam import Adam
 from mien.training.face_track import FaceTrack
-from mien.training.frames import Frame
+from mien.training.footage import Frame
 from mien.training.photometric import photometric_loss
 
 LOSS = "mean absolute difference of colours over the whole picture"

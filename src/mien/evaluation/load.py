@@ -15,8 +15,7 @@ from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_run_config
-from mien.training.frames import Frame, held_out, training_frames
-from mien.training.sequence import sequence_of
+from mien.training.footage import Frame, held_out, sequence_of, training_frames
 
 
 def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Experiment]:

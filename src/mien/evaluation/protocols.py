@@ -28,7 +28,7 @@ from mien.evaluation.scoring import (
 from mien.parallel import stream_in_threads
 from mien.progress import progress_bar
 from mien.ranges import Range
-from mien.training.frames import Frame, spread_frames
+from mien.training.footage import Frame, spread_frames
 
 AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"
 _MAX_TRAINING_FRAMES = 200

@@ -27,7 +27,7 @@ from mien.evaluation.page import (
 )
 from mien.evaluation.protocols import Evaluation
 from mien.storage import write_atomically
-from mien.training.coverage import Coverage
+from mien.training.footage import Coverage
 
 _TITLES = {
     "self_reenactment": "Self-reenactment",

@@ -17,9 +17,7 @@ from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
 from mien.pictures import Box, error_heat, to_uint8
 from mien.render.mesh import render_mesh
-from mien.training.coverage import Coverage
-from mien.training.filmed import confidence_picture, filmed_words
-from mien.training.frames import Frame
+from mien.training.footage import Coverage, Frame, confidence_picture, filmed_words
 
 _PICTURE_SIZE = 400
 _OVERLAY_SIZE = 300

@@ -15,7 +15,7 @@ from mien.evaluation.protocols import AVATAR, Evaluation
 from mien.picture_files import write_png
 from mien.pictures import WHITE, Box, error_heat, shrink, side_by_side, to_uint8
 from mien.progress import track_progress
-from mien.training.frames import Frame
+from mien.training.footage import Frame
 
 _MAX_SIDE = 440
 _BAR = 26

@@ -283,4 +283,5 @@ class PortableAvatar:
 
     c is the cosine between the triangle's normal and the direction to the camera, at least 0; v the share that the
     mesh's own depth leaves visible, m the share in the scoring mask, and s(x) = x^2 (3 - 2 x) with x limited to 0..1
-    (`mien.training.coverage`). None if it is not known. `MeshBound` avatars have the same triangles in `faces`."""
+    (`coverage` in `mien.training.footage`). None if it is not known. `MeshBound` avatars have the same triangles in
+    `faces`."""

@@ -5,9 +5,18 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.training.filmed import confidence_picture, filmed_words, read_coverage
-    from mien.training.frames import held_out
-    from mien.training.named_split import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
+    from mien.training.footage import (
+        NAMED_SPLIT,
+        NamedSplit,
+        Sequence,
+        confidence_picture,
+        filmed_words,
+        held_out,
+        read_coverage,
+        read_sequence,
+        split_by_name,
+        with_named_split,
+    )
     from mien.training.run import (
         check_data,
         check_run,
@@ -21,7 +30,6 @@ if TYPE_CHECKING:
         run_camera,
         write_imported_run,
     )
-    from mien.training.sequence import Sequence, read_sequence
     from mien.training.settings import (
         MAIN_SETTINGS,
         PRESETS,

@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 import cv2
 import torch
 
-from mien.training.frames import FrameOrder, background_at
-from mien.training.sequence import Target, Targets
+from mien.training.footage import FrameOrder, Target, Targets, background_at
 from mien.training.settings import TrainSettings
 
 Result = TypeVar("Result")

@@ -20,16 +20,17 @@ from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
 from mien.training.ahead import TargetQueue
 from mien.training.checkpoint import TrainingState
-from mien.training.frames import (
+from mien.training.footage import (
     MIN_EXTENT,
     Frame,
     FrameOrder,
+    Target,
+    Targets,
     background_at,
     crop_random,
 )
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
 from mien.training.parts import BatchFrame
-from mien.training.sequence import Target, Targets
 from mien.training.settings import TrainSettings
 
 

@@ -14,9 +14,8 @@ from mien.adam import Moments
 from mien.avatar import ParameterGroup, Rate
 from mien.errors import UserError
 from mien.render.rendering import Rendering
-from mien.training.frames import Frame
+from mien.training.footage import Frame, Sequence
 from mien.training.parts import TrainingPart
-from mien.training.sequence import Sequence
 from mien.training.settings import TrainSettings
 
 _LAST_RATE = 0.1

@@ -14,9 +14,9 @@ from mien.errors import UserError
 from mien.progress import say
 from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.adam import Adam
-from mien.training.coverage import Coverage
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
+from mien.training.footage import Coverage
 from mien.training.parts import TrainingPart
 
 _KEPT_CHECKPOINTS = 2

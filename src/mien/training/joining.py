@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 from mien.training.camera_colors import camera_colors_part
-from mien.training.inside import prepare_inside
 from mien.training.parts import Preparation, TrainingPart
-from mien.training.whole_head import prepare_whole_head
+from mien.training.whole_head import prepare_inside, prepare_whole_head
 
 
 def prepare_parts(given: Preparation) -> Callable[[], tuple[TrainingPart, ...]]:

@@ -15,8 +15,8 @@ from mien.avatar import PerceptualLoss, Photometric
 from mien.perceptual import TrainingFeatures, load_training_features
 from mien.pictures import Box
 from mien.render.rendering import Rendering
+from mien.training.footage import Target
 from mien.training.photometric import photometric_loss
-from mien.training.sequence import Target
 
 
 def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -> dict[str, Float[Tensor, ""]]:

@@ -15,12 +15,10 @@ from mien.avatar import Avatar, DensityControl, ParameterGroup, Photometric, Pos
 from mien.camera import Camera
 from mien.face import FaceModel, FaceParams
 from mien.render.rendering import Rendering
-from mien.training.coverage import Coverage, coverage
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
-from mien.training.frames import Frame
+from mien.training.footage import Coverage, Frame, Sequence, Target, measure_coverage
 from mien.training.losses import PerceptualGoal
-from mien.training.sequence import Sequence, Target
 from mien.training.settings import TrainSettings
 
 
@@ -91,7 +89,7 @@ class Preparation:
     def coverage(self) -> Coverage:
         """The part of the head that the training pictures show, computed at its first use."""
         if self.known_coverage is None:
-            self.known_coverage = coverage(self.face_model, self.sequences, self.faces, self.frames)
+            self.known_coverage = measure_coverage(self.face_model, self.sequences, self.faces, self.frames)
         return self.known_coverage
 
 

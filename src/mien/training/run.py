@@ -25,9 +25,7 @@ from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
-from mien.training.coverage import Coverage
-from mien.training.filmed import write_coverage
-from mien.training.sequence import Sequence
+from mien.training.footage import Coverage, Sequence, write_coverage
 from mien.training.settings import TrainSettings
 
 _FORMAT, _VERSION = "mien.run", 1

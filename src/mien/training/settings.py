@@ -13,7 +13,7 @@ from mien.ranges import NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars"]
 """Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
-camera instead (`mien.training.named_split`)."""
+camera instead (`mien.training.footage.named_split`)."""
 
 
 @dataclass(frozen=True)

@@ -42,24 +42,26 @@ from mien.training.ahead import targets_ahead
 from mien.training.batch import TrainingData, compare, compare_features, draw, face_groups, next_batch, seen
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.coverage import coverage, telling_frames
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack, turns_from_mean
-from mien.training.frames import (
+from mien.training.footage import (
     FrameOrder,
+    Sequence,
+    Targets,
     camera_extent,
     density_random,
     expression_rarity,
+    measure_coverage,
     resolved,
+    telling_frames,
     training_frames,
+    vertex_colors,
 )
 from mien.training.joining import prepare_parts
 from mien.training.losses import train_psnr
 from mien.training.parts import Preparation, Step, passed
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
-from mien.training.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
-from mien.training.vertex_colors import vertex_colors
 
 _STEADY_EVERY = 25
 """Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
@@ -128,7 +130,7 @@ def train(
         telling = telling_frames(faces, sequences, frames, _TELLING, _TELLING)
         data = TrainingData(order, tuple(targets), extent, tuple(telling))
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
-        write_results(run_dir, state, state.covered or coverage(face_model, sequences, faces, frames))
+        write_results(run_dir, state, state.covered or measure_coverage(face_model, sequences, faces, frames))
     return state.avatar
 
 

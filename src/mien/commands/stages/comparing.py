@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mien.avatar import MethodConfig
-from mien.benchmarking.comparing import MethodRow, comparison_table
-from mien.benchmarking.timing import measure_machine
 from mien.commands.stages.evaluating import run_evaluation_stage
 from mien.commands.stages.quality import (
     StageTimes,
@@ -20,10 +18,12 @@ from mien.commands.stages.training import run_training_stage
 from mien.errors import UserError
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
+from mien.lab.benchmarking.comparing import MethodRow, comparison_table
+from mien.lab.benchmarking.timing import measure_machine
+from mien.lab.synthetic import ReferenceCapture, reference_named
 from mien.locks import WAIT, hold
 from mien.progress import say
 from mien.storage import file_digest, read_json, write_atomically, write_json
-from mien.synthetic import ReferenceCapture, reference_named
 from mien.terminal import show
 from mien.training import PRESETS, TrainSettings, read_sequence, read_training_summary, train
 from mien.workspace import Workspace

@@ -15,7 +15,7 @@ from mien.evaluation.text import driven_line, protocol_line
 from mien.inside import check_tree
 from mien.progress import say
 from mien.training import NAMED_SPLIT, read_run_config
-from mien.training.named_split import DRIVING, driving_sequences
+from mien.training.footage import DRIVING, driving_sequences
 from mien.workspace import Workspace, open_workspace
 
 

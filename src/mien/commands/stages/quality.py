@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from mien.avatar import method_named
-from mien.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
 from mien.capture import CaptureSettings, read_capture, read_capture_hash
 from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.evaluating import run_evaluation_stage, run_sequences
@@ -26,14 +25,15 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
-from mien.evaluation.unseen_views import Figures, SidePictures, score_side_views, write_unseen_chart
 from mien.face import load_face_model
 from mien.inside import remove_tree
+from mien.lab.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
+from mien.lab.benchmarking.unseen_views import Figures, SidePictures, score_side_views, write_unseen_chart
+from mien.lab.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
 from mien.locks import WAIT, hold
 from mien.picture_files import write_png
 from mien.progress import say
 from mien.storage import read_json, replace_folder, write_atomically, write_json
-from mien.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
 from mien.terminal import show
 from mien.tracking import Tracking, TrackingSettings, make_scoring, read_tracking, write_scoring, write_tracking
 from mien.training import PRESETS, TrainSettings, read_training_summary

@@ -2,7 +2,7 @@
 
 The embedding gives the point of the surface for each landmark. But a detector has habits. It puts the chin where its
 annotators did, closes eyelids too late, turns heads too little, and gets the shape of every person slightly wrong.
-`mien.synthetic.detector_calibration` measures these habits on synthetic people.
+`mien.lab.synthetic.detector_calibration` measures these habits on synthetic people.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mien.face import FaceModel
 
-_COMMAND = "python -m mien.synthetic.detector_calibration"
+_COMMAND = "python -m mien.lab.synthetic.detector_calibration"
 _MAX_TURN = 0.6
 """Largest turn that was measured, in radians."""
 

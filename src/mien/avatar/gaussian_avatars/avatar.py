@@ -1,0 +1,228 @@
+"""GaussianAvatars (Qian et al., CVPR 2024): Gaussians in the frames of a face model's triangles.
+
+Written from the paper and its supplement. Comments note where the published code differs from the paper in a way that
+matters. Lengths and scales in the store are in units of the triangle's own scale (`mien.avatar.ops.triangle_frames`).
+Changes with the expression beside those of the mesh (`expression_rank`, `appearance`) are not part of the paper.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_group
+from mien.avatar.baking import as_array, bake_rig
+from mien.avatar.density import GradientDensity, highest_opacities_seen
+from mien.avatar.gaussian_avatars.feature_appearance import FeatureAppearance, feature_tensors
+from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
+from mien.avatar.gaussian_avatars.surface import GaussianSurface
+from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
+from mien.avatar.ops.expression_changes import ExpressionActivations, expression_change
+from mien.avatar.ops.triangle_penalties import triangle_penalties
+from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
+from mien.avatar.store import GaussianStore
+from mien.face import FaceModel, FaceParams
+from mien.gaussians import stack_timesteps
+from mien.render.rendering import Rendering
+from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
+
+_FEATURES = ("feature_colour", "feature_opacity")
+"""Names of the changes by features."""
+_BASES = ("colour_basis", "opacity_basis", "offset_basis")
+"""Names of the bases of changes with the expression."""
+
+
+class GaussianAvatars(Avatar):
+    """Bound Gaussians, one per triangle at first. They follow their triangles, so expression and pose move them."""
+
+    config: GaussianAvatarsConfig
+
+    def __init__(self, config: GaussianAvatarsConfig, face_model: FaceModel, face: FaceParams):
+        super().__init__(config, face_model, face, Extras(surface=GaussianSurface(self, config)))
+        like, n = face_model.template, face_model.faces.shape[0]
+        trained = {
+            "means": like.new_zeros(n, 3),
+            "quats": like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            "log_scales": like.new_zeros(n, 3),
+            "opacity_logits": torch.logit(like.new_full((n,), 0.1)),
+            # Almost mid grey: like the paper's code, use small random colours as the SH coefficients themselves.
+            "sh_constant": torch.rand(n, 1, 3).to(like) / 255,
+        }
+        if config.sh_degree > 0:
+            trained["sh_rest"] = like.new_zeros(n, (config.sh_degree + 1) ** 2 - 1, 3)
+        trained |= {name: like.new_zeros(n, *shape) for name, shape in self._basis_shapes().items()}
+        self.appearance = None
+        if config.appearance == "features":
+            trained |= feature_tensors(trained["means"], self._activation_count, config.appearance_features)
+            vertices = face_model.head_vertices(self.subject)[0]
+            widths = (config.appearance_features, config.appearance_hidden)
+            self.appearance = FeatureAppearance(vertices, face_model.faces, *widths)
+        if self._changes:
+            self.activations = ExpressionActivations(face, self.subject, self._activation_count)
+        self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
+
+    def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
+        """The Gaussians in world space, or in the head frame (`_sh_frame`), with one batch entry per timestep."""
+        sh, in_head = self._active_sh(progress), self._sh_frame == "head"
+        if self._changes and len(face) > 0:
+            return self._pose_with_changes(face, sh, in_head)
+        return Posed(pose_bound_gaussians(self.face_model, face, self.store, sh, in_head), {})
+
+    def _pose_with_changes(self, face: FaceParams, sh: Float[Tensor, "n k 3"], in_head: bool) -> Posed:
+        """The same with the changes of the expression, which are also returned by name."""
+        if len(face) > 1:
+            each = [self._pose_with_changes(face[timestep], sh, in_head) for timestep in range(len(face))]
+            aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in each[0].aux}
+            return Posed(stack_timesteps([posed.gaussians for posed in each]), aux)
+        (activations,) = self.activations(face)
+        # Bases take the first activations, which are those of the largest spread.
+        first = activations[: self.config.expression_rank]
+        changes = {name: expression_change(self.store[name], first) for name in self._basis_shapes()}
+        local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
+        if self.appearance is not None:
+            changes["feature_colour"], changes["feature_opacity"] = self.appearance(self.store, activations)
+        if "offset_basis" in changes:
+            local["means"] = local["means"] + changes["offset_basis"]
+        for name in (name for name in ("opacity_basis", "feature_opacity") if name in changes):
+            local["opacity_logits"] = local["opacity_logits"] + changes[name]
+        for name in (name for name in ("colour_basis", "feature_colour") if name in changes):
+            sh = torch.cat([sh[:, :1] + changes[name][:, None], sh[:, 1:]], dim=1)
+        return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
+
+    def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of a Gaussian's bases of changes with the expression, by name: those that the settings ask for."""
+        rank, rates = self.config.expression_rank, self._basis_rates()
+        wanted = [name for name in _BASES if rank > 0 and rates[name].start > 0]
+        return {name: (rank,) if name == "opacity_basis" else (3, rank) for name in wanted}
+
+    @property
+    def _changes(self) -> bool:
+        """Whether Gaussians change with the expression beside the mesh."""
+        return bool(self._basis_shapes()) or self.config.appearance == "features"
+
+    @property
+    def _activation_count(self) -> int:
+        config = self.config
+        return max(config.expression_rank, config.appearance_directions if config.appearance == "features" else 0)
+
+    @property
+    def _opacity_changes(self) -> bool:
+        return "opacity_basis" in self._basis_shapes() or self.config.appearance == "features"
+
+    def _basis_rates(self) -> dict[str, Rate]:
+        config = self.config
+        rates = (config.expression_colour_rate, config.expression_opacity_rate, config.expression_offset_rate)
+        return dict(zip(_BASES, rates, strict=True))
+
+    def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
+        """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units.
+
+        With `expression_rank` or features, also the mean squared changes with the expression, over all Gaussians.
+        """
+        config = self.config
+        position, scale = triangle_penalties(
+            self.store["means"],
+            self.store["log_scales"],
+            rendering.radii if rendering.radii.ndim == 1 else rendering.radii.amax(0),
+            thresholds=(config.position_threshold, config.scale_threshold),
+            weights=(config.position_weight, config.scale_weight),
+        )
+        losses = {"position": position, "scale": scale}
+        kinds = (("expression", _BASES, config.expression_weight), ("appearance", _FEATURES, config.appearance_weight))
+        for loss, names, weight in kinds:
+            squares = [posed.aux[name].square().mean() for name in names if name in posed.aux]
+            if squares:
+                losses[loss] = weight * torch.stack(squares).sum()
+        return losses
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """One group per tensor."""
+        config, rates = self.config, {}
+        rates["means"], rates["log_scales"], rates["quats"] = (
+            config.means_rate,
+            config.log_scales_rate,
+            config.quats_rate,
+        )
+        rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.colour_rate
+        if config.sh_degree > 0:
+            rates["sh_rest"] = Rate(config.colour_rate.start / 20)
+        rates |= {name: self._basis_rates()[name] for name in self._basis_shapes()}
+        extent = {"means": config.means_times_extent}
+        groups = [
+            store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
+        ]
+        if self.appearance is not None:
+            own = (config.appearance_rate, config.appearance_network_rate)
+            groups += self.appearance.parameter_groups(self.store, *own)
+        return groups
+
+    def gaussian_store(self) -> GaussianStore:
+        """Every per-Gaussian tensor."""
+        return self.store
+
+    def density(self) -> GradientDensity:
+        """Gradient-based control. Children stay on their parent's triangle; no triangle loses its last Gaussian."""
+        return GradientDensity(
+            self.config.density,
+            opacity_logits="opacity_logits",
+            judged_opacities=highest_opacities_seen if self._opacity_changes else resting_opacities,
+            may_prune=never_empty_a_triangle,
+        )
+
+    def bake(self) -> MeshBound:
+        """The mesh of this subject and the raw values of all Gaussians."""
+        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        sh = as_array(self._active_sh(TRAINED))
+        return MeshBound(
+            rig=bake_rig(self.face_model, self.subject),
+            faces=as_array(self.face_model.faces),
+            face_index=store["face_index"],
+            means=store["means"],
+            attributes=Attributes(store["quats"], store["log_scales"], store["opacity_logits"], sh),
+            sh_frame=self._sh_frame,
+            changes=self._bake_changes(),
+        )
+
+    def _bake_changes(self) -> ExpressionChanges | None:
+        """The changes with the expression, or None if the settings ask for none."""
+        if not self._changes:
+            return None
+        features = None if self.appearance is None else self.appearance.bake(self.store)
+        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
+        bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
+        rank = self.config.expression_rank
+        basis_columns = rank if self._basis_shapes() and rank < self._activation_count else None
+        return ExpressionChanges(*fixed, *bases, features=features, basis_columns=basis_columns)
+
+    @property
+    def _sh_frame(self) -> Literal["world", "head"]:
+        """The frame in which the Gaussians are given.
+
+        Colours that do not depend on the view look the same in either frame. In the head frame, coordinates of a
+        decimetre keep three more bits than coordinates of a metre from the camera. Triangles with edges of a millimetre
+        need these bits: in world space, float32 turns them by 1e-4.
+        """
+        return "head" if self.config.sh_degree == 0 else self.config.sh_frame
+
+    def _active_sh(self, progress: Progress) -> Float[Tensor, "n k 3"]:
+        """SH coefficients up to the degree that is active."""
+        degree = self.config.sh_degree
+        if degree == 0:
+            return self.store["sh_constant"]
+        active = active_degree(degree, self.config.sh_warmup, progress)
+        rest = self.store["sh_rest"][:, : (active + 1) ** 2 - 1]
+        return torch.cat([self.store["sh_constant"], rest], dim=1)
+
+
+def resting_opacities(store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """The opacities by which Gaussians are pruned if they do not depend on the face."""
+    return store["opacity_logits"].detach().sigmoid()
+
+
+def never_empty_a_triangle(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Allow no prunes on a triangle that would otherwise lose all its Gaussians (section 3.3)."""
+    face_index = store["face_index"]
+    kept = torch.zeros(int(face_index.max()) + 1, dtype=torch.bool, device=prune.device)
+    kept[face_index[~prune]] = True
+    return prune & kept[face_index]

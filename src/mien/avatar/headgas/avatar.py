@@ -1,0 +1,322 @@
+"""HeadGaS (Dhamo et al., ECCV 2024): Gaussians at rest in the head frame; expressions change colour and opacity.
+
+No code was published, so this is written from the paper, its supplement and its equations. Each Gaussian blends a basis
+of latent features by the expression. One small network turns the result into colour and opacity, so that lips fade
+where teeth appear. The paper leaves some choices open, which were made here: joints that no expression drives are
+appended to the expression vector, because nothing else would move the gaze; the learning rates; the bands and the
+length unit of the encoding; and the opacity to prune by. `headgas_variants` has the paper's ablations.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mien.adam import FactoredGradient
+from mien.avatar.avatar import (
+    UNBAKED_REMEDY,
+    Avatar,
+    Extras,
+    ParameterGroup,
+    Posed,
+    factored_group,
+    network_group,
+    store_group,
+)
+from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
+from mien.avatar.baking import as_array
+from mien.avatar.density import GradientDensity
+from mien.avatar.encoding import positional_encoding
+from mien.avatar.headgas.settings import HeadGasConfig
+from mien.avatar.headgas.variants import (
+    OPACITY_RATE,
+    SHIFT_LENGTH,
+    VARIANTS,
+    Changes,
+    Parts,
+    averaging_weights,
+    new_network,
+    output_widths,
+    split_outputs,
+    start_logit,
+)
+from mien.avatar.ops.activation import sigmoid
+from mien.avatar.ops.expression_changes import expression_inputs, principal_directions
+from mien.avatar.ops.feature_network import Layers, blended_features, feature_network
+from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
+from mien.avatar.store import GaussianStore
+from mien.avatar.surface_places import sample_surface
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams, head_poses
+from mien.gaussians import Gaussians
+from mien.render.rendering import Rendering
+from mien.rotation import multiply_quaternions
+from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
+
+_CHUNK = 512
+_COLOUR_RATE = 2.5e-3
+"""Learning rate of the colours in 3D Gaussian Splatting."""
+
+
+class HeadGas(Avatar):
+    """Static Gaussians in the head frame, with colour and opacity from blended features."""
+
+    config: HeadGasConfig
+    rest: Tensor
+    directions: Tensor
+    judged: Tensor
+
+    def __init__(self, config: HeadGasConfig, face_model: FaceModel, face: FaceParams):
+        n, parts = config.points, VARIANTS[config.variant]
+        # Two of the ablations move Gaussians, and one averages, which no record of `mien.runtime` can say.
+        unbaked = parts.unbaked and f"the variant {config.variant} of headgas: {parts.unbaked}"
+        super().__init__(config, face_model, face, Extras(unbaked=unbaked))
+        means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
+        rest, directions = input_directions(face, self.subject, config.directions)
+        self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
+        # Without a network, the features are the outputs themselves.
+        width = config.features if parts.layers else sum(output_widths(parts, 3 * self._coefficients))
+        trained = {
+            "means": means,
+            "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            "log_scales": neighbour_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
+        }
+        if parts.blends:
+            # The bases start at zero, as in the paper.
+            trained["bases"] = means.new_zeros(n, directions.shape[1], width)
+            trained["neutral_features"] = means.new_zeros(n, width)
+        if not parts.paints:
+            trained["sh"] = means.new_zeros(n, self._coefficients, 3)
+            trained["opacity_logits"] = start_logit().to(means).repeat(n)
+        spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
+        # Not in files: only training needs it, and makes it anew.
+        self.judged = nn.Buffer(spread.detach().clone(), persistent=False)
+        self.store = GaussianStore(trained)
+        self._bases_gradient, self._baked = FactoredGradient(), Kept[Static]()
+        inputs = (width if parts.blends else directions.shape[1]) + 3 + 6 * config.encoding_bands
+        self.network = new_network(parts, inputs, config.hidden, 3 * self._coefficients).to(means)
+
+    def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
+        """The Gaussians in the head frame, one batch entry per timestep. Colours and opacities differ between them.
+
+        Two variants also move Gaussians (supplement, eq. 1 to 3). An avatar that is not in training mode (`eval()`)
+        poses its baked form, if there is one, unless `face` is to have gradients.
+        """
+        store = self.store
+        if (
+            not self.training
+            and progress is TRAINED
+            and self.extras.unbaked is None
+            and can_pose_baked(store["means"], face)
+        ):
+            baked = self._baked.of((*self.parameters(), *self.buffers()), self.bake)
+            return Posed(pose_baked(baked, face), {})
+        inputs = (expression_inputs(face) - self.rest) @ self.directions
+        changes = list(self._changes(inputs, progress))
+        sh = _stacked([one.colours for one in changes]).unflatten(-1, (self._coefficients, 3))
+        opacities = sigmoid(_stacked([one.opacity_logits for one in changes]))
+        means, quats, aux = store["means"], store["quats"], {}
+        moved = [one.moved for one in changes if one.moved is not None]
+        if moved:
+            shifts, turns = _stacked(moved).split([3, 4], dim=-1)
+            aux["shifts"] = SHIFT_LENGTH * shifts
+            means = means + aux["shifts"]
+            identity = turns.new_tensor([1.0, 0.0, 0.0, 0.0])
+            quats = multiply_quaternions(identity + turns, quats.expand_as(turns))
+        gaussians = Gaussians(means, quats, store["log_scales"].exp(), opacities, sh, head_poses(face))
+        return Posed(gaussians, aux)
+
+    def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
+        """The size of the shifts, for variants that move Gaussians (supplement, eq. 4)."""
+        if "shifts" not in posed.aux:
+            return {}
+        return {"shift": self.config.shift_weight * posed.aux["shifts"].abs().mean()}
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """One group per tensor, and one for the network."""
+        config = self.config
+        rates = {"means": config.means_rate, "log_scales": config.log_scales_rate, "quats": config.quats_rate}
+        parts = self._parts
+        if parts.blends:
+            rates["neutral_features"] = config.features_rate
+        if not parts.paints:
+            rates |= {"sh": config.features_rate, "opacity_logits": Rate(OPACITY_RATE)}
+        extent = {"means": config.means_times_extent}
+        groups = [
+            store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
+        ]
+        if parts.blends:
+            groups.append(factored_group(self.store, "bases", config.features_rate, self._bases_gradient))
+        return [*groups, network_group("network", self.network, config.network_rate)] if parts.layers else groups
+
+    def gaussian_store(self) -> GaussianStore:
+        """Every per-Gaussian tensor."""
+        return self.store
+
+    def density(self) -> GradientDensity:
+        """Gradient-based control. Children copy features. `judged_opacities` says which opacity counts."""
+        return GradientDensity(self.config.density, opacity_logits=None, judged_opacities=self.judged_opacities)
+
+    @torch.no_grad()
+    def judged_opacities(self, store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """The highest opacity of each Gaussian at the judged expressions and in the steps since the last round.
+
+        The judged expressions are spread over those of training, so that Gaussians which rare expressions need, such as
+        teeth, are not pruned while these are not drawn.
+        """
+        highest = seen
+        for changes in self._changes(self.judged):
+            highest = torch.maximum(highest, sigmoid(changes.opacity_logits))
+        return highest
+
+    def bake(self) -> Static:
+        """Static points, with the bases of the features and the network.
+
+        Raises:
+            UserError: the variant cannot be baked.
+        """
+        if self.extras.unbaked is not None:
+            raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
+        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        n = len(self.store)
+        neutral, along = self._baked_features()
+        layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]
+        shares = self._output_shares().to(layers[-1].weight)
+        weights = [*(layer.weight for layer in layers[:-1]), layers[-1].weight * shares[:, None]]
+        biases = [*(layer.bias for layer in layers[:-1]), layers[-1].bias * shares]
+        network = AttributeNetwork(
+            input="features",
+            base=np.concatenate([as_array(neutral), as_array(self._encoding())], axis=1),
+            weights=tuple(map(as_array, weights)),
+            biases=tuple(map(as_array, biases)),
+            activation="leaky_relu",
+            outputs=("sh", "opacity_logits"),
+            along=along,
+        )
+        none, no_sh = np.zeros(n, np.float32), np.zeros((n, self._coefficients, 3), np.float32)
+        attributes = Attributes(store["quats"], store["log_scales"], none, no_sh)
+        names, free = self.face_model.expression_names, self.face_model.free_joint_names
+        return Static(store["means"], attributes, names, free, network=network)
+
+    def _baked_features(self) -> tuple[Float[Tensor, "n w"], FeatureDirections]:
+        """A network's first columns for the person at rest, and what the face adds to them."""
+        rest, directions = as_array(self.rest), as_array(self.directions)
+        if self._parts.blends:
+            return self.store["neutral_features"], FeatureDirections(rest, directions, as_array(self.store["bases"]))
+        # Without features, the columns are the inputs along the directions, the same for all Gaussians.
+        n, k = len(self.store), directions.shape[1]
+        same = np.broadcast_to(np.eye(k, dtype=np.float32), (n, k, k))
+        return self.rest.new_zeros(n, k), FeatureDirections(rest, directions, same.copy())
+
+    @property
+    def _parts(self) -> Parts:
+        return VARIANTS[self.config.variant]
+
+    @property
+    def _coefficients(self) -> int:
+        return (self.config.sh_degree + 1) ** 2
+
+    @property
+    def _last_layer(self) -> nn.Linear:
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        return last
+
+    def _changes(self, inputs: Float[Tensor, "b k"], progress: Progress = TRAINED) -> Iterator[Changes]:
+        """What the variant gives at each of some timesteps, whose inputs are along the directions."""
+        store, parts = self.store, self._parts
+        if parts.layers == 0:
+            shares = self._output_shares(progress).to(inputs)
+            for e in inputs:
+                weights, rest = averaging_weights(e)
+                neutral = rest * store["neutral_features"]
+                values = shares * blended_features(store["bases"], weights, neutral, self._bases_gradient)
+                yield Changes(values[:, :-1], values[:, -1] + start_logit().to(values))
+            return
+        encoding = self._encoding()
+        if not parts.blends:
+            shares = self._output_shares(progress).to(inputs)
+            for e in inputs:
+                values = shares * self.network(torch.cat([e.expand(len(encoding), -1), encoding], dim=-1))
+                yield Changes(values[:, :-1], values[:, -1])
+            return
+        layers = self._layers(progress)
+        for e in inputs:
+            found = split_outputs(
+                parts,
+                *feature_network(store["bases"], e, store["neutral_features"], encoding, layers, self._bases_gradient),
+            )
+            yield found if isinstance(found, Changes) else self._unpainted(found, progress)
+
+    def _unpainted(self, moved: Float[Tensor, "n 7"], progress: Progress) -> Changes:
+        shares = self._colour_shares(progress).to(moved)
+        return Changes((shares * self.store["sh"]).flatten(1), self.store["opacity_logits"], moved)
+
+    def _layers(self, progress: Progress = TRAINED) -> Layers:
+        first, last = self.network[0], self._last_layer
+        assert isinstance(first, nn.Linear)
+        shares = self._output_shares(progress).to(last.weight)
+        return Layers(first.weight, first.bias, last.weight * shares[:, None], last.bias * shares)
+
+    def _output_shares(self, progress: Progress = TRAINED) -> Float[Tensor, " o"]:
+        """Factors of the outputs, which are 1 but for colours; without a network, opacities have one of their own."""
+        colours, moved, opacity = output_widths(self._parts, 3 * self._coefficients)
+        shares = self._colour_shares(progress).flatten()[:colours]
+        # Explicit colours and opacities are in one tensor, but opacities learn at their own rate.
+        faster = 1.0 if self._parts.layers else OPACITY_RATE / _COLOUR_RATE
+        return torch.cat([shares, torch.ones(moved), torch.full((opacity,), faster)])
+
+    def _colour_shares(self, progress: Progress) -> Float[Tensor, "s 3"]:
+        """Factors of the colours' coefficients: of higher degrees, a share, and 0 before they begin."""
+        config = self.config
+        shares = torch.ones(self._coefficients, 3)
+        shares[1:] = config.sh_higher_share
+        shares[(active_degree(config.sh_degree, config.sh_warmup, progress) + 1) ** 2 :] = 0
+        return shares
+
+    def _encoding(self) -> Float[Tensor, "n c"]:
+        # Detached, so that centres move only by their effect on the picture, not through the encoding of their
+        # position.
+        points = self.store["means"].detach() / self.config.encoding_length
+        return positional_encoding(points, self.config.encoding_bands)
+
+
+def input_directions(
+    face: FaceParams, neutral: FaceParams, count: int
+) -> tuple[Float[Tensor, " i"], Float[Tensor, "i k"]]:
+    """The inputs of the person at rest, and the directions along which the bases of features are weighted.
+
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. The
+    directions are those of the largest spread over the timesteps of `face`, at most `count` (0: as many as inputs),
+    scaled to a deviation of about 1. So one second moment serves the bases of all of them.
+    """
+    rest, inputs = expression_inputs(neutral)[0].detach(), expression_inputs(face)
+    directions, _ = principal_directions(inputs - rest, min(count or len(rest), len(rest)))
+    return rest.clone(), directions
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    # Training poses one timestep at a time, and needs no copy.
+    return parts[0][None] if len(parts) == 1 else torch.stack(tuple(parts))
+
+
+def spread_out(points: Float[Tensor, "t k"], count: int) -> Float[Tensor, "c k"]:
+    """At most `count` of the points: each is the farthest from those before it, the first from the mean."""
+    chosen: list[int] = []
+    distances = (points - points.mean(0)).norm(dim=-1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distances.argmax()))
+        from_it = (points - points[chosen[-1]]).norm(dim=-1)
+        distances = from_it if len(chosen) == 1 else torch.minimum(distances, from_it)
+    return points[chosen]
+
+
+def neighbour_distances(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Mean distance to the three nearest other points, the initial scale in 3D Gaussian Splatting."""
+    nearest = [
+        torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(4, largest=False).values[:, 1:]
+        for part in points.split(_CHUNK)
+    ]
+    return torch.cat(nearest).mean(-1)

@@ -1,0 +1,108 @@
+"""The settings of HeadGaS."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from mien.avatar.schedules import Rate
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
+from mien.ranges import FRACTION, NOT_NEGATIVE, Range, ToLoad
+
+Variant = Literal["full", "no_mlp", "delta", "change_all", "no_blending"]
+"""The method and its ablations (supplement, section 2), as `mien.avatar.headgas.variants` makes them."""
+
+
+def _density() -> GradientSettings:
+    return GradientSettings(opacity_resets=(), size_start=0.1, prune_size=0.03, max_gaussians=20_000)
+
+
+def _face_tuning() -> FaceTuning:
+    return FaceTuning(within_bounds=True)
+
+
+@dataclass(frozen=True)
+class HeadGasConfig(MethodConfig):
+    """Settings of HeadGaS. The defaults suit a CPU and runs of some thousand steps."""
+
+    variant: Variant = "full"
+    """The method itself (`full`), or one of the paper's ablations. `no_mlp` averages explicit colours and opacities,
+    without a network. `delta` moves and turns Gaussians instead of painting them. `change_all` does both.
+    `no_blending` has no features: a network of five layers takes the expression and the place."""
+    shift_weight: Annotated[float, NOT_NEGATIVE] = 1.0
+    """Weight of the mean absolute shift of the centres, in metres, which only `delta` and `change_all` have. The paper
+    has this term, but not its weight."""
+    face_tuning: FaceTuning = field(default_factory=_face_tuning)
+    """Whether and how fast training changes the tracked face parameters of each frame."""
+    points: Annotated[int, Range(4, 1_000_000), ToLoad(4)] = 2500
+    """Number of Gaussians at the start, sampled on the subject's mesh."""
+    features: Annotated[int, Range(1, 1024)] = 32
+    """Number of latent features per Gaussian, as in the paper. More features need more memory and time per step."""
+    directions: Annotated[int, Range(0, 1024)] = 20
+    """Number of directions of the face along which features change: those of the largest spread over the training
+    timesteps. 0 means as many as the face has inputs (expression coefficients and angles of joints), as in the paper.
+    Fewer need less memory and time per step; a finished avatar follows all inputs either way."""
+    hidden: Annotated[int, Range(1, 4096)] = 64
+    """Width of the network's only hidden layer."""
+    encoding_bands: Annotated[int, Range(0, 24)] = 4
+    """Number of octaves of the positional encoding."""
+    encoding_length: Annotated[float, Range(1e-4, 1e4)] = 0.05
+    """Length of one unit in the positional encoding, in metres."""
+    sh_degree: Annotated[int, Range(0, 3)] = 0
+    """Degree of the spherical harmonics for view-dependent colour (paper: 3). Keep 0 with a single camera, because
+    view-dependent colours then absorb the head's pose."""
+    sh_warmup: Annotated[float, FRACTION] = 0.3
+    """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
+    sh_higher_share: Annotated[float, FRACTION] = 0.05
+    """Factor of the coefficients of higher degrees. The network learns them at this share of the constant colour's
+    rate; 3D Gaussian Splatting uses a twentieth."""
+    means_rate: Rate = Rate(1e-4, 1e-6)
+    """Learning rate of the centres, in metres per step."""
+    means_times_extent: bool = False
+    """Whether the learning rate of the centres is multiplied by the extent of the training cameras in metres, as in
+    3D Gaussian Splatting."""
+    log_scales_rate: Rate = Rate(5e-3)
+    """Learning rate of the logarithms of the scales, per step."""
+    quats_rate: Rate = Rate(1e-3)
+    """Learning rate of the rotations (quaternions), per step."""
+    features_rate: Rate = Rate(2.5e-3)
+    """Learning rate of the feature bases and of the neutral features, per step."""
+    network_rate: Rate = Rate(2e-3, 2e-4)
+    """Learning rate of the network, per step."""
+    judged_expressions: Annotated[int, Range(0, 10_000)] = 64
+    """Number of training expressions, as different as possible, at which each round of density control computes the
+    opacities to prune by. With 0, only the opacities in the steps since the last round count."""
+    density: GradientSettings = field(default_factory=_density)
+    """Density control: when and where Gaussians are added and removed. Opacities come from the network and are never
+    reset, so `size_start` sets when large Gaussians are removed."""
+
+
+_STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS = 50_000, 100, 500, 15_000, 1_000
+"""The paper's run, in steps. The schedule of density control and of degrees is that of 3D Gaussian Splatting."""
+
+
+def _paper() -> HeadGasConfig:
+    """The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
+    return HeadGasConfig(
+        face_tuning=FaceTuning(enabled=False),
+        directions=0,
+        sh_degree=3,
+        sh_warmup=4 * _DEGREE_STEPS / _STEPS,
+        means_rate=Rate(1.6e-4, 1.6e-6),
+        means_times_extent=True,
+        density=GradientSettings(
+            start=_FIRST / _STEPS,
+            stop=_LAST / _STEPS,
+            rounds=(_LAST - _FIRST) // _ROUND + 1,
+            size_unit="extent",
+            split_size=0.01,
+            prune_size=0.1,
+            size_start=_FIRST / _STEPS,
+            opacity_resets=(),
+            max_gaussians=45_000,
+        ),
+    )
+
+
+PRESETS = {"draft": HeadGasConfig(), "standard": HeadGasConfig(), "paper": _paper()}
+"""Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
+PRESET_STEPS = {"paper": _STEPS}
+"""Number of steps of the presets for which the method has its own."""

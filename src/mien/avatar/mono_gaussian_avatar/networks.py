@@ -1,0 +1,201 @@
+"""The three networks of MonoGaussianAvatar: attributes at rest, deformation of points, change of attributes.
+
+Their inputs and outputs that are lengths are in units of
+`LENGTH_UNIT`. Each is a list of `Layer`, made anew from its
+parameters for every step: linear layers that follow each other are multiplied first, which changes nothing but the
+speed.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.utils.parametrizations import weight_norm
+
+from mien.avatar.encoding import positional_encoding
+from mien.avatar.ops.point_network import Activation, Layer, point_network
+
+SKINNING_SHARPNESS = 20.0
+"""Factor on the logits of the skinning weights: their softmax has a temperature of 1/20."""
+_SKIP = 3  # the layer, counted from 0, that reads the encoding again
+_SPHERE_RADIUS = 0.6
+
+ATTRIBUTES = ("log_scales", "quats", "opacity_logits", "sh")
+"""Outputs of the attribute networks, in the order of their columns."""
+ATTRIBUTE_WIDTHS = (3, 4, 1, 3)
+"""Number of columns of each output. Colours and scales go through a sigmoid: `log_scales` and `sh` are logits."""
+
+
+class AttributeNet(nn.Module):
+    """Raw attributes of a point at rest, given its position.
+
+    The trunk has weight normalisation, the heads have none.
+
+    Args:
+        width: Width of all layers.
+        layers: Number of layers of the trunk.
+        bands: Number of octaves of the encoding of positions.
+        sphere: Whether the trunk starts as about the signed distance to a sphere, as published. Otherwise its last
+            layer starts as the others do.
+    """
+
+    def __init__(self, width: int, layers: int, bands: int, sphere: bool = True):
+        super().__init__()
+        self.bands = bands
+        inputs = 3 + 6 * bands
+        # The encoding enters a second time after the third layer, which has fewer outputs to make room for it.
+        self.skip = _SKIP if layers > _SKIP and width > inputs else None
+        sizes = [inputs, *[width] * layers]
+        outputs = [size - inputs if index + 1 == self.skip else size for index, size in enumerate(sizes[1:])]
+        plain = [_linear(i, o) for i, o in zip(sizes[:-1], outputs, strict=True)]
+        with torch.no_grad():
+            # Start with smooth functions of the position. The waves of the encoding come in as training needs them.
+            plain[0].weight[:, 3:] = 0
+            if self.skip is not None:
+                plain[self.skip].weight[:, width - inputs + 3 :] = 0
+            if sphere:
+                nn.init.normal_(plain[-1].weight, math.sqrt(math.pi / width), 1e-4)
+                nn.init.constant_(plain[-1].bias, -_SPHERE_RADIUS)
+        # Last, so that the norms are those of the weights above.
+        self.trunk = nn.ModuleList(weight_norm(layer) for layer in plain)
+        self.heads = nn.ModuleList(nn.Linear(width, width) for _ in ATTRIBUTE_WIDTHS)
+        self.colour = nn.Linear(width, width)
+        self.outputs = nn.ModuleList(nn.Linear(width, size) for size in ATTRIBUTE_WIDTHS)
+        with torch.no_grad():
+            _as_linear(self.outputs[1]).bias.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
+
+    def layers(self) -> list[Layer]:
+        """The layers that follow the encoding. The colour's second layer is linear, and joins the one after it."""
+        layers = []
+        for index, layer in enumerate(self.trunk):
+            weight, bias = _as_linear(layer).weight, _as_linear(layer).bias
+            if index == self.skip:
+                layers.append(Layer(weight / math.sqrt(2), bias, "softplus", extra=0))
+            else:
+                layers.append(Layer(weight, bias, "softplus"))
+        hidden = [_as_linear(head) for head in self.heads]
+        *others, last = [(_as_linear(output).weight, _as_linear(output).bias) for output in self.outputs]
+        joined = (last[0] @ self.colour.weight, last[0] @ self.colour.bias + last[1])
+        return [*layers, _beside(hidden, "softplus"), _block_diagonal([*others, joined])]
+
+    def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 11"]:
+        """Columns as in `ATTRIBUTES`."""
+        return point_network(positional_encoding(points, self.bands), self.layers())
+
+
+class Deformation(NamedTuple):
+    """What the deformation network says about points."""
+
+    offset: Float[Tensor, "n 3"]
+    """O: the canonical position less the point's own."""
+    expression: Float[Tensor, "n 3 e"]
+    pose: Float[Tensor, "n 3 p"]
+    weights: Float[Tensor, "n k"]
+    """Skinning weights, which sum to 1."""
+
+
+class DeformationNet(nn.Module):
+    """Offset, blend directions and skinning weights of a point, given its position. At first zero, zero, equal."""
+
+    def __init__(self, width: int, expressions: int, pose_features: int, bones: int):
+        super().__init__()
+        self.expressions, self.pose_features = expressions, pose_features
+        self.trunk = nn.ModuleList(weight_norm(_linear(size, width)) for size in (3, width, width, width))
+        self.directions = nn.Linear(width, 3 * (1 + expressions + pose_features))
+        self.hidden, self.skinning = nn.Linear(width, width), nn.Linear(width, bones)
+        for last in (self.directions, self.skinning):
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def forward(
+        self, points: Float[Tensor, "n 3"], coefficients: Float[Tensor, "b c"]
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "b n 3"], Float[Tensor, "n k"]]:
+        """Offsets, sums of directions weighted by `coefficients`, and skinning weights.
+
+        The layer of directions is linear, so its weights are summed in place of the directions: exactly the same sums
+        for a fraction of the work.
+
+        Args:
+            points: Positions.
+            coefficients: Weights of the expression directions, then of the pose correctives, of each timestep.
+        """
+        weight, bias = self._directions()
+        weight = torch.cat([weight[:, 0], torch.einsum("bc,xcw->bxw", coefficients, weight[:, 1:]).flatten(0, 1)])
+        bias = torch.cat([bias[:, 0], torch.einsum("bc,xc->bx", coefficients, bias[:, 1:]).flatten()])
+        outputs = point_network(points, self._layers(weight, bias))
+        offset, moved, logits = outputs.split([3, 3 * len(coefficients), self.skinning.out_features], dim=-1)
+        moved = moved.unflatten(-1, (-1, 3)).transpose(0, 1)
+        return offset, moved, (SKINNING_SHARPNESS * logits).softmax(-1)
+
+    def whole(self, points: Float[Tensor, "n 3"]) -> Deformation:
+        """Everything about some points, with every direction."""
+        weight, bias = self._directions()
+        widths = [1, self.expressions, self.pose_features]
+        outputs = point_network(points, self._layers(weight.flatten(0, 1), bias.flatten()))
+        directions, logits = outputs.split([3 * sum(widths), self.skinning.out_features], dim=-1)
+        offset, expression, pose = directions.unflatten(-1, (3, -1)).split(widths, dim=-1)
+        return Deformation(offset[..., 0], expression, pose, (SKINNING_SHARPNESS * logits).softmax(-1))
+
+    def _directions(self) -> tuple[Float[Tensor, "3 _ w"], Float[Tensor, "3 _"]]:
+        return self.directions.weight.unflatten(0, (3, -1)), self.directions.bias.unflatten(0, (3, -1))
+
+    def _layers(self, weight: Float[Tensor, "o w"], bias: Float[Tensor, " o"]) -> list[Layer]:
+        """Trunk, hidden layer of the skinning weights, and their logits beside `weight` and `bias` of the trunk."""
+        trunk = [Layer(_as_linear(layer).weight, _as_linear(layer).bias, "softplus") for layer in self.trunk]
+        hidden = Layer(self.hidden.weight, self.hidden.bias, "softplus")
+        of_hidden = torch.cat([weight.new_zeros(weight.shape), self.skinning.weight])
+        of_trunk = torch.cat([weight, weight.new_zeros(self.skinning.weight.shape)])
+        last = Layer(torch.cat([of_hidden, of_trunk], dim=1), torch.cat([bias, self.skinning.bias]), extra=len(trunk))
+        return [*trunk, hidden, last]
+
+
+class AttributeChangeNet(nn.Module):
+    """Changes of a point's raw attributes, given its motion from the canonical position."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        # There is no activation after the third layer, as in the published code: this layer and the next form one
+        # linear map.
+        self.trunk = nn.ModuleList(weight_norm(nn.Linear(size, width)) for size in (3, width, width))
+        self.heads = nn.ModuleList(nn.Linear(width, width) for _ in ATTRIBUTE_WIDTHS)
+        self.outputs = nn.ModuleList(nn.Linear(width, size) for size in ATTRIBUTE_WIDTHS)
+
+    def forward(self, displacement: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 11"]:
+        """Columns as in `ATTRIBUTES`."""
+        return point_network(displacement.flatten(0, -2), self.layers()).unflatten(0, displacement.shape[:-1])
+
+    def layers(self) -> list[Layer]:
+        """An equivalent plain network with ReLU between all of its four layers."""
+        first, second, third = (_as_linear(layer) for layer in self.trunk)
+        fan_out = _beside([_as_linear(head) for head in self.heads], "relu")
+        third_weight = third.weight
+        return [
+            Layer(first.weight, first.bias, "relu"),
+            Layer(second.weight, second.bias, "relu"),
+            Layer(fan_out.weight @ third_weight, fan_out.weight @ third.bias + fan_out.bias, "relu"),
+            _block_diagonal([(_as_linear(output).weight, _as_linear(output).bias) for output in self.outputs]),
+        ]
+
+
+def _beside(layers: list[nn.Linear], activation: Activation) -> Layer:
+    """Layers with the same input as one."""
+    return Layer(torch.cat([layer.weight for layer in layers]), torch.cat([layer.bias for layer in layers]), activation)
+
+
+def _block_diagonal(layers: list[tuple[Tensor, Tensor]]) -> Layer:
+    """Layers, each of which reads its own columns, as one."""
+    return Layer(torch.block_diag(*(weight for weight, _ in layers)), torch.cat([bias for _, bias in layers]))
+
+
+def _as_linear(layer: nn.Module) -> nn.Linear:
+    assert isinstance(layer, nn.Linear)
+    return layer
+
+
+def _linear(inputs: int, outputs: int) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    nn.init.normal_(layer.weight, std=math.sqrt(2 / outputs))
+    nn.init.zeros_(layer.bias)
+    return layer

@@ -1,0 +1,102 @@
+"""Bound Gaussians: posing of the face, frames of the triangles and opacities as one operation."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien import _native
+from mien.arrays import unpacked
+from mien.avatar.ops.activation import sigmoid
+from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
+from mien.avatar.store import GaussianStore
+from mien.face import FaceModel, FaceParams, head_poses
+from mien.face.posing import compiled_model, has_native_posing
+from mien.gaussians import Gaussians
+
+_LOCAL = ("means", "quats", "log_scales", "opacity_logits")
+
+
+def pose_bound_gaussians(
+    face_model: FaceModel,
+    face: FaceParams,
+    store: GaussianStore | Mapping[str, Tensor],
+    sh: Float[Tensor, "n k 3"],
+    in_head: bool,
+) -> Gaussians:
+    """The posed Gaussians of a store, or of such tensors by name.
+
+    The tensors are `face_index`, `means, quats, log_scales` in triangle units, and `opacity_logits`. The Gaussians are
+    in world space or, with `in_head`, in the head frame together with its pose. There is one batch entry per timestep.
+    Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training, takes one
+    native call forward and one backward.
+    """
+    if len(face) == 1 and has_native_posing(face_model, face) and store["means"].dtype == torch.float32:
+        compiled = compiled_model(face_model)
+        rest = compiled.rest_shape(face_model, face)
+        if not rest[0].requires_grad:
+            topology = rig_topology(len(face_model.template), face_model.faces, store["face_index"])
+            pose = (face.expression, face.joints, face.head_rotation, face.head_translation)
+            local = (store[name] for name in _LOCAL)
+            means, quats, scales, opacities, *head = _BoundGaussians.apply(
+                compiled.data, topology, in_head, *rest, *pose, *local
+            )
+            return Gaussians(means, quats, scales, opacities, sh, *head)
+    return pose_bound_gaussians_reference(face_model, face, store, sh, in_head)
+
+
+def pose_bound_gaussians_reference(
+    face_model: FaceModel,
+    face: FaceParams,
+    store: GaussianStore | Mapping[str, Tensor],
+    sh: Float[Tensor, "n k 3"],
+    in_head: bool,
+) -> Gaussians:
+    """`pose_bound_gaussians` composed from its parts, for any dtype, device and number of timesteps."""
+    vertices = face_model.head_vertices(face) if in_head else face_model(face)
+    means, quats, log_scales, opacity_logits = (store[name] for name in _LOCAL)
+    bound = bind_to_world(vertices, face_model.faces, store["face_index"], means, quats, log_scales)
+    return Gaussians(*bound, sigmoid(opacity_logits), sh, head_poses(face) if in_head else None)
+
+
+class _BoundGaussians(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, data: Any, topology: Any, in_head: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
+        arrays = [tensor.detach().contiguous() for tensor in inputs]
+        count = len(arrays[-1])
+        means, quats, scales = (torch.empty(1, count, width) for width in (3, 4, 3))
+        opacities, head_pose = torch.empty(count), torch.empty(1, 4, 4)
+        known = unpacked(*arrays, means, quats, scales, opacities, head_pose)
+        face, local = _native.FaceArrays(*known[:6]), _native.LocalGaussians(*known[6:10])
+        posed = _native.PosedGaussians(*known[10:])
+        ctx.ride = _native.ride(data, topology, in_head, face, local, posed)
+        ctx.data, ctx.topology, ctx.in_head = data, topology, in_head
+        ctx.save_for_backward(*arrays, scales, opacities)
+        return (means, quats, scales, opacities, head_pose) if in_head else (means, quats, scales, opacities)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *saved, scales, opacities = ctx.saved_tensors
+        moves_face = any(ctx.needs_input_grad[5:9])
+        of_face = [torch.empty_like(tensor) if moves_face else None for tensor in saved[2:6]]
+        of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:]]
+        head_pose = () if ctx.in_head else (None,)
+        by_posed = (*(gradient.contiguous() for gradient in gradients), *head_pose)
+        known = unpacked(*saved, *by_posed, *of_gaussians, scales.detach(), opacities.detach())
+        _native.ride_backward(
+            ctx.ride,
+            ctx.data,
+            ctx.topology,
+            _native.FaceArrays(*known[:6]),
+            _native.LocalGaussians(*known[6:10]),
+            known[19],
+            known[20],
+            _native.PosedGaussians(*known[10:15]),
+            _native.LocalGaussians(*known[15:19]),
+            _native.FaceParameterGradients(*unpacked(*of_face)) if moves_face else None,
+        )
+        return None, None, None, None, None, *of_face, *of_gaussians

@@ -1,0 +1,266 @@
+"""The protocol `unseen_view`: an avatar of one front camera against true pictures of the person from all sides."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.capture import Capture
+from mien.evaluation.experiment import Experiment
+from mien.evaluation.metrics import crop_to
+from mien.evaluation.scoring import Scores, ScoreSettings, as_8_bit, mean_scores, perceptual_metric, score_pictures
+from mien.files import write_atomically
+from mien.lab.synthetic import Truth
+from mien.lab.synthetic.recipe import SIDES
+from mien.parallel import stream_in_threads
+from mien.pictures import Box
+from mien.progress import track_progress
+from mien.render import rasterize
+from mien.render.mesh import render_mesh
+from mien.tracking import NeckParts, head_crop, head_cutter
+from mien.training.footage import composite, measure_coverage
+from mien.training.whole_head import complete_colors, vertex_means
+
+AVATAR, MESH = "avatar", "mesh"
+_DEPTH_OF_MIDDLE = 0.08
+"""Distance of the head's middle behind that of the face, in metres."""
+Figures = dict[str, dict[str, Any]]
+"""Mean figures (`mean_scores`) by angle and by what is scored."""
+
+
+@dataclass(frozen=True, eq=False)
+class SidePictures:
+    """True pictures of one sequence from the front and from `SIDES`, at some of its timesteps."""
+
+    capture: Capture
+    """The pictures and exact mattes of all cameras; the first one is in front."""
+    truth: Truth
+    timesteps: tuple[int, ...]
+    """The timestep of the sequence that each picture shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One picture to score."""
+
+    camera: int
+    moment: int
+
+    @cached_property
+    def label(self) -> str:
+        """The row that the view counts in: left and right count together."""
+        return angle_names()[self.camera]
+
+
+_Job = tuple[_View, dict[str, Tensor], Tensor, Box]
+"""A view, its pictures to score, the truth, and the head crop."""
+
+
+def angle_names() -> list[str]:
+    """The name of each camera's row, the front camera's first, such as `15` for both cameras 15 degrees aside."""
+    names = ["front"]
+    for azimuth, elevation in SIDES.values():
+        upright = "above" if elevation > 0 else "below"
+        names.append(f"{abs(azimuth):g}" if elevation == 0 else f"{upright} {abs(elevation):g}")
+    return names
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """The front camera at one moment, as it truly is and as the tracking has it, and the head in front of both."""
+
+    true: Camera
+    tracked: Camera
+    true_middle: Float[np.ndarray, " 3"]
+    """Middle of the true face or head in the true world, in metres."""
+    tracked_middle: Float[np.ndarray, " 3"]
+    """Middle of the tracked face or head in the tracking's world, in its metres."""
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """The rotation from the true world to that of the tracking: both cameras look the same way."""
+        true, own = (one.viewmat[:3, :3].double().numpy() for one in (self.true, self.tracked))
+        return own.T @ true
+
+    @property
+    def scale(self) -> float:
+        """Size of the tracking's metres in the front picture, as a share of that of true metres."""
+        true, own = (
+            one.K[0, 0].item() / _before(one, middle)[2]
+            for one, middle in ((self.true, self.true_middle), (self.tracked, self.tracked_middle))
+        )
+        return own / true
+
+    def behind(self, ahead: Float[np.ndarray, " 3"]) -> "Front":
+        """Return this front camera with both middles moved from that of the face to that of the head.
+
+        Args:
+            ahead: Direction in which the true head looks, in the true world.
+        """
+        back = -_DEPTH_OF_MIDDLE * ahead
+        return replace(
+            self,
+            true_middle=self.true_middle + back,
+            tracked_middle=self.tracked_middle + self.rotation @ back / self.scale,
+        )
+
+
+def camera_beside(camera: Camera, front: Front) -> Camera:
+    """A true camera in the world of a tracking, which sees the avatar as it sees the person.
+
+    Cameras stand beside each other as they truly do: their rotations relative to the front camera are exact. The front
+    camera itself becomes the tracking's own, so that the avatar is seen from the front as it was trained. The middle of
+    the head therefore has the tracked place and size in the front picture, and a camera aside has the same distance
+    from it relative to the front camera's. Focal lengths and principal points differ from the true ones as the front
+    camera's do.
+
+    A similarity that aligns the tracked vertices with the true ones would do for a perfect shape. But vertices that are
+    off by a millimetre along the skin make it half a percent too large or small, and shift it by a quarter of a pixel.
+
+    Args:
+        camera: The camera in the true world.
+        front: The front camera.
+    """
+    side, true = (one.viewmat.double().numpy() for one in (camera, front.true))
+    lens, true_lens, tracked_lens = (one.K.double().numpy() for one in (camera, front.true, front.tracked))
+    near, far = _before(front.tracked, front.tracked_middle), _before(front.true, front.true_middle)
+    # The point at the true distance that the true front camera sees where the tracking sees the head.
+    pixel = tracked_lens @ near / near[2]
+    point = true[:3, :3].T @ (np.linalg.solve(true_lens, pixel) * far[2] - true[:3, 3])
+    own_lens = lens.copy()
+    own_lens[[0, 1], [0, 1]] *= (tracked_lens.diagonal() / true_lens.diagonal())[:2]
+    own_lens[:2, 2] += (tracked_lens - true_lens)[:2, 2]
+    place = np.linalg.solve(own_lens, lens @ _before(camera, point)) * near[2] / far[2]
+    moved = np.eye(4)
+    moved[:3, :3] = side[:3, :3] @ front.rotation.T
+    moved[:3, 3] = place - moved[:3, :3] @ front.tracked_middle
+    view = torch.from_numpy(moved).to(camera.viewmat)
+    return replace(camera, K=torch.from_numpy(own_lens).to(camera.K), viewmat=view)
+
+
+def _before(camera: Camera, point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """A point of the world in a camera's frame."""
+    view = camera.viewmat.double().numpy()
+    return view[:3, :3] @ point + view[:3, 3]
+
+
+@torch.no_grad()
+def score_side_views(
+    experiment: Experiment, sequence: str, pictures: SidePictures, settings: ScoreSettings
+) -> tuple[Figures, Float[np.ndarray, "h w 3"]]:
+    """Figures by angle for the avatar and the mesh in completed colours, and a sheet: truth, avatar, mesh by angle.
+
+    The pictures are cut and cropped as in every other protocol: over white, above the cut at the neck of the posed
+    head.
+    An avatar is posed as in `experiment`, and seen by the true cameras as they stand beside the front camera
+    (`camera_beside`).
+
+    Args:
+        experiment: The trained avatar with its sequences.
+        sequence: Name of the sequence that the pictures show.
+        pictures: The true pictures.
+        settings: Which figures. ST-LPIPS is computed for one of `settings.perceptual_frames` moments per camera.
+    """
+    index = [one.name for one in experiment.sequences].index(sequence)
+    model, truth = experiment.avatar.face_model, pictures.truth
+    neck = NeckParts.of(model)
+    colors = _completed_colors(experiment, settings.threads or None)
+    metric, judged = perceptual_metric(settings), _judged(len(pictures.timesteps), settings.perceptual_frames)
+    tracking, used = experiment.sequences[index].tracking, experiment.faces[index]
+    true_points, cameras = truth.vertices_world.astype(np.float64), truth.tracking.cameras
+
+    def drawn(view: _View) -> _Job:
+        timestep = pictures.timesteps[view.moment]
+        points = model(tracking.face[timestep])[0].numpy()[truth.vertex_index].astype(np.float64)
+        face = Front(cameras[0], tracking.cameras[0], true_points[view.moment].mean(0), points.mean(0))
+        ahead = truth.tracking.face[view.moment].T_world_head[0, :3, 2].double().numpy()
+        camera = camera_beside(cameras[view.camera], face.behind(ahead))
+        gaussians = experiment.avatar.pose(used[timestep]).gaussians.timestep(0)
+        place = (view.moment, view.camera)
+        mask = head_cutter(model, neck, used[timestep])(np.asarray(pictures.capture.mattes[place]), camera)
+        white = np.full(3, 255, np.uint8)
+        picture = composite(np.asarray(pictures.capture.images[place]), mask, white)
+        vertices = model(used[timestep])[0]
+        images = {
+            AVATAR: rasterize(gaussians, camera, torch.ones(3)).image.clamp(0, 1),
+            MESH: render_mesh(vertices, model.faces, camera, colors, supersample=2)[0].clamp(0, 1),
+        }
+        left, top, width, height = (int(value) for value in head_crop(mask))
+        return view, images, torch.from_numpy(picture).float() / 255, (left, top, width, height)
+
+    def score(job: _Job) -> tuple[_View, dict[str, Scores]]:
+        view, images, target, crop = job
+        eight = {name: as_8_bit(image) for name, image in images.items()}
+        return view, score_pictures(eight, target, crop, metric if view.moment in judged else None)
+
+    views = [_View(camera, moment) for camera in range(len(SIDES) + 1) for moment in range(len(pictures.timesteps))]
+    shown: list[list[np.ndarray]] = []
+
+    def jobs() -> Iterator[_Job]:
+        for view in track_progress(views, "unseen views", len(views)):
+            job = drawn(view)
+            if view.moment == len(pictures.timesteps) // 2:
+                shown.append([_tile(crop_to(image, job[3])) for image in (job[2], job[1][AVATAR], job[1][MESH])])
+            yield job
+
+    rows = list(stream_in_threads(score, jobs(), settings.threads or None))
+    return _by_angle(rows), np.concatenate([np.concatenate(row, 0) for row in shown], 1)
+
+
+def _completed_colors(experiment: Experiment, threads: int | None) -> Float[Tensor, "v 3"]:
+    """Colours of the mesh from the training pictures, completed where they show none."""
+    model = experiment.avatar.face_model
+    found = measure_coverage(model, experiment.sequences, experiment.faces, experiment.training_frames, threads)
+    neutral = model.head_vertices(experiment.avatar.subject)[0]
+    return vertex_means(model, complete_colors(model, neutral, found.seen, found.colors))
+
+
+def _by_angle(rows: list[tuple[_View, dict[str, Scores]]]) -> Figures:
+    figures: Figures = {}
+    for label in dict.fromkeys(angle_names()):
+        own = [scored for view, scored in rows if view.label == label]
+        figures[label] = {name: mean_scores([row[name] for row in own]) for name in (AVATAR, MESH)}
+    return figures
+
+
+def write_unseen_chart(path: Path, figures: Figures) -> None:
+    """Write a chart of the head crop's PSNR over the angle aside. The file's ending decides its format."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for subject, style in ((AVATAR, "o-"), (MESH, "s--")):
+        level = {0.0 if label == "front" else float(label): row for label, row in figures.items() if _is_level(label)}
+        axes.plot(list(level), [row[subject]["head"]["psnr"] for row in level.values()], style, label=subject)
+    axes.set(xlabel="degrees from the front camera", ylabel="PSNR of the head crop, dB", title="unseen views")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    write_atomically(path, lambda part: figure.savefig(part, format=path.suffix.lstrip("."), dpi=130))
+
+
+def _is_level(label: str) -> bool:
+    return label == "front" or label.isdigit()
+
+
+def _judged(moments: int, count: int) -> set[int]:
+    """The moments for which ST-LPIPS is computed: `count` of them, evenly spread; all with 0."""
+    return set(range(0, moments, max(1, -(-moments // count)) if count else 1))
+
+
+def _tile(image: Tensor, side: int = 160) -> np.ndarray:
+    """The picture scaled into a white square."""
+    import cv2
+
+    scale = side / max(image.shape[:2])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    square = np.full((side, side, 3), 255, np.uint8)
+    scaled = cv2.resize(np.asarray(image), size, interpolation=cv2.INTER_AREA)
+    square[: size[1], : size[0]] = np.clip(np.rint(scaled * 255), 0, 255).astype(np.uint8)
+    return square

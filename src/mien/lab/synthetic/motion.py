@@ -1,0 +1,344 @@
+"""Generate a head's motion from a seed, with natural timing.
+
+The order of the file: the script in time, the expressions (speech, smiles and brows, posed expressions, blinks), then
+the pose and gaze of the head. Names of expressions are ARKit's.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import accumulate
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from mien import exact
+from mien.face import FaceModel, FaceParams
+from mien.lab.synthetic.arithmetic import smoothstep
+from mien.lab.synthetic.posing import rest_joints
+from mien.lab.synthetic.recipe import Segment, SegmentKind, SyntheticRecipe
+from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+
+_MAX_GAZE = 0.42
+"""Largest angle of the gaze in radians. Beyond it the head turns."""
+_SHOULDERS_FOLLOW = 0.25
+"""Share of the head's rotation that the shoulders follow."""
+_RAMP = 0.5
+"""Seconds in which a part fades in and out."""
+_TURNS = ((0.0, 1.0), (0.0, -1.0), (0.7, 0.0), (-0.8, 0.0), (0.4, 0.7), (-0.4, -0.7), (0.4, -0.7), (-0.4, 0.7))
+"""Goals of successive turns, as shares of the largest pitch (positive looks down) and yaw."""
+_TURN_SECONDS = 2.2
+"""Seconds from one goal to the next."""
+
+_Tracks = dict[str, np.ndarray]
+"""Coefficients over time by name. A name without a side means both sides."""
+
+_VISEMES: dict[str, Mapping[str, float]] = {
+    "rest": {},
+    "a": {"jawOpen": 0.4, "mouthLowerDown": 0.3, "mouthUpperUp": 0.3},
+    "e": {"jawOpen": 0.2, "mouthStretch": 0.35, "mouthSmile": 0.15, "mouthLowerDown": 0.3, "mouthUpperUp": 0.3},
+    "i": {"jawOpen": 0.1, "mouthSmile": 0.3, "mouthStretch": 0.3, "mouthLowerDown": 0.3, "mouthUpperUp": 0.35},
+    "o": {"jawOpen": 0.3, "mouthFunnel": 0.5},
+    "u": {"jawOpen": 0.12, "mouthPucker": 0.55, "mouthFunnel": 0.2},
+    "m": {"mouthClose": 0.03, "mouthPress": 0.35, "mouthRollLower": 0.15, "mouthRollUpper": 0.15},
+    "f": {"jawOpen": 0.06, "mouthRollLower": 0.25, "mouthUpperUp": 0.2},
+    "s": {"jawOpen": 0.06, "mouthStretch": 0.2, "mouthLowerDown": 0.25, "mouthUpperUp": 0.1},
+}
+_GESTURES: dict[str, Mapping[str, float]] = {
+    "smile": {
+        "mouthSmile": 0.7, "cheekSquint": 0.45, "eyeSquint": 0.3, "mouthUpperUp": 0.3, "mouthLowerDown": 0.1,
+        "mouthDimple": 0.2,
+    },
+    "raise": {"browInnerUp": 0.7, "browOuterUp": 0.7, "eyeWide": 0.3},
+    "frown": {"browDown": 0.7, "eyeSquint": 0.25, "mouthFrown": 0.2},
+    "worry": {"browInnerUp": 0.75, "mouthFrown": 0.35},
+}  # fmt: skip
+_POSED: dict[str, Mapping[str, float]] = {
+    "mouth wide open": {"jawOpen": 0.85},
+    "broad smile": {"mouthSmile": 1.0, "cheekSquint": 0.8, "eyeSquint": 0.5, "mouthUpperUp": 0.5, "jawOpen": 0.12},
+    "pucker": {"mouthPucker": 1.0},
+    "brows up": {"browInnerUp": 1.0, "browOuterUp": 1.0, "eyeWide": 0.7},
+    "anger": {"browDown": 1.0, "eyeSquint": 0.5, "noseSneer": 0.7, "mouthPress": 0.5},
+    "mouth left": {"mouthLeft": 0.8, "jawLeft": 0.4},
+    "mouth right": {"mouthRight": 0.8, "jawRight": 0.4},
+    "puffed cheeks": {"cheekPuff": 1.0, "mouthPress": 0.4},
+    "sadness": {"browInnerUp": 0.9, "mouthFrown": 1.0, "mouthShrugLower": 0.6},
+    "funnel": {"mouthFunnel": 1.0, "jawOpen": 0.25},
+    "half a smile": {"mouthSmileLeft": 0.9, "mouthDimpleLeft": 0.5},
+    "wink": {"eyeBlinkRight": 1.0, "cheekSquintRight": 0.7, "mouthSmileRight": 0.4},
+    "eyes shut tight": {"eyeBlink": 1.0, "eyeSquint": 0.9, "cheekSquint": 0.8, "browDown": 0.5},
+    "rolled lips": {"mouthRollLower": 0.8, "mouthRollUpper": 0.8},
+}
+
+
+@dataclass(frozen=True)
+class _Span:
+    """A segment with its start and end in the clip, in seconds."""
+
+    kind: SegmentKind
+    start: float
+    end: float
+    first: bool
+    last: bool
+
+    def window(self, times: np.ndarray) -> np.ndarray:
+        """Return 1 inside and 0 outside, with soft ends inside, except at the beginning and the end of the clip."""
+        ramp = min(_RAMP, 0.25 * (self.end - self.start))
+        rise = 1.0 if self.first else smoothstep(self.start, self.start + ramp, times)
+        fall = 0.0 if self.last else smoothstep(self.end - ramp, self.end, times)
+        return rise - fall + np.zeros_like(times)
+
+
+def _lay_out(recipe: SyntheticRecipe) -> tuple[_Span, ...]:
+    """Return the recipe's script as spans in time."""
+    segments = recipe.script or (Segment("free", recipe.seconds),)
+    ends = list(accumulate(segment.seconds for segment in segments))
+    last = len(segments) - 1
+    return tuple(
+        _Span(segment.kind, end - segment.seconds, end, index == 0, index == last)
+        for index, (segment, end) in enumerate(zip(segments, ends, strict=True))
+    )
+
+
+def _moving_clock(times: np.ndarray, spans: tuple[_Span, ...]) -> np.ndarray:
+    """Return the seconds of motion so far: a clock that stops while the script is still."""
+    speed = 1 - sum((span.window(times) for span in spans if span.kind == "still"), np.zeros_like(times))
+    step = float(times[1] - times[0]) if len(times) > 1 else 0.0
+    return np.concatenate([[0.0], np.cumsum(speed[:-1]) * step])
+
+
+def _share_of(kind: SegmentKind, times: np.ndarray, spans: tuple[_Span, ...]) -> np.ndarray:
+    """Return the share of this kind at each time, 0..1."""
+    return sum((span.window(times) for span in spans if span.kind == kind), np.zeros_like(times))
+
+
+def _wide_turns(times: np.ndarray, spans: tuple[_Span, ...], pitch: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return pitch and yaw of the turns, up to these angles: sideways, up, down, diagonally, and back."""
+    down, left = np.zeros_like(times), np.zeros_like(times)
+    for span in spans:
+        if span.kind != "turns":
+            continue
+        before = np.zeros(2)
+        moves = max(int((span.end - span.start) / _TURN_SECONDS), 2)
+        length = (span.end - span.start) / moves
+        for index in range(moves):
+            goal = np.array(_TURNS[index % len(_TURNS)] if index < moves - 1 else (0.0, 0.0))
+            begin = span.start + index * length
+            share = smoothstep(begin, begin + 0.9 * length, times)
+            down += share * (goal - before)[0]
+            left += share * (goal - before)[1]
+            before = goal
+    return pitch * down, yaw * left
+
+
+def _make_tracks(
+    random: np.random.Generator, times: np.ndarray, scale: float, spans: tuple[_Span, ...], *, blinks: bool
+) -> _Tracks:
+    """Return every coefficient over time that is not always 0.
+
+    Args:
+        random: Decides timing and order.
+        times: Times in seconds.
+        scale: Scale of everything but blinks.
+        spans: Spans of the script.
+        blinks: Whether to add blinks.
+    """
+    tracks: _Tracks = {}
+    for span in spans:
+        for add in _EXPRESSIONS_OF[span.kind]:
+            part: _Tracks = {}
+            add(random, times, span, part)
+            window = span.window(times)
+            _add(tracks, dict.fromkeys(part, 1.0), scale * window, part)
+    if blinks:
+        _add_blinks(random, times, spans, tracks)
+    return tracks
+
+
+def _add(tracks: _Tracks, shape: Mapping[str, float], weight: np.ndarray, factors: _Tracks | None = None) -> None:
+    for name, value in shape.items():
+        tracks[name] = tracks.get(name, 0) + value * weight * (1 if factors is None else factors[name])
+
+
+def _add_speech(random: np.random.Generator, times: np.ndarray, span: _Span, tracks: _Tracks) -> None:
+    """Add phrases of one to two seconds: visemes every 0.12 to 0.24 s that blend into each other, then a pause."""
+    names = [name for name in _VISEMES if name != "rest"]
+    keys, shapes, loudness = [span.start], ["rest"], [1.0]
+    clock = span.start + random.uniform(0.1, 0.4)
+    while clock < span.end + 1:
+        for _ in range(random.integers(6, 11)):
+            keys.append(clock)
+            shapes.append(names[random.integers(len(names))])
+            loudness.append(random.uniform(0.7, 1.15))
+            clock += random.uniform(0.12, 0.24)
+        pause = random.uniform(0.25, 0.7)
+        keys += [clock, clock + pause]
+        shapes += ["rest", "rest"]
+        loudness += [1.0, 1.0]
+        clock += pause + 0.12
+    for index, (shape, loud) in enumerate(zip(shapes, loudness, strict=True)):
+        before, now = keys[max(index - 1, 0)], keys[index]
+        after = keys[min(index + 1, len(keys) - 1)]
+        weight = smoothstep(before - 1e-6, now, times) * (1 - smoothstep(now, after + 1e-6, times))
+        _add(tracks, _VISEMES[shape], loud * weight)
+
+
+def _add_gestures(random: np.random.Generator, times: np.ndarray, span: _Span, tracks: _Tracks) -> None:
+    """Add smiles, raised and lowered brows that rise, hold and fall. Every kind recurs."""
+    order: list[str] = []
+    clock = span.start + random.uniform(0.2, 0.8)
+    while clock < span.end:
+        if not order:
+            order = [*random.permutation([*_GESTURES, "smile"])]
+        rise, hold, fall = random.uniform(0.25, 0.45), random.uniform(0.3, 0.9), random.uniform(0.35, 0.6)
+        weight = smoothstep(clock, clock + rise, times) - smoothstep(
+            clock + rise + hold, clock + rise + hold + fall, times
+        )
+        _add(tracks, _GESTURES[order.pop()], random.uniform(0.7, 1.0) * weight)
+        clock += rise + hold + 0.6 * fall + random.uniform(0.0, 0.5)
+
+
+def _add_posed(random: np.random.Generator, times: np.ndarray, span: _Span, tracks: _Tracks) -> None:
+    """Add one posed expression after the other: rise, hold, fall. All kinds occur before one recurs."""
+    order: list[str] = []
+    clock = span.start + 0.2
+    while clock < span.end - 1.0:
+        order = order or [*random.permutation([*_POSED])]
+        rise, hold, fall = random.uniform(0.3, 0.5), random.uniform(0.4, 0.9), random.uniform(0.3, 0.5)
+        down = clock + rise + hold
+        weight = smoothstep(clock, clock + rise, times) - smoothstep(down, down + fall, times)
+        _add(tracks, _POSED[order.pop()], random.uniform(0.8, 1.0) * weight)
+        clock = down + fall + random.uniform(0.0, 0.25)
+
+
+def _add_blinks(random: np.random.Generator, times: np.ndarray, spans: tuple[_Span, ...], tracks: _Tracks) -> None:
+    """Add blinks every 1.2 to 3.5 s. They last 0.18 to 0.3 s and close in a third of that."""
+    clock = random.uniform(0.5, 1.5)
+    closed = np.zeros_like(times)
+    while clock < times[-1]:
+        length = random.uniform(0.18, 0.3)
+        if not any(span.kind == "still" and span.start < clock + length and clock < span.end for span in spans):
+            weight = smoothstep(clock, clock + 0.35 * length, times) - smoothstep(
+                clock + 0.45 * length, clock + length, times
+            )
+            closed = np.maximum(closed, weight)
+        clock += random.uniform(1.2, 3.5)
+    tracks["eyeBlink"] = np.maximum(tracks.get("eyeBlink", 0), closed)
+
+
+_AddExpressions = Callable[[np.random.Generator, np.ndarray, _Span, _Tracks], None]
+_EXPRESSIONS_OF: dict[str, tuple[_AddExpressions, ...]] = {
+    "still": (),
+    "speech": (_add_speech,),
+    "expressions": (_add_posed,),
+    "turns": (),
+    "free": (_add_speech, _add_gestures),
+}
+
+
+def generate_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecipe, seed: int) -> FaceParams:
+    """Return face parameters of every timestep. The camera is at the world's origin and looks along -z.
+
+    The head turns about the base of the neck, which sways. The neck joint, if the model has one, bends so that the base
+    of the neck stays with the shoulders. The shoulders follow the head's turns by a quarter.
+    """
+    random = np.random.default_rng([seed, 1])
+    times, spans = np.arange(recipe.timesteps) / recipe.fps, _lay_out(recipe)
+    clock = _moving_clock(times, spans)
+    pitch_yaw_roll = np.stack(
+        [_drift(random, clock, amplitude) for amplitude in np.radians(np.array(recipe.rotation)[[1, 0, 2]])], axis=-1
+    )
+    sway = np.stack([_drift(random, clock, amplitude) for amplitude in recipe.translation], axis=-1)
+    pitch_yaw_roll *= 1 - _share_of("turns", times, spans)[:, None]
+    turned = _wide_turns(times, spans, *np.radians(recipe.turns)[::-1])
+    pitch_yaw_roll[:, :2] += np.stack(turned, axis=-1)
+    gaze = _gaze(random, times, spans) if recipe.blinks else np.zeros((len(times), 2))
+    gaze -= np.clip(0.85 * pitch_yaw_roll[:, :2], -_MAX_GAZE, _MAX_GAZE)  # the eyes keep looking into the camera
+    tracks = _make_tracks(random, times, recipe.expression, spans, blinks=recipe.blinks)
+    rotations = _euler_matrices(pitch_yaw_roll)
+    pivot = neck_pivot(model, identity)
+    anchor = np.array([0.0, 0.0, -recipe.distance]) + pivot + sway
+    head_rotation = axis_angle_from_matrix(rotations)
+    return FaceParams(
+        identity=identity,
+        expression=_expression(model, tracks, len(times)),
+        joints=_joints(model, rotations, head_rotation, gaze),
+        head_rotation=torch.from_numpy(head_rotation).float(),
+        head_translation=torch.from_numpy(anchor - exact.dot(rotations, pivot)).float(),
+    )
+
+
+def shoulder_rotation(head_rotation: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
+    """Return the shoulders' rotations, given the head's as axis-angle."""
+    return matrix_from_axis_angle(_SHOULDERS_FOLLOW * head_rotation)
+
+
+def neck_pivot(model: FaceModel, identity: torch.Tensor) -> Float[np.ndarray, " 3"]:
+    """Return the point at the neck joint, in the head frame, that stays in place when the head nods and turns."""
+    if "neck" in model.joint_names:
+        return rest_joints(model, identity)[model.joint_names.index("neck")]
+    return np.array([0.0, -0.10, -0.02])
+
+
+def _euler_matrices(pitch_yaw_roll: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
+    """Return rotations by roll, then pitch, then yaw, about the head's +z, +x and +y axes.
+
+    Angles are in radians. Positive pitch looks down.
+    """
+    axes = np.eye(3)
+    pitch, yaw, roll = (matrix_from_axis_angle(pitch_yaw_roll[..., i, None] * axes[i]) for i in range(3))
+    return exact.product(exact.product(yaw, pitch), roll)
+
+
+def _drift(random: np.random.Generator, times: np.ndarray, amplitude: float) -> np.ndarray:
+    """Return slow, aimless motion whose maximum is the amplitude."""
+    total = np.zeros_like(times)
+    for frequency, strength in ((0.11, 1.0), (0.19, 0.7), (0.33, 0.35), (0.62, 0.12)):
+        frequency *= random.uniform(0.85, 1.15)
+        total += strength * np.sin(2 * np.pi * (frequency * times + random.uniform()))
+    return amplitude * total / max(np.abs(total).max(), 1e-9)
+
+
+def _gaze(random: np.random.Generator, times: np.ndarray, spans: tuple[_Span, ...]) -> np.ndarray:
+    """Return the gaze beside the camera as (down, left) angles in radians: fixations with jumps of 40 ms between."""
+    gaze = np.zeros((len(times), 2))
+    clock, current = 0.0, np.zeros(2)
+    while clock < times[-1]:
+        clock += random.uniform(0.5, 1.6)
+        target = random.normal(0, [0.05, 0.11]) if random.uniform() < 0.6 else np.zeros(2)
+        if any(span.kind == "still" and span.start <= clock < span.end for span in spans):
+            continue
+        gaze += smoothstep(clock, clock + 0.04, times)[:, None] * (target - current)
+        current = target
+    return gaze
+
+
+def _expression(model: FaceModel, tracks: _Tracks, timesteps: int) -> Float[torch.Tensor, "t e"]:
+    """Convert tracks to rows of the model's expression. `eyeBlink` drives `eyeBlinkLeft` and `eyeBlinkRight`."""
+    expression = np.zeros((timesteps, len(model.expression_names)))
+    closed = tracks.get("eyeBlink", np.zeros(timesteps))
+    for column, name in enumerate(model.expression_names):
+        side = name.removesuffix("Left").removesuffix("Right")
+        if name not in tracks and side not in tracks:
+            continue
+        values = tracks.get(name, 0.0) + (tracks.get(side, 0.0) if side != name else 0.0)
+        if side in ("eyeSquint", "eyeWide"):
+            values = values * (1 - closed)  # a closed eye cannot close further
+        expression[:, column] = np.clip(values, *model.expression_bounds[column].tolist())
+    return torch.from_numpy(expression).float()
+
+
+def _joints(
+    model: FaceModel,
+    rotations: Float[np.ndarray, "t 3 3"],
+    head_rotation: Float[np.ndarray, "t 3"],
+    gaze: Float[np.ndarray, "t 2"],
+) -> Float[torch.Tensor, "t j 3"]:
+    joints = np.zeros((len(gaze), len(model.free_joint_names), 3))
+    shoulders = shoulder_rotation(head_rotation)
+    for column, name in enumerate(model.free_joint_names):
+        if "eye" in name:
+            joints[:, column, :2] = gaze
+        elif name == "neck":
+            joints[:, column] = axis_angle_from_matrix(exact.product(np.swapaxes(rotations, 1, 2), shoulders))
+    return torch.from_numpy(joints).float()

@@ -1,0 +1,312 @@
+"""A synthetic person: the face model's head and everything beyond the face model, ready to be posed and drawn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien import exact
+from mien.face import FaceModel, FaceParams
+from mien.lab.synthetic.accessories import Glasses, RigidMesh, build_glasses, build_shirt, stack_meshes
+from mien.lab.synthetic.anatomy import CHIN, SIDES, Anatomy, measure_anatomy
+from mien.lab.synthetic.facial_hair import RootedStrands, SkinStrands, grow_beard, grow_brows, grow_lashes
+from mien.lab.synthetic.hair import DrapedStrands, Strands, grow_long_hair, grow_short_hair, ribbon_faces
+from mien.lab.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
+from mien.lab.synthetic.motion import neck_pivot, shoulder_rotation
+from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions
+from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.skin import SkinTextures, paint_skin
+
+SKIN, EYE, TEETH, MOUTH, HAIR, SHIRT, FRAME = range(7)
+"""Materials."""
+
+_HAIR_COLORS = np.array(
+    [[0.018, 0.012, 0.009], [0.045, 0.026, 0.016], [0.10, 0.055, 0.028], [0.20, 0.12, 0.058], [0.13, 0.045, 0.02]],
+    np.float32,
+)
+_IRIS_COLORS = np.array(
+    [[0.10, 0.045, 0.018], [0.16, 0.085, 0.03], [0.10, 0.17, 0.24], [0.12, 0.16, 0.10], [0.17, 0.20, 0.22]], np.float32
+)
+_SHIRT_COLORS = np.array(
+    [[0.05, 0.08, 0.15], [0.25, 0.06, 0.06], [0.10, 0.16, 0.13], [0.35, 0.33, 0.30], [0.045, 0.045, 0.05]], np.float32
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """One eyeball at rest."""
+
+    vertices: Int[np.ndarray, " e"]
+    local: Float[np.ndarray, "e 3"]
+    """Offsets from the centre in metres, +z along the line of sight. Interpolated and normalised, they give exact
+    directions."""
+    front: Int[np.ndarray, " i"]
+    """Vertices of the iris."""
+    radius: float
+    """Radius in metres."""
+    iris_size: float
+    """Sine of the angle between the line of sight and the iris's rim."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """Everything about a person that does not move by itself, in the head frame at rest."""
+
+    model: FaceModel
+    poser: HeadPoser
+    anatomy: Anatomy
+    textures: SkinTextures
+    lighting: Lighting
+    visibility: Visibility
+    eyes: tuple[Eye, ...]
+    iris_color: Float[np.ndarray, " 3"]
+    wet_eyes: bool
+    shirt_color: Float[np.ndarray, " 3"]
+    hair: Strands | DrapedStrands | None
+    on_skin: tuple[SkinStrands | RootedStrands, ...]
+    """Brows and beard."""
+    lashes: bool
+    glasses: Glasses | None
+    shirt: RigidMesh | None
+    faces: Int[np.ndarray, "f 3"]
+    """Triangles of everything that is opaque."""
+    materials: Int[np.ndarray, " f"]
+    model_faces: Int[np.ndarray, " m"]
+    """Indices of the face model's triangles that come first in `faces`, in this order."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSubject:
+    """A subject at one timestep, in the head frame."""
+
+    head: Float[np.ndarray, "v 3"]
+    """The face model's vertices."""
+    normals: Float[np.ndarray, "v 3"]
+    landmarks: Float[np.ndarray, "l 3"]
+    eye_centres: Float[np.ndarray, "2 3"]
+    strands: tuple[Strands, ...]
+    """Hair, brows, beard and lashes, if present, in the order of the subject's `faces`."""
+    T_head_shoulders: Float[np.ndarray, "4 4"]
+    R_world_head: Float[np.ndarray, "3 3"]
+    viewpoint: Float[np.ndarray, " 3"]
+    """Position of the camera."""
+
+
+def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRecipe, seed: int) -> Subject:
+    """Build a person from a seed: paint the skin, add hair and clothes, and compute what shades what."""
+    random = np.random.default_rng([seed, 6])
+    anatomy = measure_anatomy(model, identity)
+    hair_color = _HAIR_COLORS[random.integers(len(_HAIR_COLORS))]
+    collar, size = _collar(anatomy)
+    hair = _grow_hair(anatomy, recipe, hair_color, float(collar[1]), seed)
+    glasses = build_glasses(anatomy) if recipe.glasses else None
+    shirt = build_shirt(collar, size, _shoulder_points(anatomy, collar, size), seed) if recipe.clothes else None
+    on_skin: tuple[SkinStrands | RootedStrands, ...] = ()
+    if recipe.brows_and_lashes:
+        on_skin += (grow_brows(anatomy, 0.7 * hair_color, seed),)
+    if recipe.beard > 0:
+        on_skin += (grow_beard(anatomy, 0.8 * hair_color, recipe.beard, seed),)
+    kept = _uncovered_faces(anatomy, collar) if recipe.clothes else np.arange(len(anatomy.faces))
+    faces, materials = _all_faces(
+        anatomy, kept, _strand_sizes(hair, on_skin, recipe.brows_and_lashes, anatomy), glasses, shirt
+    )
+    occluders = _occluders(anatomy, _at_rest(hair), glasses, shirt) if recipe.detail.shadows else None
+    return Subject(
+        model=model,
+        poser=HeadPoser(model, identity),
+        anatomy=anatomy,
+        textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color),
+        lighting=studio_lighting(seed),
+        visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders),
+        eyes=tuple(_eye(anatomy, side) for side in SIDES),
+        iris_color=_IRIS_COLORS[random.integers(len(_IRIS_COLORS))],
+        wet_eyes=recipe.detail.wet_eyes,
+        shirt_color=_SHIRT_COLORS[random.integers(len(_SHIRT_COLORS))],
+        hair=hair,
+        on_skin=on_skin,
+        lashes=recipe.brows_and_lashes,
+        glasses=glasses,
+        shirt=shirt,
+        faces=faces,
+        materials=materials,
+        model_faces=kept,
+    )
+
+
+def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.ndarray, " 3"]) -> PosedSubject:
+    """Return the subject at one timestep (`face` has a batch of one)."""
+    model = subject.model
+    head = subject.poser(face)
+    landmarks = landmark_positions(model, head)
+    normals = exact.vertex_normals(head, subject.anatomy.faces)
+    T_world_head = head_pose(face)
+    R = T_world_head[:3, :3]
+    centres = np.stack([head[eye.vertices].mean(0) for eye in subject.eyes])
+    T_head_shoulders = _shoulders(subject, face, R)
+    return PosedSubject(
+        head=head,
+        normals=normals,
+        landmarks=landmarks,
+        eye_centres=centres,
+        strands=_posed_strands(subject, head, normals, landmarks, centres, T_head_shoulders),
+        T_head_shoulders=T_head_shoulders,
+        R_world_head=R,
+        viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
+    )
+
+
+def _grow_hair(
+    anatomy: Anatomy, recipe: SyntheticRecipe, color: Float[np.ndarray, " 3"], collar: float, seed: int
+) -> Strands | DrapedStrands | None:
+    if recipe.hair == "none":
+        return None
+    return (
+        grow_long_hair(anatomy, color, collar, seed) if recipe.hair == "long" else grow_short_hair(anatomy, color, seed)
+    )
+
+
+def _at_rest(hair: Strands | DrapedStrands | None) -> Strands | None:
+    return hair.rest if isinstance(hair, DrapedStrands) else hair
+
+
+def _posed_strands(
+    subject: Subject,
+    head: np.ndarray,
+    normals: np.ndarray,
+    landmarks: np.ndarray,
+    eye_centres: np.ndarray,
+    T_head_shoulders: np.ndarray,
+) -> tuple[Strands, ...]:
+    strands = []
+    if subject.hair is not None:
+        hair = subject.hair
+        strands.append(hair.posed(T_head_shoulders) if isinstance(hair, DrapedStrands) else hair)
+    strands += [part.posed(subject.anatomy, head, normals) for part in subject.on_skin]
+    if subject.lashes:
+        strands.append(grow_lashes(landmarks, eye_centres, subject.eyes[0].radius))
+    return tuple(strands)
+
+
+def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:
+    """Return the vertices of `subject.faces` in the head frame."""
+    parts = [posed.head]
+    parts += [strands.ribbon_vertices(posed.viewpoint) for strands in posed.strands]
+    if subject.glasses is not None:
+        parts.append(subject.glasses.frame.vertices)
+    if subject.shirt is not None:
+        T = posed.T_head_shoulders
+        parts.append(exact.rotated(subject.shirt.vertices, T[:3, :3], T[:3, 3]))
+    return np.concatenate(parts).astype(np.float32)
+
+
+def _shoulders(subject: Subject, face: FaceParams, R_world_head: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """Return the shoulders' pose in the head frame. They turn less than the head, about the neck joint."""
+    pivot = neck_pivot(subject.model, face.identity)
+    R = exact.product(R_world_head.T, shoulder_rotation(face.head_rotation[0].numpy()))
+    T = np.eye(4, dtype=np.float32)
+    T[:3, :3], T[:3, 3] = R, pivot - exact.dot(R, pivot)
+    return T
+
+
+def _eye(anatomy: Anatomy, side: str) -> Eye:
+    vertices = anatomy.eye_vertices(side)
+    iris = np.intersect1d(vertices, np.unique(anatomy.faces[anatomy.region("irises")]))
+    offsets = anatomy.vertices[vertices] - anatomy.vertices[vertices].mean(0)
+    directions = offsets / exact.length(offsets)[:, None]
+    axis = directions[np.isin(vertices, iris)].mean(0) if len(iris) else np.array([0, 0, 1.0])
+    axis = axis / exact.length(axis)
+    right = np.cross([0, 1, 0], axis)
+    right /= exact.length(right)
+    basis = np.stack([right, np.cross(axis, right), axis]).T
+    rim = exact.length(exact.product(directions, basis)[np.isin(vertices, iris), :2]).max() if len(iris) else 0.42
+    radius = float(exact.length(offsets).mean())
+    return Eye(vertices, exact.product(offsets, basis).astype(np.float32), iris, radius, float(rim))
+
+
+def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, float]]:
+    """Return the middle, half width and half depth of the neck at the collar's height."""
+    y = float(anatomy.landmarks[CHIN, 1]) - 0.052
+    neck = anatomy.vertices[np.unique(anatomy.faces[anatomy.skin])]
+    ring = neck[np.abs(neck[:, 1] - y) < 0.012]
+    ring = ring[np.abs(ring[:, 0]) < 0.085]
+    half_width = float(np.quantile(np.abs(ring[:, 0]), 0.95))
+    front, back = np.quantile(ring[:, 2], 0.97), np.quantile(ring[:, 2], 0.03)
+    return np.array([0, y, 0.5 * (front + back)], np.float32), (half_width, 0.5 * float(front - back))
+
+
+def _uncovered_faces(anatomy: Anatomy, collar: Float[np.ndarray, " 3"]) -> Int[np.ndarray, " m"]:
+    """Return the triangles that are not deep under the shirt."""
+    return np.flatnonzero(anatomy.vertices[anatomy.faces].mean(1)[:, 1] > collar[1] - 0.065)
+
+
+def _shoulder_points(
+    anatomy: Anatomy, collar: Float[np.ndarray, " 3"], size: tuple[float, float]
+) -> Float[np.ndarray, "p 3"]:
+    """Return dense points of the model's skin that a shirt has to cover: low and beside the neck."""
+    faces = anatomy.faces[anatomy.skin]
+    centres = anatomy.vertices[faces].mean(1) - collar
+    beside = (centres[:, 1] < 0.02) & (centres[:, 1] > -0.06) & (np.abs(centres[:, 0]) > 1.02 * size[0])
+    weights = np.random.default_rng(0).dirichlet((1, 1, 1), (beside.sum(), 40)).astype(np.float32)
+    corners = anatomy.vertices[faces[beside]]
+    return np.concatenate([exact.product(weights, corners).reshape(-1, 3), corners.reshape(-1, 3)])
+
+
+def _occluders(
+    anatomy: Anatomy, hair: Strands | None, glasses: Glasses | None, shirt: RigidMesh | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what casts shadows: the head at rest, every fourth strand three times as wide, the rims, the shoulders."""
+    closed = ~anatomy.region("eyes", "irises", "teeth", "tongue", "mouth", "eye_sockets")
+    meshes = [(anatomy.vertices, anatomy.faces[closed])]
+    if hair is not None:
+        wide = Strands(hair.points[::4], 3.0 * hair.widths[::4], hair.colors[::4], hair.outwards[::4])
+        # Ribbons that face the skull's centre lie flat on the skin.
+        meshes.append((wide.ribbon_vertices(anatomy.skull_centre), ribbon_faces(*wide.widths.shape)))
+    meshes += [
+        (part.vertices, part.faces) for part in ([glasses.frame] if glasses else []) + ([shirt] if shirt else [])
+    ]
+    return stack_meshes(meshes)
+
+
+def _strand_sizes(
+    hair: Strands | DrapedStrands | None,
+    on_skin: tuple[SkinStrands | RootedStrands, ...],
+    lashes: bool,
+    anatomy: Anatomy,
+) -> list[tuple[int, int]]:
+    """Return the numbers of strands and of points per strand of all hair, in drawing order."""
+    rest = _at_rest(hair)
+    sizes = [] if rest is None else [rest.widths.shape]
+    sizes += [strands.widths.shape for strands in on_skin]
+    if lashes:
+        sizes.append(grow_lashes(anatomy.landmarks, np.zeros((2, 3)), 0.017).widths.shape)
+    return sizes
+
+
+def _all_faces(
+    anatomy: Anatomy,
+    kept: np.ndarray,
+    strand_sizes: list[tuple[int, int]],
+    glasses: Glasses | None,
+    shirt: RigidMesh | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles over `opaque_vertices` and their materials."""
+    of_model = np.full(len(anatomy.faces), SKIN)
+    of_model[anatomy.region("eyes", "irises")] = EYE
+    of_model[anatomy.region("teeth")] = TEETH
+    of_model[anatomy.region("mouth", "tongue", "eye_sockets")] = MOUTH
+    faces, materials, start = [anatomy.faces[kept]], [of_model[kept]], len(anatomy.vertices)
+
+    def add(part_faces: np.ndarray, vertices: int, material: int) -> None:
+        nonlocal start
+        faces.append(part_faces + start)
+        materials.append(np.full(len(part_faces), material))
+        start += vertices
+
+    for strands, points in strand_sizes:
+        add(ribbon_faces(strands, points), 2 * strands * points, HAIR)
+    if glasses is not None:
+        add(glasses.frame.faces, len(glasses.frame.vertices), FRAME)
+    if shirt is not None:
+        add(shirt.faces, len(shirt.vertices), SHIRT)
+    return np.concatenate(faces), np.concatenate(materials)

@@ -1,0 +1,116 @@
+"""The exact truth of a synthetic capture, for measuring trackers in millimetres and pixels."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien import exact
+from mien.errors import UserError
+from mien.lab.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure_anatomy
+from mien.lab.synthetic.scene import SyntheticScene
+from mien.storage import read_arrays, read_json, write_arrays, write_json
+from mien.tracking import Tracking, read_tracking, write_tracking
+
+FORMAT, VERSION = "mien.synthetic_truth", 1
+_JSON, _ARRAYS, _TRACKING = "truth.json", "truth.safetensors", "tracking"
+_METRE, _PIXEL = 1e-5, 1 / 16
+"""Units of the stored 16-bit numbers: 10 micrometres, a sixteenth of a pixel."""
+_MAX_STORED = np.iinfo(np.int16).max
+_REMEDY = "delete the folder and draw the capture again"
+_EAR = 234
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The truth of one sequence of t timesteps and c cameras."""
+
+    tracking: Tracking
+    """Head poses, cameras and identity. Vertices are exact too, unless the head leaves the face model (`off_model`)."""
+    vertex_index: Int[np.ndarray, " n"]
+    """Vertices of the face region: the face model's skin between chin and hairline, in front of the ears."""
+    vertices: Float[np.ndarray, "t n 3"]
+    """Their positions in the head frame, in metres, to 10 micrometres. They are exact for every recipe."""
+    landmarks: Float[np.ndarray, "t c l 2"]
+    """MediaPipe's 478 points on the true surface, projected to pixels of the drawn pictures. Hidden ones are
+    included."""
+
+    @property
+    def vertices_world(self) -> Float[np.ndarray, "t n 3"]:
+        """The region's vertices in world space."""
+        poses = self.tracking.face.T_world_head.numpy()
+        return exact.product(self.vertices, np.swapaxes(poses[:, :3, :3], 1, 2)) + poses[:, None, :3, 3]
+
+
+def truth_of(scene: SyntheticScene) -> Truth:
+    """Return the truth of a scene, rounded as it is stored."""
+    return Truth(scene.tracking(), *surface_of(scene))
+
+
+def surface_of(
+    scene: SyntheticScene,
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
+    """Return `vertex_index`, `vertices` and `landmarks` of the truth."""
+    index = face_region(measure_anatomy(scene.model, scene.identity))
+    chosen = torch.from_numpy(index)
+    vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.timesteps)])
+    landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
+    return index, _unpacked(_packed(vertices, _METRE), _METRE), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
+
+
+def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
+    """Return the vertices of the face's skin: no ears, no neck, nothing behind the ears or above the forehead."""
+    skin = np.unique(anatomy.faces[anatomy.skin & ~anatomy.region("ears", "neck", "scalp")])
+    points, marks = anatomy.vertices[skin], anatomy.landmarks
+    inside = (points[:, 1] > marks[CHIN, 1] - 0.005) & (points[:, 1] < marks[FOREHEAD_TOP, 1])
+    return skin[inside & (points[:, 2] > marks[_EAR, 2])].astype(np.int64)
+
+
+def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
+    """Add the numbers of `surface_of` to a hash."""
+    index, vertices, landmarks = surface_of(scene)
+    digest.update(index.astype(np.int32).tobytes())
+    digest.update(_packed(vertices, _METRE).tobytes() + _packed(landmarks, _PIXEL).tobytes())
+
+
+def write_truth(folder: Path, truth: Truth) -> None:
+    """Write FOLDER/truth.json, truth.safetensors and tracking/. The json comes last."""
+    write_tracking(folder / _TRACKING, truth.tracking)
+    arrays = {
+        "vertex_index": truth.vertex_index.astype(np.int32),
+        "vertices": _packed(truth.vertices, _METRE),
+        "landmarks": _packed(truth.landmarks, _PIXEL),
+    }
+    write_arrays(folder / _ARRAYS, arrays)
+    content = {"metre": _METRE, "pixel": _PIXEL}
+    write_json(folder / _JSON, FORMAT, VERSION, content)
+
+
+def read_truth(folder: Path) -> Truth:
+    """Read what `write_truth` wrote.
+
+    Raises:
+        UserError: a file is missing, damaged or of another version.
+    """
+    content = read_json(folder / _JSON, FORMAT, VERSION)
+    arrays = read_arrays(folder / _ARRAYS)
+    try:
+        return Truth(
+            tracking=read_tracking(folder / _TRACKING),
+            vertex_index=arrays["vertex_index"].astype(np.int64),
+            vertices=_unpacked(arrays["vertices"], float(content["metre"])),
+            landmarks=_unpacked(arrays["landmarks"], float(content["pixel"])),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{folder / _JSON}: incomplete ({error}); {_REMEDY}") from None
+
+
+def _packed(values: np.ndarray, unit: float) -> np.ndarray:
+    return np.clip(np.rint(values / unit), -_MAX_STORED, _MAX_STORED).astype(np.int16)
+
+
+def _unpacked(values: np.ndarray, unit: float) -> np.ndarray:
+    return (values * np.float32(unit)).astype(np.float32)

@@ -1,0 +1,89 @@
+"""The frames that an avatar is trained on: sequences, splits, targets, and which sides of the head they show."""
+
+from typing import TYPE_CHECKING
+
+from mien.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep, telling_frames
+    from mien.training.footage.filmed import (
+        confidence_picture,
+        filmed_words,
+        read_coverage,
+        with_shown_angles,
+        write_coverage,
+    )
+    from mien.training.footage.frames import (
+        MIN_EXTENT,
+        Frame,
+        FrameOrder,
+        aside_random,
+        background_at,
+        camera_extent,
+        crop_random,
+        density_random,
+        disguise_random,
+        evenly_spread,
+        expression_rarity,
+        held_out,
+        resolved,
+        spread_frames,
+        training_frames,
+    )
+    from mien.training.footage.hidden import hidden_triangles, inside_triangles
+    from mien.training.footage.mesh_colors import sample_picture, vertex_colors
+    from mien.training.footage.named_split import (
+        DRIVING,
+        NAMED_SPLIT,
+        NamedSplit,
+        driving_sequences,
+        split_by_name,
+        with_named_split,
+    )
+    from mien.training.footage.sequence import Sequence, Target, Targets, composite, read_sequence, sequence_of
+else:
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
+
+__all__ = [
+    "Coverage",
+    "DRIVING",
+    "Frame",
+    "FrameOrder",
+    "MIN_EXTENT",
+    "NAMED_SPLIT",
+    "NamedSplit",
+    "Sequence",
+    "Target",
+    "Targets",
+    "aside_random",
+    "background_at",
+    "camera_extent",
+    "composite",
+    "confidence_picture",
+    "crop_random",
+    "density_random",
+    "disguise_random",
+    "drawn_share",
+    "driving_sequences",
+    "evenly_spread",
+    "expression_rarity",
+    "filmed_words",
+    "held_out",
+    "hidden_triangles",
+    "inside_triangles",
+    "measure_coverage",
+    "read_coverage",
+    "read_sequence",
+    "resolved",
+    "sample_picture",
+    "sequence_of",
+    "smoothstep",
+    "split_by_name",
+    "spread_frames",
+    "telling_frames",
+    "training_frames",
+    "vertex_colors",
+    "with_named_split",
+    "with_shown_angles",
+    "write_coverage",
+]

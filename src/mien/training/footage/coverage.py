@@ -1,0 +1,174 @@
+"""How well the training pictures show each triangle of the tracked head, and in which colour.
+
+One camera in front sees half of a head. `Coverage` belongs to the data and not to a method: training draws only what is
+covered, what is not covered is filled afterwards, and pictures of the avatar can say which sides were filmed.
+"""
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from mien.face import FaceModel, FaceParams
+from mien.parallel import stream_in_threads
+from mien.render.mesh import rasterize_mesh
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking import NeckCut, NeckParts, fit_neck_cut
+from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.mesh_colors import sample_picture
+from mien.training.footage.sequence import Sequence
+
+_EVEN_FRAMES, _TURNED_FRAMES = 48, 24
+"""Number of frames that are looked at: some evenly spread, and those in which the head turns furthest to each side."""
+_DEPTH_TOLERANCE = 0.004
+"""Depth in metres behind the nearest surface over which a triangle fades from visible to hidden, twice."""
+_FACING = (0.1, 0.3)
+"""Cosines between a triangle's normal and the direction to the camera, between which its view begins to count."""
+_ENOUGH = 1.0
+"""Sum of squared cosines over the frames from which a triangle is certain. Rare sights, such as teeth, count fully."""
+_SOFT = 0.001
+"""Distance in metres below the cut at the neck to which a vertex counts as above. It fades over the same distance."""
+_INTERIOR = ("mouth", "teeth", "tongue")
+"""Regions inside the mouth. Lips hide them in most frames, so the mesh cannot say which of them pictures show."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """What the training pictures show of the f triangles of a head."""
+
+    seen: Float[Tensor, " f"]
+    """Confidence: 1 for triangles that are seen often and squarely, 0 for those that are never seen; it fades."""
+    colors: Float[Tensor, "f 3"]
+    """Mean colours in the pictures, 0..1; 0.5 where `seen` is 0."""
+    above: Float[Tensor, " f"]
+    """1 for triangles above the cut at the neck, 0 for those below it, which nothing shows or scores; it fades."""
+
+
+@torch.no_grad()
+def measure_coverage(
+    face_model: FaceModel,
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+    threads: int | None = None,
+) -> Coverage:
+    """Confidence and mean colour of every triangle.
+
+    A frame counts for a triangle by the squared cosine between the triangle's normal and the direction to the camera,
+    where the mesh hides it from nothing (a soft test against the mesh's own depth) and where the scoring mask has the
+    head. At most 72 frames are used, and those in which the head turns furthest to either side are among them.
+
+    Args:
+        face_model: The face model, float32 on the CPU.
+        sequences: The sequences that the frames count in.
+        faces: Face parameters of each sequence, with all its timesteps.
+        frames: The frames to look at.
+        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
+    """
+    count = len(face_model.faces)
+    colors, weights, above = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
+    chosen = telling_frames(faces, sequences, frames)
+
+    neck = NeckParts.of(face_model)
+
+    def seen_in(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        face = faces[frame.sequence][frame.timestep]
+        vertices = face_model(face)[0]
+        cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
+        return _seen_colors(sequences[frame.sequence], frame, vertices, face_model.faces, cut)
+
+    for own, weight, line in stream_in_threads(seen_in, chosen, threads):
+        colors += weight[:, None] * own
+        weights += weight
+        above += line
+    known = weights > 1e-3
+    colors = torch.where(known[:, None], colors / weights.clamp_min(1e-3)[:, None], torch.tensor(0.5))
+    seen = torch.where(known, smoothstep(weights / _ENOUGH), 0.0)
+    return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 1))
+
+
+def telling_frames(
+    faces: Items[FaceParams],
+    sequences: Items[Sequence],
+    frames: Items[Frame],
+    even: int = _EVEN_FRAMES,
+    turned: int = _TURNED_FRAMES,
+) -> list[Frame]:
+    """Evenly spread frames, and those in which the camera sees the head furthest from each side, above and below.
+
+    Args:
+        faces: Face parameters of each sequence, with all its timesteps.
+        sequences: The sequences that the frames count in.
+        frames: The frames to choose from.
+        even: Number of evenly spread frames.
+        turned: Number of the others, a quarter for each direction.
+    """
+    chosen = spread_frames(frames, even)
+    directions = torch.stack([_camera_direction(faces, sequences, frame) for frame in frames])
+    share = turned // 4
+    for axis in (0, 1):
+        order = directions[:, axis].argsort(stable=True).tolist()
+        chosen += [frames[index] for index in (*order[:share], *order[len(order) - share :])]
+    return sorted(set(chosen))
+
+
+def drawn_share(face_model: FaceModel, covered: Coverage) -> Float[Tensor, " f"]:
+    """How much of each triangle training draws, 0..1: its confidence, and everything inside the mouth."""
+    interior = face_model.region_mask(*_INTERIOR)
+    return torch.where(interior, torch.ones_like(covered.seen), covered.seen)
+
+
+def smoothstep(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """0 up to 0, 1 from 1, and a smooth rise between."""
+    inside = values.clamp(0, 1)
+    return inside * inside * (3 - 2 * inside)
+
+
+def _camera_direction(faces: Items[FaceParams], sequences: Items[Sequence], frame: Frame) -> Float[Tensor, " 3"]:
+    """The unit direction from the head to the frame's camera, in the head's axes."""
+    face = faces[frame.sequence]
+    rotation, place = face.head_rotation[frame.timestep], face.head_translation[frame.timestep]
+    to_camera = sequences[frame.sequence].tracking.cameras[frame.camera].position - place
+    return normalize(matrix_from_axis_angle(rotation).T @ to_camera, dim=0)
+
+
+def triangle_views(
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera_position: Float[Tensor, " 3"]
+) -> Float[Tensor, " f"]:
+    """Cosine between each triangle's normal and the direction to a camera; negative if it faces away."""
+    a, b, c = (vertices[faces[:, corner].long()] for corner in range(3))
+    normals = normalize(torch.linalg.cross(b - a, c - a), dim=-1, eps=1e-20)
+    return (normals * normalize(camera_position - (a + b + c) / 3, dim=-1)).sum(-1)
+
+
+def _seen_colors(
+    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], cut: NeckCut
+) -> tuple[Float[Tensor, "f 3"], Float[Tensor, " f"], Float[Tensor, " f"]]:
+    """Each triangle's colour in one picture, its weight, and whether it is above the cut at the neck (0..1).
+
+    The weight is 0 if the triangle is hidden, faces away, or is not part of the head that is scored.
+    """
+    camera = sequence.tracking.cameras[frame.camera]
+    centres = vertices[faces.long()].mean(1)
+    pixels, depth = camera.project(centres)
+    grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
+    picture = torch.from_numpy(np.array(sequence.capture.images[frame[1:]])).float() / 255
+    mask = torch.from_numpy(np.array(sequence.scoring[frame[1:]])).float()[..., None] / 255
+    nearest = rasterize_mesh(vertices, faces, camera).depth[..., None].nan_to_num(posinf=1e3)
+    colors, head = (sample_picture(whole, grid, "bilinear") for whole in (picture, mask))
+    front = sample_picture(nearest, grid, "nearest")[:, 0]
+    cosine = triangle_views(vertices, faces, camera.position)
+    visible = smoothstep((front + 2 * _DEPTH_TOLERANCE - depth) / _DEPTH_TOLERANCE)
+    facing = smoothstep((cosine - _FACING[0]) / (_FACING[1] - _FACING[0]))
+    inside = (grid.abs() < 1).all(-1) & (depth > 0)
+    weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
+    line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
+    corners, _ = camera.project(vertices)
+    # Masks of workspaces from before 2026-11-23 end at the neck line, later ones at the cut.
+    above = torch.minimum((corners @ line[:2] + line[2]).clamp(0, 1), (cut.heights(vertices) / _SOFT + 2).clamp(0, 1))
+    # All of the triangle has to be above: what hangs over the cut is scored as background.
+    return colors, torch.where(inside, weight, 0.0), above[faces.long()].amin(1)

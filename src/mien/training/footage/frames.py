@@ -1,0 +1,215 @@
+"""Which frames are held out, and which frame each step trains on.
+
+Every random draw depends only on the seed and the step, so that runs resume exactly.
+"""
+
+import hashlib
+from collections.abc import Sequence as Items
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from mien.errors import UserError
+from mien.training.footage.sequence import Sequence
+from mien.training.settings import Split, TrainSettings, check_held_out
+
+Item = TypeVar("Item")
+_ORDER, _BACKGROUND, _DENSITY, _CROP, _DISGUISE, _ASIDE = range(6)
+"""Purposes of random numbers."""
+_BLOCK, _EVERY = 10, 5
+_TAIL_SHARE = 0.2
+_EXTENT_MARGIN = 1.1
+MIN_EXTENT = 0.5
+"""Least extent of the training cameras, in metres.
+
+A single fixed camera has an extent of 0: centres would not move, and every Gaussian would be too large. Half a metre is
+less than the extent of a ring of cameras around a head, and more than the head.
+"""
+_MAX_RARITY, _MAX_NEIGHBOUR = 2.0, 100
+
+
+class Frame(NamedTuple):
+    """One picture: the indices of one of the run's sequences, of a timestep in it, and of the camera."""
+
+    sequence: int
+    timestep: int
+    camera: int
+
+
+def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
+    """Which of a sequence's timesteps are held out for testing.
+
+    - `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
+      training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one.
+    - `tail`: the last 20 %, which may show things that were never seen.
+    - `none` and `gaussian-avatars`: nothing. The latter holds out a whole sequence and a camera.
+    """
+    index = torch.arange(timesteps)
+    if split == "blocks":
+        block = min(_BLOCK, max(1, timesteps // _EVERY))
+        return index // block % _EVERY == _EVERY - 1
+    if split == "tail":
+        return index >= timesteps - round(_TAIL_SHARE * timesteps)
+    return torch.zeros(timesteps, dtype=torch.bool)
+
+
+def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
+    """All frames that are usable, sharp, and not held out by their timestep, their sequence or their camera.
+
+    Frames in which something covers a part of the face are left out as well, unless no others are left. The split
+    divides each sequence that is trained on. A held-out sequence or camera is held out at all timesteps.
+
+    Raises:
+        UserError: no frame is left, or a sequence or camera to hold out does not exist.
+    """
+    names = [sequence.name for sequence in sequences]
+    check_held_out(names, settings)
+    if settings.split == "gaussian-avatars" and not (settings.held_out_sequences and settings.held_out_cameras):
+        raise UserError(
+            "--split gaussian-avatars: the sequence and the camera to hold out are not filled in; train with `mien "
+            "train`, or give the result of mien.training.with_named_split"
+        )
+    ids = dict.fromkeys(camera_id for sequence in sequences for camera_id in sequence.capture.camera_ids)
+    unknown = [camera_id for camera_id in settings.held_out_cameras if camera_id not in ids]
+    if unknown:
+        raise UserError(f"--hold-out-cameras {unknown[0]}: no such camera; there are: {', '.join(ids)}")
+    frames = []
+    for index, sequence in enumerate(sequences):
+        usable = sequence.usable() & sequence.sharp()
+        usable = usable & ~held_out(sequence.capture.timesteps, settings.split).numpy()[:, None]
+        cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
+        if sequence.name not in settings.held_out_sequences:
+            frames += [Frame(index, int(t), int(c)) for t, c in np.argwhere(usable & np.array(cameras))]
+    clear = [sequence.clear() for sequence in sequences]
+    frames = [frame for frame in frames if clear[frame.sequence][frame.timestep, frame.camera]] or frames
+    if not frames:
+        places = [str(sequence.folder or sequence.name) for sequence in sequences]
+        raise UserError(
+            f"{', '.join(places)}: no frame is left to train on with --split {settings.split} and what is held out; "
+            "use a longer clip or --split none, or hold out less"
+        )
+    return frames
+
+
+def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
+    """The extent of the cameras that some frames were seen by, in metres, and at least `MIN_EXTENT`.
+
+    It is 1.1 x the largest distance of a camera from the mean of all cameras (3D Gaussian Splatting, published code).
+    Each camera of each sequence counts once.
+    """
+    seen = sorted({(frame.sequence, frame.camera) for frame in frames})
+    centres = torch.stack([sequences[index].tracking.cameras[camera].position for index, camera in seen]).double()
+    distances = (centres - centres.mean(0)).norm(dim=-1)
+    return max(MIN_EXTENT, _EXTENT_MARGIN * float(distances.max()))
+
+
+def evenly_spread(items: Items[Item], max_count: int) -> list[Item]:
+    """At most `max_count` of the items, evenly spread, always with the first one. With 0, all of them."""
+    stride = max(1, -(-len(items) // max_count)) if max_count else 1
+    return list(items[::stride])
+
+
+def spread_frames(frames: Items[Frame], max_count: int) -> list[Frame]:
+    """At most `max_count` of the frames, evenly spread over sequences, cameras and time. With 0, all of them."""
+    # Sort by camera first: a stride over the cameras of each timestep could always select the same one.
+    ordered = sorted(frames, key=lambda frame: (frame.sequence, frame.camera, frame.timestep))
+    return evenly_spread(ordered, max_count)
+
+
+def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float[Tensor, " n"]:
+    """How often to draw each frame by how rare its expression is: 0.5 to 2, relative to the median timestep.
+
+    The measure is the distance, in tracked expression coefficients, to the k-th nearest timestep of all frames, where
+    k is the square root of their number (at most 100). It is large if few timesteps have a similar expression.
+    """
+    timesteps = sorted({(frame.sequence, frame.timestep) for frame in frames})
+    expressions = torch.stack([sequences[s].tracking.face.expression[t] for s, t in timesteps]).double()
+    neighbour = min(max(1, round(len(timesteps) ** 0.5)), _MAX_NEIGHBOUR, len(timesteps) - 1)
+    # In rows of bounded memory. Without matrix products, equal expressions are exactly 0 apart.
+    rows = (
+        torch.cdist(some, expressions, compute_mode="donot_use_mm_for_euclid_dist") for some in expressions.split(512)
+    )
+    distances = torch.cat([row.kthvalue(neighbour + 1, dim=1).values for row in rows])
+    rarity = (distances / distances.median().clamp_min(1e-9)).clamp(1 / _MAX_RARITY, _MAX_RARITY)
+    index = {timestep: number for number, timestep in enumerate(timesteps)}
+    return rarity[[index[frame.sequence, frame.timestep] for frame in frames]]
+
+
+class FrameOrder:
+    """Shuffled passes over the training frames.
+
+    Args:
+        frames: The frames. A pass has as many steps.
+        seed: Seed of the shuffling.
+        weights: How often each frame is drawn, relative to the others. A pass has every frame as often as its share
+            says, rounded down or up at random. None draws every frame once.
+    """
+
+    def __init__(self, frames: Items[Frame], seed: int, weights: Float[Tensor, " n"] | None = None):
+        self._frames = frames
+        self._seed = seed
+        self._ends = None if weights is None else weights.cumsum(0) * (len(frames) / weights.sum())
+        self._epoch = -1
+        self._order: list[int] = []
+
+    def at(self, step: int) -> tuple[Frame, int]:
+        """The frame of a step and the number of passes completed before it."""
+        epoch = step // len(self._frames)
+        if epoch != self._epoch:
+            generator = random_at(self._seed, _ORDER, epoch)
+            order = torch.randperm(len(self._frames), generator=generator)
+            if self._ends is not None:
+                # One random shift for evenly spaced points: each frame owns an interval as long as its share.
+                shift = torch.rand((), generator=generator, dtype=torch.float64)
+                points = torch.arange(len(self._frames), dtype=torch.float64) + shift
+                drawn = torch.searchsorted(self._ends.double(), points, right=True)
+                order = drawn.clamp_max(len(self._frames) - 1)[order]
+            self._order = order.tolist()
+            self._epoch = epoch
+        return self._frames[self._order[step % len(self._frames)]], epoch
+
+
+def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
+    """The settings without `auto`: filled sides have random backgrounds and cleaned edges, others white and filmed."""
+    if settings.background == "auto":
+        settings = replace(settings, background="random" if filled else "white")
+    return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
+
+
+def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:
+    """The background colour of a step, 0 to 255."""
+    if settings.background != "random":
+        return np.full(3, 255, dtype=np.uint8)
+    generator = random_at(settings.seed, _BACKGROUND, step)
+    return torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)
+
+
+def density_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers for a step's density control."""
+    return random_at(settings.seed, _DENSITY, step)
+
+
+def crop_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers for a step's crop of the perceptual loss."""
+    return random_at(settings.seed, _CROP, step)
+
+
+def disguise_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers for the colour of a step's hidden Gaussians."""
+    return random_at(settings.seed, _DISGUISE, step)
+
+
+def aside_random(settings: TrainSettings, step: int) -> torch.Generator:
+    """The random numbers for a step's side view."""
+    return random_at(settings.seed, _ASIDE, step)
+
+
+def random_at(seed: int, purpose: int, step: int) -> torch.Generator:
+    """A generator that depends only on these three numbers."""
+    # torch's CPU generator uses only the low 32 bits of its seed, so the three numbers are hashed into them.
+    digest = hashlib.blake2b(f"{seed} {purpose} {step}".encode(), digest_size=4).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest, "little"))

@@ -1,0 +1,280 @@
+"""Sequence: what training needs of one filmed sequence, and the target pictures."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from mien import _native
+from mien.camera import Camera
+from mien.capture import Capture, read_capture, read_capture_hash
+from mien.errors import UserError
+from mien.face import FaceModel, part_boxes
+from mien.locks import read_beside_writers
+from mien.pictures import Box
+from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
+from mien.training.footage.foreground import foreground_colors, soft_pixels
+from mien.training.footage.hidden import hidden_triangles
+
+_CACHE_BYTES = 1 << 30
+_ON_CPU = torch.zeros(())
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """One sequence: pictures, the tracked face, and the frozen mask of the pixels that are trained on and scored."""
+
+    name: str
+    capture: Capture
+    tracking: Tracking
+    scoring: UInt8[np.ndarray, "t c h w"]
+    """Opacity of the pixels that count (the matte above the cut at the neck). 255 is opaque."""
+    folder: Path | None = None
+    """Folder that it was read from, for messages."""
+
+    def usable(self) -> np.ndarray:
+        """Bool [t, c]: the face was tracked, and was found in this picture, or the cameras are calibrated.
+
+        A calibrated camera sees the tracked head even if it finds no face, for example from behind.
+        """
+        tracked = self.tracking.valid.numpy()[:, None]
+        return (self.capture.valid | (self.capture.calibration is not None)) & tracked
+
+    def sharp(self) -> np.ndarray:
+        """Bool [t, c]: the capture did not mark the picture as blurred."""
+        quality = self.capture.quality
+        return np.ones(self.capture.valid.shape, bool) if quality is None else ~quality.blurred
+
+    def clear(self) -> np.ndarray:
+        """Bool [t, c]: nothing that the tracking found covers a part of the face, such as a hand."""
+        return ~self.tracking.covered_pictures().numpy()
+
+
+def composite(
+    image: UInt8[np.ndarray, "h w 3"],
+    matte: UInt8[np.ndarray, "h w"],
+    background: UInt8[np.ndarray, " 3"],
+    box: Box | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """`image` over `background`, blended by the matte and rounded to the nearest integer.
+
+    `box` promises that the matte is 0 outside of it; the image is not read there.
+    """
+    height, width = matte.shape
+    picture = np.empty((height, width, 3), np.uint8)
+    image, matte = np.ascontiguousarray(image), np.ascontiguousarray(matte)
+    _native.composite(image, matte, background.tolist(), box or (0, 0, width, height), picture)
+    return picture
+
+
+def composite_reference(
+    image: UInt8[np.ndarray, "h w 3"],
+    matte: UInt8[np.ndarray, "h w"],
+    background: UInt8[np.ndarray, " 3"],
+    box: Box | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """`composite` in numpy, with the same integers."""
+    left, top, width, height = box or (0, 0, *matte.shape[::-1])
+    inside = (slice(top, top + height), slice(left, left + width))
+    alpha = matte[inside][..., None].astype(np.uint16)
+    mixed = image[inside] * alpha + background.astype(np.uint16) * (255 - alpha)
+    # Rounded division by 255 in integers, exact for 16 bits.
+    mixed += 128
+    picture = np.empty((*matte.shape, 3), np.uint8)
+    picture[:] = background
+    picture[inside] = (mixed + (mixed >> 8)) >> 8
+    return picture
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The picture that a rendering is compared with."""
+
+    picture: UInt8[Tensor, "h w 3"]
+    """The picture, composited on the rendering's background."""
+    matte: UInt8[Tensor, "h w"]
+    """Opacity of the pixels that count."""
+    box: Box
+    """Left, top, width and height of a box, in pixels. Outside it there is only background."""
+    background: Float[Tensor, " 3"]
+    """Colour of the background, 0..1."""
+    parts: tuple[Box, ...] = ()
+    """Boxes around eyes and mouth, as far as they are seen. Empty if no loss needs them."""
+    hidden: Bool[Tensor, " f"] | None = None
+    """Which triangles inside the head the mesh hides (`mien.training.footage.hidden`). None if nothing needs them."""
+
+    def pinned(self) -> "Target":
+        """This target in pinned memory, which a GPU can read asynchronously."""
+        return replace(
+            self,
+            picture=self.picture.pin_memory(),
+            matte=self.matte.pin_memory(),
+            background=self.background.pin_memory(),
+            hidden=None if self.hidden is None else self.hidden.pin_memory(),
+        )
+
+    def to(self, like: Tensor) -> "Target":
+        """This target on the device of `like`, with a background of its dtype. The copies are asynchronous."""
+        return replace(
+            self,
+            picture=self.picture.to(like.device, non_blocking=True),
+            matte=self.matte.to(like.device, non_blocking=True),
+            background=self.background.to(like, non_blocking=True),
+            hidden=None if self.hidden is None else self.hidden.to(like.device, non_blocking=True),
+        )
+
+
+class Targets:
+    """The pictures of one sequence at training resolution, composited.
+
+    Pictures over a fixed background are cached, and of cleaned pictures over changing ones the soft pixels.
+
+    Args:
+        sequence: The sequence.
+        resolution: Longer side in pixels, or 0 for the capture's own.
+        share: Number of sequences that share the memory for cached pictures.
+        like: Cameras and targets have its float dtype and its device.
+        face_model: The face model, on the CPU, if targets shall have the boxes around eyes and mouth.
+        inside: The triangles inside the head, if targets shall say which of them are hidden. Needs `face_model`.
+        cleaned: Whether soft edges have the colours of the person alone (`foreground_colors`).
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        resolution: int,
+        share: int = 1,
+        like: Tensor = _ON_CPU,
+        face_model: FaceModel | None = None,
+        inside: Bool[Tensor, " f"] | None = None,
+        *,
+        cleaned: bool = False,
+    ):
+        self._sequence, self._cleaned = sequence, cleaned
+        longest = max(sequence.capture.width, sequence.capture.height)
+        scale = min(1.0, resolution / longest) if resolution > 0 else 1.0
+        self.width = max(1, round(sequence.capture.width * scale))
+        self.height = max(1, round(sequence.capture.height * scale))
+        cameras = (camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
+        self.cameras = tuple(camera.to(like) for camera in cameras)
+        self._like = like
+        self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
+        self._cache: dict[tuple[int, int, bytes], Target] = {}
+        self._soft: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        """Indices of soft pixels, in rows, and their cleaned colours, by timestep and camera."""
+        self._soft_room = _CACHE_BYTES // share
+        self._face_model, self._inside = face_model, inside
+        self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...], Tensor | None]] = {}
+        """Boxes of the mattes and of the parts, and hidden triangles, by timestep and camera."""
+        self._max_cached = _CACHE_BYTES // (share * self.width * self.height * 4)
+
+    def camera(self, camera: int) -> Camera:
+        """A camera at training resolution."""
+        return self.cameras[camera]
+
+    def target(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
+        """The picture over a background. `keep` caches it, for use with the same background again."""
+        kept = self.kept(timestep, camera, background)
+        return self.moved(self.composed(timestep, camera, background, keep) if kept is None else kept)
+
+    def kept(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"]) -> Target | None:
+        """The cached target in the CPU's memory, or None."""
+        return self._cache.get((timestep, camera, background.tobytes()))
+
+    def composed(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], keep: bool) -> Target:
+        """The target, made anew in the CPU's memory. `keep` caches it. One other thread may do this."""
+        target = self._compose(timestep, camera, background, again=not keep)
+        if keep and len(self._cache) < self._max_cached:
+            self._cache[timestep, camera, background.tobytes()] = target
+        return target
+
+    def moved(self, target: Target) -> Target:
+        """The target with the dtype and device of the cameras."""
+        return target if self._on_cpu else target.to(self._like)
+
+    def _compose(self, timestep: int, camera: int, background: UInt8[np.ndarray, " 3"], *, again: bool) -> Target:
+        image = self._image(timestep, camera, again=again)
+        # A copy: the pages of a mapped file are given back.
+        matte = np.array(self._resize(self._sequence.scoring[timestep, camera]))
+        boxes = self._boxes.get((timestep, camera))
+        if boxes is None:
+            left, top, width, height = cv2.boundingRect(matte)
+            boxes = self._boxes[timestep, camera] = (left, top, width, height), *self._tracked(timestep, camera)
+        picture, colour = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
+        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], colour, *boxes[1:])
+        return target.pinned() if self._like.is_cuda else target
+
+    def _image(self, timestep: int, camera: int, *, again: bool) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture at training resolution. `again` says that another background will need it."""
+        capture = self._sequence.capture
+        image = self._resize(capture.images[timestep, camera])
+        if not self._cleaned:
+            return image
+        image, kept = np.array(image), self._soft.get((timestep, camera))
+        if kept is None:
+            # A copy: the pages of a mapped file are given back.
+            matte = np.array(self._resize(capture.mattes[timestep, camera]))
+            place = np.flatnonzero(soft_pixels(matte)).astype(np.int32)
+            kept = place, foreground_colors(image, matte).reshape(-1, 3)[place]
+            size = sum(part.nbytes for part in kept)
+            if again and size <= self._soft_room:
+                self._soft_room -= size
+                self._soft[timestep, camera] = kept
+        place, colors = kept
+        image.reshape(-1, 3)[place] = colors
+        return image
+
+    @torch.no_grad()
+    def _tracked(self, timestep: int, camera: int) -> tuple[tuple[Box, ...], Tensor | None]:
+        """The boxes around eyes and mouth, and hidden triangles, by the tracking. Its corrections change neither."""
+        if self._face_model is None:
+            return (), None
+        tracking = self._sequence.tracking
+        vertices = self._face_model(tracking.face[timestep])[0]
+        view = tracking.cameras[camera].resized(self.width, self.height)
+        boxes = tuple(part_boxes(self._face_model, vertices, view).values())
+        inside = self._inside
+        return boxes, None if inside is None else hidden_triangles(vertices, self._face_model, inside, view)
+
+    def _resize(self, picture: np.ndarray) -> np.ndarray:
+        if picture.shape[:2] == (self.height, self.width):
+            return picture
+        return cv2.resize(np.array(picture), (self.width, self.height), interpolation=cv2.INTER_AREA)
+
+
+def read_sequence(folder: Path) -> Sequence:
+    """The sequence in FOLDER/{capture,tracking,scoring}. Its name is that of the folder.
+
+    Raises:
+        UserError: a part is missing, damaged, of another version, is being written, or does not belong to the other
+            parts.
+    """
+    parts = [folder / name for name in ("capture", "tracking", "scoring")]
+    return read_beside_writers(lambda: _read_parts(folder), parts, [folder])
+
+
+def _read_parts(folder: Path) -> Sequence:
+    capture_hash = read_capture_hash(folder / "capture")
+    sequence = sequence_of(folder, read_scoring(folder / "scoring", capture_hash))
+    if read_capture_hash(folder / "capture") != capture_hash:
+        raise UserError(f"{folder / 'capture'}: was replaced while it was read; run the same command again")
+    return sequence
+
+
+def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
+    """Like `read_sequence`, with a scoring that was read before.
+
+    Raises:
+        UserError: as for `read_sequence`.
+    """
+    capture, tracking = read_capture(folder / "capture"), read_tracking(folder / "tracking")
+    check_tracking_of(capture, tracking, folder / "tracking")
+    if scoring.masks.shape != capture.mattes.shape:
+        raise UserError(
+            f"{folder / 'scoring'}: does not belong to the capture beside it; delete it and run `mien track` again"
+        )
+    return Sequence(folder.name, capture, tracking, scoring.masks, folder)

@@ -1,0 +1,193 @@
+"""Colours for the triangles of a head that no training picture shows.
+
+Where the other side was seen, a triangle takes its mirror image's colour. Elsewhere colours spread over the surface
+from what was seen: hair over the scalp, skin over face, ears and neck. The inside of the mouth has colours of its own.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.face import FaceModel, mirror_triangles
+from mien.face.head_parts import HeadParts, head_parts, mouth_colors
+from mien.face.mirror import triangle_geometry
+from mien.render.mesh import shade
+from mien.training.whole_head.spreading import Surface
+
+_COLOR_SPREAD = 0.12
+"""Distance between colours (0..1) over which a colour stops counting as skin or as hair."""
+_TINT_SPREAD, _LIGHT_SPREAD = 0.06, 0.25
+"""The same for colours of equal brightness, and for the logarithm of their brightness beyond half or twice."""
+_DIFFERENT = 0.10
+"""Distance between the medians of skin and hair from which their colours can be told apart."""
+_LARGEST_OFFSET = 0.25
+"""Largest difference of brightness between a triangle and its mirror image that counts as light."""
+_LEAST_LIGHT = 0.1
+
+
+def complete_colors(
+    face_model: FaceModel,
+    template_vertices: Float[Tensor, "v 3"],
+    seen: Float[Tensor, " f"],
+    colors: Float[Tensor, "f 3"],
+    light: Float[Tensor, "9 3"] | None = None,
+    texture: float = 0.0,
+) -> Float[Tensor, "f 3"]:
+    """Return a colour for every triangle: its own as far as it was seen, else one that is made up.
+
+    A colour is made up from the mirror image as far as that was seen. The difference between both sides, measured where
+    both were seen, is spread over the head and added, so that no border shows. What neither side shows spreads from the
+    nearest seen triangles of the same kind: scalp from scalp that looks like hair, face and ears from what looks like
+    skin, neck from either (so that long hair goes on behind). Mouth, teeth and tongue get dark, light and red colours
+    that fade with the depth behind the lips.
+
+    Args:
+        face_model: The face model.
+        template_vertices: The person's neutral head in the head frame, in metres.
+        seen: Confidence in each triangle's colour, 0..1. Values that are not finite count as 0.
+        colors: Colours in the pictures, 0..1. A triangle whose colour is not finite counts as not seen.
+        light: Spherical harmonics of the light over normals of the head frame (`mien.render.mesh.shade`). It is taken
+            out before colours are made up, and put back after. None leaves colours as they are.
+        texture: Share of the seen triangles' contrast that made-up colours of hair and skin get as noise, 0..1.
+
+    Returns:
+        Finite colours, 0..1. They equal `colors` where `seen` is 1.
+    """
+    seen, colors = _cleaned(seen, colors)
+    vertices = template_vertices.detach().to(colors)
+    parts = head_parts(face_model)
+    mesh = Surface.of(vertices, face_model.faces.cpu())
+    shading = torch.ones_like(colors) if light is None else _shading(vertices, face_model.faces.cpu(), light)
+    albedo = colors / shading
+    known = seen * _trust(parts, mesh.middles, seen, colors)
+    made_up = _spread_by_part(parts, mesh, known, albedo)
+    if texture > 0:
+        made_up = made_up + texture * _noise(parts, mesh, known, albedo)
+    mirrored, share = _mirrored(face_model, mesh, seen, known, albedo)
+    made_up = torch.lerp(made_up, mirrored, share[:, None]) * shading
+    brightness = _brightness(parts, seen, colors)
+    made_up = torch.where(parts.interior[:, None], brightness * mouth_colors(parts, mesh.middles), made_up)
+    return torch.where(seen[:, None] >= 1, colors, torch.lerp(made_up.clamp(0, 1), colors, seen[:, None]))
+
+
+def vertex_means(face_model: FaceModel, colors: Float[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
+    """Return the mean colour of the triangles around each vertex, for drawing a completed mesh (`render_mesh`).
+
+    Vertices without a triangle are grey.
+    """
+    colors, corners = colors.detach().float().cpu(), face_model.faces.long().cpu().T.flatten()
+    own = torch.cat([colors, torch.ones(len(colors), 1)], dim=1).repeat(3, 1)
+    total = torch.zeros(len(face_model.template), 4).index_add(0, corners, own)
+    return torch.where(total[:, 3:] > 0, total[:, :3] / total[:, 3:].clamp_min(1), 0.5)
+
+
+def _cleaned(seen: Tensor, colors: Tensor) -> tuple[Float[Tensor, " f"], Float[Tensor, "f 3"]]:
+    """Return both on the CPU and finite. What is damaged is not seen."""
+    seen, colors = seen.detach().float().cpu(), colors.detach().float().cpu()
+    whole = seen.isfinite() & colors.isfinite().all(1)
+    colors = torch.where(whole[:, None], colors, 0.5).clamp(0, 1)
+    return torch.where(whole, seen, 0.0).clamp(0, 1), colors
+
+
+def _shading(
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], light: Float[Tensor, "9 3"]
+) -> Float[Tensor, "f 3"]:
+    normals = triangle_geometry(vertices, faces)[2]
+    shading = shade(normals, light.detach().to(vertices)).clamp_min(_LEAST_LIGHT)
+    return torch.where(shading.isfinite(), shading, 1.0)
+
+
+def _median(values: Float[Tensor, "f 3"], chosen: Bool[Tensor, " f"]) -> Float[Tensor, " 3"] | None:
+    return values[chosen].median(0).values if bool(chosen.any()) else None
+
+
+def _trust(
+    parts: HeadParts, middles: Float[Tensor, "f 3"], seen: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]
+) -> Float[Tensor, " f"]:
+    """Return how far each triangle's colour belongs to its part, 0..1: hair over the face, or a collar, does not."""
+    sure = seen > 0.5
+    skin = _median(colors, sure & parts.face)
+    top = sure & parts.scalp
+    if bool(top.any()):
+        top &= middles[:, 1] >= middles[top, 1].median()
+    hair = _median(colors, top)
+
+    trust = torch.ones_like(seen)
+    hair_like = trust if hair is None else _close(colors, hair)
+    if skin is None:
+        return trust
+    skin_like = _close_but_for_light(colors, skin)
+    trust = torch.where(parts.skin, skin_like, trust)
+    trust = torch.where(parts.neck, skin_like if hair is None else torch.maximum(skin_like, hair_like), trust)
+    if hair is not None and float((skin - hair).norm()) > _DIFFERENT:
+        trust = torch.where(parts.scalp, hair_like / (hair_like + _close(colors, skin) + 1e-3), trust)
+    return trust
+
+
+def _close(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
+    """Return how close colours are to one colour, 0..1."""
+    return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / _COLOR_SPREAD**2)
+
+
+def _close_but_for_light(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
+    """Return how close colours are to one colour in half to twice the light, 0..1."""
+    light = (colors @ color) / (color @ color).clamp_min(1e-6)
+    tint = ((colors - light[:, None] * color) ** 2).sum(1) / _TINT_SPREAD**2
+    beyond = (light.clamp_min(1e-3).log().abs() - math.log(2)).clamp_min(0)
+    return torch.exp(-0.5 * (tint + (beyond / _LIGHT_SPREAD) ** 2))
+
+
+def _spread_by_part(
+    parts: HeadParts, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+) -> Float[Tensor, "f 3"]:
+    """Return smooth colours for all triangles, each from those of its own kind."""
+    sure = known > 0.05
+    anything = albedo[sure].mean(0) if bool(sure.any()) else albedo.new_full((3,), 0.5)
+    filled = anything.expand_as(albedo).clone()
+    for part, sources in parts.kinds():
+        own = torch.where(sources, known, 0.0)
+        if bool((own > 0.05).any()):
+            whole = mesh.spread(albedo, own, part | sources)
+            filled = torch.where(part[:, None], whole, filled)
+    return filled
+
+
+def _mirrored(
+    face_model: FaceModel,
+    mesh: Surface,
+    seen: Float[Tensor, " f"],
+    known: Float[Tensor, " f"],
+    albedo: Float[Tensor, "f 3"],
+) -> tuple[Float[Tensor, "f 3"], Float[Tensor, " f"]]:
+    """Return the mirror images' colours, fitted to this side's light, and how far the mirror images were seen."""
+    images = mirror_triangles(face_model)
+    has, image = images >= 0, images.clamp_min(0)
+    both = torch.where(has, known * known[image], 0.0)
+    offset = (albedo - albedo[image]).clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
+    offset = torch.where((both > 0.05)[:, None], offset, 0.0)
+    return albedo[image] + mesh.spread(offset, both, torch.ones_like(has)), torch.where(has, seen[image], 0.0)
+
+
+def _noise(
+    parts: HeadParts, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
+) -> Float[Tensor, "f 3"]:
+    """Return the seen triangles' differences from their neighbours, dealt out to all triangles of their part."""
+    noise = torch.zeros_like(albedo)
+    random = torch.Generator().manual_seed(0)
+    for part in (parts.scalp, parts.skin | parts.neck):
+        sources = (part & (known > 0.8)).nonzero()[:, 0]
+        targets = part.nonzero()[:, 0]
+        if len(sources):
+            detail = (albedo - mesh.around(albedo, known * part))[sources].clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
+            noise[targets] = detail[torch.randint(len(sources), (len(targets),), generator=random)]
+    return noise
+
+
+def _brightness(parts: HeadParts, seen: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> float:
+    """Return how bright the pictures are: the median luminance of seen skin over that of skin in daylight."""
+    skin = _median(colors, (seen > 0.5) & parts.face)
+    if skin is None:
+        return 1.0
+    return float((skin @ torch.tensor([0.2126, 0.7152, 0.0722]) / 0.6).clamp(0.4, 1.3))

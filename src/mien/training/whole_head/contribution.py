@@ -1,0 +1,73 @@
+"""How much each Gaussian adds to training pictures, and what becomes of those that add nothing.
+
+Density control duplicates Gaussians with strong gradients. Soon many of them lie under others, where no picture shows
+them. They are not trained any more, count towards the limit, and show as specks in odd colours from aside. After each
+round, those that hardly add to any of a few pictures are removed. If all Gaussians of a triangle are such, one stays
+and becomes what it was in the beginning: a closed surface in the completed colour.
+"""
+
+from collections.abc import Sequence as Items
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.avatar import Avatar
+from mien.camera import Camera
+from mien.face import FaceParams
+from mien.gaussians import SH_C0
+from mien.render import rasterize
+from mien.training.whole_head.unseen import Unseen
+
+_HIDDEN = 0.03
+"""Contribution below which a Gaussian counts as hidden, in pixels of the training picture that shows it best."""
+
+
+def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Float[Tensor, " n"]:
+    """The most that each Gaussian adds to one of the views: the sum of its weights in the blending, in pixels.
+
+    The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it (3D Gaussian Splatting,
+    equation 3). It is the derivative of the picture by the Gaussian's colour.
+
+    Args:
+        avatar: The avatar.
+        views: A face at one timestep, and a camera, for each view.
+    """
+    most = torch.zeros(len(avatar.gaussian_store()), device=avatar.face_model.template.device)
+    for face, camera in views:
+        with torch.no_grad():
+            gaussians = avatar.pose(face).gaussians.timestep(0)
+        colors = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
+        picture = rasterize(replace(gaussians, sh=colors), camera, colors.new_zeros(3)).image
+        picture[..., 0].sum().backward()
+        assert colors.grad is not None
+        most = torch.maximum(most, colors.grad[:, 0, 0].to(most) / SH_C0)
+    return most
+
+
+def tidy(avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool) -> Bool[Tensor, " n"]:
+    """Deal with Gaussians that hardly add to any view, and return which are to be removed.
+
+    One Gaussian stays on each triangle. If it is hidden, it gets the completed colour and, with `close`, also place,
+    shape and opacity of a fill. Made-up sides and the inside of the mouth are left alone.
+
+    Args:
+        avatar: An avatar with bound Gaussians.
+        unseen: What the training pictures do not show of the head.
+        views: Views of the training, as for `contributions`.
+        close: Whether what stays becomes a surface, which training then fits to the pictures.
+    """
+    surface, prior = avatar.surface(), unseen.prior
+    assert surface is not None
+    triangles = surface.triangles()
+    kept = prior.made_up if prior.closed is None else prior.closed
+    assert kept is not None
+    hidden = (contributions(avatar, views) < _HIDDEN) & ~kept[triangles]
+    shown = torch.zeros_like(kept).index_put((triangles[~hidden],), torch.ones_like(hidden[~hidden]))
+    order = torch.arange(len(hidden), device=hidden.device)
+    first = torch.full_like(kept, len(hidden), dtype=torch.long)
+    first = first.scatter_reduce(0, triangles[hidden].long(), order[hidden], "amin")
+    stays = hidden & ~shown[triangles] & (order == first[triangles])
+    surface.restore(stays.nonzero()[:, 0], prior, close=close)
+    return hidden & ~stays

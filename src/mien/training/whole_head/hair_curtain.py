@@ -1,0 +1,127 @@
+"""Long hair behind a head: where it hangs beside the neck in the pictures, it hangs at the back as well.
+
+The front camera sees hair beside jaw and neck, as far as it stands out from the outline, and nothing of the back. A
+head whose hair ended at the hairline of the nape would lack much of its outline from aside. Long hair falls from where
+the head is widest, so behind the ears it is as far from the upright axis as it is above, down to the level to which it
+hangs at the sides.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.face import FaceModel
+from mien.face.head_parts import head_parts
+from mien.face.mirror import triangle_geometry
+from mien.tracking import NeckParts, fit_neck_cut
+from mien.training.whole_head.hair_height import HIGHEST
+
+_HANGS = 0.015
+"""Median height at a level of jaw and neck, in metres, from which hair counts as hanging."""
+_SHARE = 0.8
+"""Least distance from the axis at the sides, as a share of that of the hair above, at which hair hangs."""
+_LEVEL = 0.01
+"""Height of the levels at which the sides are looked at, in metres. Hair has to hang at each from the scalp down."""
+_BESIDE = math.radians(35)
+"""Angle from the sides within which the pictures' outline tells how far hair hangs."""
+_ALIKE = math.radians(15)
+"""Difference of angle about the axis within which hair above decides about hair below."""
+_BEHIND = 0.0
+"""Forward part of a triangle's normal up to which it is behind. Hair in front of the shoulders is not made up."""
+_CLEAR = 0.006
+"""Least distance of hair from the cut at the neck, in metres."""
+
+
+@torch.no_grad()
+def hair_curtain(
+    face_model: FaceModel,
+    vertices: Float[Tensor, "v 3"],
+    hair: Float[Tensor, " f"],
+    hanging: Float[Tensor, " f"],
+) -> Float[Tensor, " f"]:
+    """Return the height of hair that hangs behind the head, along the triangles' normals, in metres, 0..0.08.
+
+    It is 0 on triangles that face forward, where hair does not hang to their level, and everywhere on short hair.
+
+    Args:
+        face_model: The face model.
+        vertices: The person's neutral head in the head frame (y up, z ahead), in metres, on the CPU.
+        hair: Height of the hair above the scalp (`hair_height`), in metres.
+        hanging: How far hair stands out beside skin and neck (`hanging_hair`), in metres.
+    """
+    middles, _, normals = triangle_geometry(vertices.detach().float(), face_model.faces.cpu())
+    parts, curtain = head_parts(face_model), torch.zeros_like(hair)
+    if not bool(parts.scalp.any()) or not bool((hair > 0).any()):
+        return curtain
+    scalp = middles[parts.scalp][:, [0, 2]]
+    axis = (scalp.amin(0) + scalp.amax(0)) / 2
+    flat, outwards = middles[:, [0, 2]] - axis, normals[:, [0, 2]]
+    angle = torch.atan2(flat[:, 0], flat[:, 1])  # 0 in front, +-90 degrees at the sides
+    above = flat + hair[:, None] * outwards
+    widest = _widest_above(angle, middles[:, 1], above.norm(dim=1), parts.scalp)
+    share = (flat + hanging[:, None] * outwards).norm(dim=1) / widest.clamp_min(1e-6)
+    beside = (angle.abs() - math.pi / 2).abs() < _BESIDE
+    lowest = _lowest_level(beside, angle > 0, middles[:, 1], share, hanging, parts.scalp)
+    if lowest is None:
+        return curtain
+    behind = (parts.scalp | parts.neck | parts.skin) & (normals[:, 2] < _BEHIND) & (angle.abs() > math.pi / 2)
+    behind &= middles[:, 1] >= lowest
+    # The distance t along the normal to the wall of hair solves |flat + t outwards| = widest.
+    a = outwards.square().sum(1).clamp_min(1e-3)
+    b, c = (flat * outwards).sum(1), flat.square().sum(1) - widest.square()
+    distance = (-b + (b * b - a * c).clamp_min(0).sqrt()) / a
+    useful = behind & (distance > hair) & (a > 0.25)
+    distance = torch.where(useful, distance, curtain).clamp(0, HIGHEST)
+    return distance * _above_cut(face_model, vertices, middles, distance[:, None] * normals)
+
+
+def _widest_above(
+    angle: Float[Tensor, " f"], level: Float[Tensor, " f"], radius: Float[Tensor, " f"], scalp: Bool[Tensor, " f"]
+) -> Float[Tensor, " f"]:
+    """Return how far hair is from the axis at most, above each triangle and in its direction; 0 if there is none."""
+    sources = scalp.nonzero()[:, 0]
+    turned = (angle[:, None] - angle[sources]).abs()
+    alike = torch.minimum(turned, 2 * math.pi - turned) < _ALIKE
+    alike &= level[sources] >= level[:, None]
+    return torch.where(alike, radius[sources], 0.0).amax(1)
+
+
+def _lowest_level(
+    beside: Bool[Tensor, " f"],
+    left: Bool[Tensor, " f"],
+    level: Float[Tensor, " f"],
+    share: Float[Tensor, " f"],
+    hanging: Float[Tensor, " f"],
+    scalp: Bool[Tensor, " f"],
+) -> float | None:
+    """Return the lowest level to which hair hangs without a gap at both sides; None if it does not hang at all."""
+    around, lowest = beside & scalp, []
+    if not bool(around.any()):
+        return None
+    top = float(level[around].amin())
+    for side in (left, ~left):
+        bottom = top
+        while True:
+            own = beside & side & ~scalp & (level < bottom) & (level >= bottom - _LEVEL) & (hanging > 0)
+            hangs = bool(own.any()) and float(hanging[own].median()) > _HANGS and float(share[own].median()) > _SHARE
+            if not hangs:
+                break
+            bottom -= _LEVEL
+        lowest.append(bottom)
+    return max(lowest) if max(lowest) < top - _LEVEL / 2 else None
+
+
+def _above_cut(
+    face_model: FaceModel,
+    vertices: Float[Tensor, "v 3"],
+    middles: Float[Tensor, "f 3"],
+    offsets: Float[Tensor, "f 3"],
+) -> Float[Tensor, " f"]:
+    """Return the largest share of each offset, 0..1, with which a point stays above the cut at the neck."""
+    cut = fit_neck_cut(NeckParts.of(face_model), vertices, vertices.new_tensor([0.0, 1.0, 0.0]))
+    share = torch.zeros(len(middles))
+    for part in torch.linspace(0, 1, 9).tolist():
+        share = torch.where(cut.margins(middles + part * offsets) > _CLEAR, part, share)
+    return share

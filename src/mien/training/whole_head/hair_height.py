@@ -1,0 +1,195 @@
+"""How far hair stands out from the scalp of a face model, measured on the outlines of the mattes."""
+
+from collections.abc import Sequence as Items
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
+
+from mien.face import FaceModel, FaceParams
+from mien.face.head_parts import head_parts
+from mien.face.mirror import triangle_geometry
+from mien.parallel import stream_in_threads
+from mien.render.mesh import rasterize_mesh
+from mien.training.footage import Frame, Sequence, spread_frames
+from mien.training.whole_head.spreading import Surface
+
+_MAX_FRAMES = 60
+_STEP, HIGHEST = 0.002, 0.08
+"""Distance between the points that are tested above the scalp, and the largest height that counts, in metres."""
+_GRAZING = 0.4
+"""Cosine between a triangle's normal and the direction to the camera up to which the outline tells its height."""
+_CLEAR = 0.008
+"""Height in metres at which nothing of the mesh may be behind or in front of a triangle at the outline."""
+_QUANTILE = 0.3
+"""Share of the measured heights below the one that counts. Single strands and other things behind make some higher."""
+_SAME_HAIR = 1.3
+"""Largest height where nothing was measured, as a multiple of the median height on top of the head."""
+_SLOPE, _NEAR = 0.12, 0.03
+"""Difference of slope (the upward part of a normal) and distance in metres, within which measured heights count alike
+for what is never measured."""
+_AT_HAIRLINE, _RISE = 0.004, 0.4
+"""Largest height in metres at the hairline where nothing was measured, and how much it grows per metre from skin."""
+_SMOOTHING_ROUNDS = 2
+"""Rings of triangles over which heights are averaged. More would flatten the hair on top."""
+_FADING_ROUNDS = 2
+"""Rings of triangles over which the height fades at the hairline."""
+_NEAR_ROUNDS = 4
+"""Rings of triangles around an outline that hanging hair may cover too."""
+
+
+@torch.no_grad()
+def hair_height(
+    face_model: FaceModel,
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+    threads: int | None = None,
+) -> Float[Tensor, " f"]:
+    """Return the height of hair above each triangle along its normal, in metres, 0..0.08; 0 outside of the scalp.
+
+    A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
+    along its normal to the border of the matte. Triangles that are never on the outline have the height of what was
+    measured where the head is as steep. Near skin, ears included, they have no more than hair that rises slowly from
+    the hairline, where the height fades. Without any measurement it is 0.
+
+    Args:
+        face_model: The face model, float32 on the CPU.
+        sequences: The sequences that the frames count in.
+        faces: Face parameters of each sequence, with all its timesteps.
+        frames: The frames to look at. At most 60 of them, evenly spread, are used.
+        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
+    """
+    parts = head_parts(face_model)
+    scalp = parts.scalp
+    height, known = _outline_heights(face_model, sequences, faces, frames, scalp, threads)
+    if not bool(known.any()):
+        return height[:, 0]
+    vertices = face_model.rest_vertices(faces[0])
+    surface, upward = Surface.of(vertices, face_model.faces), triangle_geometry(vertices, face_model.faces)[2][:, 1]
+    guess = _by_slope(surface, upward, height, known, scalp).clamp_max(_SAME_HAIR * _on_top(surface, height, known))
+    guess[scalp, 0] = guess[scalp, 0].minimum(_behind_hairline(surface, scalp, parts.skin))
+    height = torch.lerp(guess, height, known[:, None])
+    inside = scalp.to(height)
+    for _ in range(_SMOOTHING_ROUNDS):
+        height = surface.around(height, inside) * inside[:, None]
+    share = inside[:, None]
+    for _ in range(_FADING_ROUNDS):
+        share = torch.minimum(share, surface.around(share, torch.ones_like(known))) * inside[:, None]
+    return (height * share)[:, 0].clamp(0, HIGHEST)
+
+
+@torch.no_grad()
+def hanging_hair(
+    face_model: FaceModel,
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+    threads: int | None = None,
+) -> Float[Tensor, " f"]:
+    """Return how far the outline stands out beside skin and neck, in metres, 0..0.08; 0 on the scalp.
+
+    Long hair hangs off the scalp, beside cheeks and neck, and rings hang from ears. Unlike `hair_height`, nothing is
+    concluded about triangles that are far from any outline. The arguments are those of `hair_height`.
+    """
+    parts = head_parts(face_model)
+    beside = parts.skin | parts.neck
+    height, known = _outline_heights(face_model, sequences, faces, frames, beside, threads)
+    if not bool(known.any()):
+        return height[:, 0]
+    surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
+    for _ in range(_NEAR_ROUNDS):
+        height = torch.maximum(height, surface.around(height, torch.ones_like(known)))
+        height[~beside] = 0
+    return height[:, 0].clamp(0, HIGHEST)
+
+
+def _outline_heights(
+    face_model: FaceModel,
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+    region: Bool[Tensor, " f"],
+    threads: int | None,
+) -> tuple[Float[Tensor, "f 1"], Float[Tensor, " f"]]:
+    """Return the height of the outline above the triangles of a region, and how sure it is, 0..1; 0 elsewhere."""
+    chosen = region.nonzero()[:, 0]
+
+    def measured_in(frame: Frame) -> Tensor:
+        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
+        return _measured(sequences[frame.sequence], frame, vertices, face_model.faces, chosen)
+
+    used = spread_frames(frames, _MAX_FRAMES)
+    heights = torch.stack(list(stream_in_threads(measured_in, used, threads))) if used else torch.zeros(0, len(chosen))
+    height, known = torch.zeros(len(region), 1), torch.zeros(len(region))
+    found = heights.isfinite().any(0)
+    if bool(found.any()):
+        height[chosen[found], 0] = heights[:, found].nanquantile(_QUANTILE, dim=0)
+        known[chosen[found]] = heights.isfinite().sum(0)[found].clamp_max(3) / 3
+    return height, known
+
+
+def _on_top(surface: Surface, height: Float[Tensor, "f 1"], known: Float[Tensor, " f"]) -> float:
+    """Return the median height in the upper half of what was measured. Lower down, long hair hangs off the head."""
+    measured = known > 0
+    level = surface.middles[measured, 1].median()
+    return float(height[measured & (surface.middles[:, 1] >= level)].median())
+
+
+def _by_slope(
+    surface: Surface,
+    upward: Float[Tensor, " f"],
+    height: Float[Tensor, "f 1"],
+    known: Float[Tensor, " f"],
+    among: Bool[Tensor, " f"],
+) -> Float[Tensor, "f 1"]:
+    """Return the mean of the measured heights where the head is as steep, most of all of the near ones.
+
+    Hair is short on the walls of a head and long where it curves to the top, behind as at the sides. `upward` is the
+    upward part of the triangles' normals.
+    """
+    targets, sources = among.nonzero()[:, 0], (known > 0).nonzero()[:, 0]
+    apart = surface.middles[targets, None] - surface.middles[sources]
+    alike = torch.exp(-0.5 * ((upward[targets, None] - upward[sources]) / _SLOPE).square()) + 1e-9
+    weight = alike * known[sources] / (apart.square().sum(-1) + _NEAR**2)
+    guess = torch.zeros_like(height)
+    guess[targets, 0] = (weight * height[sources, 0]).sum(1) / weight.sum(1)
+    return guess
+
+
+def _behind_hairline(surface: Surface, scalp: Bool[Tensor, " f"], skin: Bool[Tensor, " f"]) -> Float[Tensor, " k"]:
+    """Return the largest height of hair on each triangle of the scalp. Hair over a forehead grows out of the skin."""
+    if not bool(skin.any()):
+        return surface.middles.new_full((int(scalp.sum()),), HIGHEST)
+    from_scalp, to_skin = surface.middles[scalp], surface.middles[skin]
+    apart = torch.cdist(from_scalp, to_skin, compute_mode="donot_use_mm_for_euclid_dist")
+    return _AT_HAIRLINE + _RISE * apart.amin(1)
+
+
+def _measured(
+    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Tensor, chosen: Tensor
+) -> Float[Tensor, " n"]:
+    """Return the height of the matte's border above some triangles in one frame; NaN where the frame does not tell."""
+    camera = sequence.tracking.cameras[frame.camera]
+    matte = torch.from_numpy(sequence.capture.mattes[frame[1:]].astype(np.float32)) / 255
+    empty = rasterize_mesh(vertices, faces, camera).face_index < 0
+    middles, _, normals = (values[chosen] for values in triangle_geometry(vertices, faces))
+    cosine = (normals * normalize(camera.position - middles, dim=-1)).sum(-1)
+    steps = torch.arange(0.0, HIGHEST + _STEP / 2, _STEP)
+    pixels, depth = camera.project(middles[:, None] + steps[:, None] * normals[:, None])
+    grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
+    inside = _sample(matte, grid) > 0.5
+    framed = (grid.abs() < 1).all(-1) & (depth > 0)
+    clear = _sample(empty.float(), grid[:, round(_CLEAR / _STEP) :][:, :1])[:, 0] > 0.5
+    count = inside.int().cumprod(1).sum(1)
+    ends = (count < len(steps)) & framed.all(1)
+    tells = (cosine.abs() < _GRAZING) & clear & ends
+    height = _STEP * (count - 1).clamp_min(0).float()
+    return torch.where(tells, height, torch.nan)
+
+
+def _sample(picture: Float[Tensor, "h w"], grid: Float[Tensor, "n s 2"]) -> Float[Tensor, "n s"]:
+    """Return values of a picture at points in -1..1; 0 outside."""
+    return grid_sample(picture[None, None], grid.nan_to_num(2.0).clamp(-2, 2)[None], align_corners=False)[0, 0]

@@ -1,0 +1,133 @@
+"""The surface of hair, which rises and sinks as a whole during training.
+
+How high hair stands is measured only where it was on an outline. Elsewhere its height is a guess, although a head that
+turns shows it: at a wrong height, hair slides over the scalp. One Gaussian alone cannot follow, because its neighbours
+hide what it would gain. So the gradients of all Gaussians on a patch of scalp are added up, and the patch moves along
+its normals together with the limits of the surface. What no picture shows moves with what is beside it. Nicolet et al.
+2021 (Large steps in inverse rendering of geometry) show that smoothed gradients make large and smooth steps.
+
+The gradient is that of all losses. The position penalty of a method is among them and pulls towards the scalp.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.avatar import Avatar, BoundSurface, SurfacePrior
+from mien.face.head_parts import head_parts
+from mien.face.mirror import triangle_geometry
+
+EVERY = 8
+"""Number of training frames from one correction to the next."""
+_BEGIN, _END = 0.03, 0.6
+"""Times of the first and the last correction, as fractions of the run. Their size falls to 0 in between."""
+_REACH = 0.012
+"""Distance in metres over which gradients are smoothed (standard deviation of a Gaussian)."""
+_SAME_SIDE = 0.3
+"""Cosine between two normals from which triangles belong to the same side of a fold."""
+_FIRST, _SECOND = 0.9, 0.98
+"""Decay of the running means of the gradient and of its square (Adam, Kingma and Ba 2015)."""
+_EPSILON = 1e-12
+_LOWEST, _FURTHEST = -0.004, 0.03
+"""Limits of the shift in metres: how far hair may sink below the scalp, and how far it may move at all."""
+
+
+@dataclass(eq=False)
+class HairSurface:
+    """How far the surface of hair has moved since the start, and the state of its optimiser."""
+
+    scalp: Int[Tensor, " k"]
+    """Triangles that move."""
+    kernel: Float[Tensor, "k k"]
+    """Weights of the scalp's triangles for each other, which add up gradients."""
+    mean: Float[Tensor, "k k"]
+    """The same, scaled to means over the area."""
+    shown: Bool[Tensor, " k"]
+    """Triangles with Gaussians that pictures train. Gradients of others do not count."""
+    start: SurfacePrior
+    """The surface as it was known before training."""
+    state: dict[str, Tensor]
+    """Tensors that training changes, by name: `shift` in metres along the normals, its moments, and the gradient since
+    the last correction, [k] each; `count`, the number of corrections."""
+
+    def collect(self, surface: BoundSurface, fraction: float) -> None:
+        """Add the gradients of a step, after its backward pass, unless no correction follows.
+
+        Args:
+            surface: The surface of the avatar.
+            fraction: How far the run was before the step, 0..1.
+        """
+        gradient = surface.height_gradient() if fraction < _END else None
+        if gradient is not None:
+            self.state["gradient"] += gradient[self.scalp].to(self.kernel) * self.shown
+
+    def correct(self, surface: BoundSurface, fraction: float, rate: float) -> bool:
+        """Move the avatar's Gaussians along the normals if it is time for that. Return whether they moved.
+
+        Args:
+            surface: The surface of the avatar.
+            fraction: How far the run is, 0..1.
+            rate: Size of a first correction in metres, where all gradients agree.
+        """
+        moves = rate > 0 and _BEGIN <= fraction < _END
+        if moves:
+            step = self._step() * rate * (_END - fraction) / (_END - _BEGIN)
+            before = self.state["shift"].clone()
+            lowest = _LOWEST - self.start.hair[self.scalp]
+            self.state["shift"] = (before - step).clamp(-_FURTHEST, _FURTHEST).maximum(lowest)
+            surface.raise_by(self._on_all(self.state["shift"] - before))
+        self.state["gradient"] = torch.zeros_like(self.state["gradient"])
+        return moves
+
+    def prior(self) -> SurfacePrior:
+        """Return the surface as it is known now: the hair moved, the rest as at the start."""
+        return replace(self.start, hair=(self.start.hair + self.shift).clamp_min(0))
+
+    @property
+    def shift(self) -> Float[Tensor, " f"]:
+        """The shift of all triangles along their normals, in metres; 0 outside of the scalp."""
+        return self._on_all(self.state["shift"])
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore the tensors of `state`."""
+        self.state = {name: state[name].to(own) for name, own in self.state.items()}
+
+    def _step(self) -> Float[Tensor, " k"]:
+        """Adam's step for the smoothed gradient, at most about 1. Neighbours share the second moment."""
+        gradient, state = self.kernel @ self.state["gradient"], self.state
+        state["count"] = state["count"] + 1
+        state["first"] = torch.lerp(gradient, state["first"], _FIRST)
+        state["second"] = torch.lerp(gradient.square(), state["second"], _SECOND)
+        first = state["first"] / (1 - _FIRST ** state["count"])
+        second = self.mean @ state["second"] / (1 - _SECOND ** state["count"])
+        return first / (second.sqrt() + _EPSILON)
+
+    def _on_all(self, values: Float[Tensor, " k"]) -> Float[Tensor, " f"]:
+        return torch.zeros_like(self.start.hair).index_copy(0, self.scalp, values)
+
+
+@torch.no_grad()
+def hair_surface(avatar: Avatar, prior: SurfacePrior) -> HairSurface | None:
+    """The surface of the hair at the start of a run. None if the face model has no scalp.
+
+    Args:
+        avatar: An avatar with bound Gaussians, on any device.
+        prior: What is known of its surface, on the same device.
+    """
+    vertices = avatar.face_model.head_vertices(avatar.subject)[0].detach()
+    scalp = head_parts(avatar.face_model).scalp.nonzero()[:, 0]
+    if not len(scalp):
+        return None
+    geometry = triangle_geometry(vertices.cpu().float(), avatar.face_model.faces.cpu())
+    middles, areas, normals = (values[scalp] for values in geometry)
+    apart = torch.cdist(middles, middles, compute_mode="donot_use_mm_for_euclid_dist") / _REACH
+    kernel = torch.exp(-0.5 * apart.square()) * (apart < 3) * (normals @ normals.T > _SAME_SIDE)
+    mean = kernel * areas
+    mean = mean / mean.sum(1, keepdim=True)
+    scalp = scalp.to(prior.hair.device)
+    shown = torch.ones_like(scalp, dtype=torch.bool) if prior.made_up is None else ~prior.made_up[scalp]
+    state = {name: prior.hair.new_zeros(len(scalp)) for name in ("shift", "first", "second", "gradient")}
+    state["count"] = prior.hair.new_zeros(())
+    return HairSurface(scalp, kernel.to(prior.hair), mean.to(prior.hair), shown, prior, state)

@@ -1,0 +1,121 @@
+"""What is inside a head explains only what the mesh shows of it: eyeballs between lids, teeth between lips.
+
+Triangles inside a mouth are a centimetre wide, and their Gaussians may lie that far from them. If nothing forbids it,
+they come out through the skin, paint cheeks and closed lids, and are missing where the mouth opens.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien.avatar import Avatar, BoundSurface, Posed
+from mien.face.head_parts import head_parts
+from mien.gaussians import sh_from_rgb
+from mien.training.footage import Coverage, disguise_random, inside_triangles
+from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
+from mien.training.whole_head.completion import complete_colors
+
+_FURNISH_AT = 0.5
+"""Time at which an open surface inside the mouth is closed, as a fraction of the run: after the last opacity reset of
+the presets, from which surface that is hardly ever seen does not recover."""
+_OPAQUE = 0.97
+"""Opacity of this surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inside:
+    """The surface inside a mouth, and its colours where pictures do not show it."""
+
+    triangles: Bool[Tensor, " f"]
+    """Mouth, teeth and tongue."""
+    colors: Float[Tensor, "f 3"]
+    """Colours that are plausible, 0..1: a dark mouth with light teeth."""
+
+    def furnish(self, surface: BoundSurface, step: int, steps: int) -> None:
+        """Close the surface where it is open, if this is a step of a run of `steps` at which this is due."""
+        if step == round(_FURNISH_AT * steps):
+            surface.furnish(self.triangles, _OPAQUE, self.colors)
+
+    def to(self, like: Tensor) -> "Inside":
+        """The same on the device of `like`, with colours of its dtype."""
+        return Inside(self.triangles.to(like.device), self.colors.to(like))
+
+
+def prepare_inside(given: Preparation) -> TrainingPart | None:
+    """The part of a training that covers and furnishes what is inside a head, if the settings ask for it."""
+    avatar, surface, settings = given.avatar, given.avatar.surface(), given.settings
+    if settings.inside == "free" or surface is None:
+        return None
+
+    def covered(posed: Posed, one: BatchFrame) -> Posed:
+        return disguise(posed, avatar, one.target.hidden, disguise_random(settings, one.number))
+
+    hideable = inside_triangles(given.face_model)
+    if settings.inside == "covered":
+        return TrainingPart("inside", hideable, posed=covered)
+    inside = inside_of(avatar, given.coverage).to(given.like)
+
+    def furnish(step: Step) -> None:
+        for one in step.batch:
+            inside.furnish(surface, one.number, settings.steps)
+
+    return TrainingPart("inside", hideable, posed=covered, before_step=furnish)
+
+
+@torch.no_grad()
+def inside_of(avatar: Avatar, covered: Coverage) -> Inside:
+    """What is inside an avatar's mouth. The avatar is on the CPU.
+
+    The mesh cannot say which part of a mouth pictures show, so all of it has made-up colours.
+    """
+    model, interior = avatar.face_model, head_parts(avatar.face_model).interior
+    neutral = model.head_vertices(avatar.subject)[0].detach().float()
+    seen = torch.where(interior, 0.0, covered.seen)
+    return Inside(interior, complete_colors(model.to(neutral), neutral, seen, covered.colors))
+
+
+def disguise(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None, random: torch.Generator) -> Posed:
+    """Give hidden Gaussians one colour, drawn at random, so that they can explain nothing and have to be covered.
+
+    Their opacities have no gradient: they must not fade because a skin that is still thin lets them through. Their
+    places and sizes do have one, and so they leave where they do not belong. Gaussians of methods that bind none to
+    triangles stay as they are.
+    """
+    surface = avatar.surface()
+    if hidden is None or surface is None:
+        return posed
+    gaussians, own = posed.gaussians, hidden[surface.triangles()]
+    color = sh_from_rgb(torch.rand(3, generator=random)).to(gaussians.sh, non_blocking=True)
+    # Only on a CPU are rows found without waiting for the device.
+    disguised = _Disguised.apply if gaussians.sh.device.type == "cpu" else disguised_reference
+    sh, opacities = disguised(gaussians.sh, gaussians.opacities, own, color)
+    return replace(posed, gaussians=replace(gaussians, sh=sh, opacities=opacities))
+
+
+def disguised_reference(
+    sh: Float[Tensor, "n k 3"], opacities: Float[Tensor, " n"], own: Bool[Tensor, " n"], color: Float[Tensor, " 3"]
+) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, " n"]]:
+    """Coefficients of which some rows are one constant colour, and opacities that have no gradient in these rows."""
+    degrees = torch.zeros_like(sh[:1, :, :1])
+    degrees[:, :1] = 1
+    return torch.where(own[:, None, None], degrees * color, sh), torch.where(own, opacities.detach(), opacities)
+
+
+class _Disguised(torch.autograd.Function):
+    """`disguised_reference` in a third of its time, because it touches only the rows that change."""
+
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor, opacities: Tensor, own: Tensor, color: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.rows = own.nonzero()[:, 0]
+        changed = sh.detach().clone().index_fill_(0, ctx.rows, 0.0)
+        changed[:, 0].index_copy_(0, ctx.rows, color.expand(len(ctx.rows), 3))
+        return changed, opacities.detach().clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return *(gradient.clone().index_fill_(0, ctx.rows, 0.0) for gradient in gradients), None, None

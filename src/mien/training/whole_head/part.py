@@ -1,0 +1,128 @@
+"""Whole heads as a part of a training: closed sides, hair that moves, and views from aside."""
+
+from collections.abc import Callable
+from collections.abc import Sequence as Items
+from dataclasses import replace
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.avatar import Avatar, BoundSurface
+from mien.render.rendering import Rendering
+from mien.training.footage import aside_random, resolved, with_shown_angles
+from mien.training.parts import Preparation, Step, TrainingPart
+from mien.training.settings import TrainSettings
+from mien.training.whole_head.contribution import tidy
+from mien.training.whole_head.hair_surface import EVERY, HairSurface, hair_surface
+from mien.training.whole_head.side_views import SideViews, side_views_of
+from mien.training.whole_head.unseen import Unseen, fills_sides, moved, spare_fills, unseen_of
+
+
+class WholeHead:
+    """What no training picture shows, and what is done about it.
+
+    Args:
+        avatar: The avatar, on its device.
+        unseen: What the training pictures show, on the same device.
+        settings: The settings of the run.
+    """
+
+    def __init__(self, avatar: Avatar, unseen: Unseen, settings: TrainSettings):
+        self.unseen = unseen
+        self.aside: SideViews | None = side_views_of(avatar, unseen, settings.side_weight)
+        self.hair: HairSurface | None = hair_surface(avatar, unseen.prior) if unseen.fills else None
+        self._avatar = avatar
+        self._surface: BoundSurface | None = avatar.surface()
+
+    def part(self) -> TrainingPart:
+        """The functions that the trainer calls."""
+        return TrainingPart(
+            "hair",
+            settings=lambda settings: resolved(settings, filled=True) if self.unseen.fills else settings,
+            density=lambda control: spare_fills(self._avatar, control, self.unseen),
+            weights=lambda weights: self.unseen.weights(weights),
+            losses=self._losses,
+            rare_losses=() if self.aside is None else ("aside",),
+            after_backward=self._after_backward,
+            after_update=self._after_update,
+            after_step=self._after_step,
+            state=lambda: {} if self.hair is None else self.hair.state,
+            load_state=self._load_state,
+        )
+
+    def follow_hair(self) -> None:
+        """Let what is known of the surface follow the hair."""
+        if self.hair is None:
+            return
+        prior = self.hair.prior()
+        self.unseen = replace(self.unseen, prior=prior)
+        if self.aside is not None:
+            self.aside = self.aside.at_height(prior.fill_height)
+
+    def _losses(self, step: Step) -> dict[str, Float[Tensor, ""]]:
+        """The loss of a side view, if one of the frames is due for it: that of the first such frame."""
+        aside = self.aside
+        due = [] if aside is None else [one for one in step.batch if aside.due(one.number)]
+        if aside is None or not due:
+            return {}
+        one = due[0]
+        camera, random = step.camera(one.frame), aside_random(step.settings, one.number)
+        face = step.track.face(one.index)
+        return {"aside": aside.loss(step.avatar, face, camera, step.progress, one.number, random)}
+
+    def _after_backward(self, step: Step, renderings: Items[Rendering]) -> None:
+        if self.hair is not None and self._surface is not None:
+            self.hair.collect(self._surface, step.progress.step / step.settings.steps)
+        self.unseen.guard(step.avatar, *renderings)
+
+    def _after_update(self, step: Step) -> None:
+        if self._surface is not None:
+            self._surface.keep_to(self.unseen.prior)
+
+    def _after_step(self, step: Step) -> None:
+        hair, surface = self.hair if step.reaches(EVERY) else None, self._surface
+        if hair and surface and hair.correct(surface, step.fraction_done, step.settings.hair_rate):
+            self.follow_hair()
+        self._tidy(step)
+
+    def _tidy(self, step: Step) -> None:
+        """Remove Gaussians that pictures do not show, after a round of density control and at the end."""
+        last = step.fraction_done >= 1
+        if not self.unseen.fills or not (step.changed or last) or not step.telling:
+            return
+
+        def redundant() -> Bool[Tensor, " n"]:
+            track = step.track
+            views = [
+                (track.face(track.index_of(frame.sequence, frame.timestep)).detach(), step.camera(frame))
+                for frame in step.telling
+            ]
+            return tidy(step.avatar, self.unseen, views, close=not last)
+
+        step.density.thin(step.avatar.gaussian_store(), step.fraction_done, redundant)
+
+    def _load_state(self, state: dict[str, Tensor]) -> None:
+        if self.hair is not None:
+            self.hair.load_state(state)
+            self.follow_hair()
+
+
+def prepare_whole_head(given: Preparation) -> Callable[[], WholeHead] | None:
+    """Close the avatar's surface where no picture shows it, if it is asked for.
+
+    Returns:
+        A function that makes the whole head once the avatar is on its device, or None.
+    """
+    avatar, surface = given.avatar, given.avatar.surface()
+    filled = fills_sides(given.frames, given.settings, bound=surface is not None)
+    if not filled and (surface is None or not surface.limited):
+        return None
+    unseen = unseen_of(avatar, given.sequences, given.faces, given.frames, filled=filled)
+    if surface is not None:
+        surface.close(unseen.prior)
+    if unseen.coverage is not None:
+        given.known_coverage = unseen.coverage
+        neutral = given.face_model.head_vertices(avatar.subject)[0].detach()
+        assert avatar.filmed is not None
+        avatar.filmed = with_shown_angles(avatar.filmed, given.face_model, neutral, unseen.coverage)
+    return lambda: WholeHead(avatar, moved(unseen, given.like), given.settings)

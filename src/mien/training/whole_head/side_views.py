@@ -1,0 +1,171 @@
+"""Training pictures that no camera took: the head from aside, and with raised expressions.
+
+One camera in front shows half of a head at a few expressions. Between its pictures, Gaussians may do as they like: they
+leave the surface, and show as shards and holes once the head turns. A side view is compared with the completed mesh:
+from aside, the head is opaque exactly where the mesh with its hair is, above the cut at the neck, and colours are
+pulled towards those of the mesh. In raised expressions, a difference that a real head could have is free.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.avatar import Avatar, Progress
+from mien.camera import Camera
+from mien.face import FaceModel, FaceParams
+from mien.face.head_parts import head_parts
+from mien.render import rasterize
+from mien.render.mesh import rasterize_mesh, vertex_normals
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.tracking import NeckParts, head_cutter
+from mien.training.whole_head.completion import vertex_means
+from mien.training.whole_head.unseen import Unseen
+
+_EVERY = 8
+"""Number of steps between two side views. Views of raised expressions take turns with those from aside."""
+_SIDE = 256
+"""Longer side of these pictures, in pixels. The completed colours are no finer."""
+_LEAST, _MOST = 45.0, 180.0
+"""Angles between which the head turns aside, in degrees. Pictures know the outline nearer to the front better."""
+_EXPRESSION_MOST = 45.0
+"""Largest angle at which a raised expression is seen, in degrees."""
+_RAISED = 6
+"""Number of coefficients that are raised."""
+_FREE = 0.06
+"""Difference of colour (0..1) between an avatar and the completed mesh that costs nothing in raised expressions. The
+mesh knows neither hair nor pores."""
+_OUTLINE = 3.0
+"""Weight of the difference of alpha from aside against that of colours. Most errors from aside are at the outline."""
+
+
+@dataclass(frozen=True, eq=False)
+class SideViews:
+    """The completed head that side views are compared with. All tensors are on the CPU."""
+
+    face_model: FaceModel
+    weight: float
+    """Weight of the mean absolute differences of colour and of alpha."""
+    colors: Float[Tensor, "f 3"]
+    """Completed colours of the triangles, 0..1."""
+    height: Float[Tensor, " v"]
+    """Height of the surface above each vertex, in metres."""
+    neck: NeckParts
+    """The parts of the neck that tell where it is cut."""
+    compared: Bool[Tensor, " f"]
+    """Triangles whose colours are compared in raised expressions: skin, lips and the inside of the mouth."""
+
+    def at_height(self, height: Float[Tensor, " f"]) -> "SideViews":
+        """The same views of a head whose triangles have another height, in metres."""
+        return replace(self, height=_at_vertices(self.face_model, height.to(self.colors)))
+
+    def due(self, step: int) -> bool:
+        """Whether a step has a side view."""
+        return self.weight > 0 and step % (_EVERY // 2) == 0
+
+    def loss(
+        self, avatar: Avatar, face: FaceParams, camera: Camera, progress: Progress, step: int, random: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """The weighted difference between the avatar and the completed mesh in one side view.
+
+        Args:
+            avatar: The avatar, on any device.
+            face: One timestep. Its joints and its place are kept, and its expression is that of views from aside. It
+                gets no gradient.
+            camera: The camera in front of the head.
+            progress: How far training is.
+            step: The step, which says whether the head is turned or the expression raised.
+            random: Draws the angle and the coefficients.
+        """
+        raised = step % _EVERY != 0
+        angle = _drawn_angle(raised, random)
+        face = turned_aside(face.detach(), angle)
+        if raised:
+            face = replace(face, expression=self._raised(face.expression, random))
+        scale = _SIDE / max(camera.width, camera.height)
+        small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        background = torch.rand(3, generator=random)
+        picture, alpha, compared = self._target(face, small, background)
+        like = face.expression
+        seen = rasterize(avatar.pose(face, progress).gaussians.timestep(0), small, background.to(like))
+        difference = (seen.image - picture.to(like)).abs()
+        if raised:
+            difference = (difference - _FREE).clamp_min(0) * compared.to(like)[..., None]
+            return self.weight * difference.mean()
+        return self.weight * (difference.mean() + _OUTLINE * (seen.alpha - alpha.to(like)).abs().mean())
+
+    @torch.no_grad()
+    def _target(
+        self, face: FaceParams, camera: Camera, background: Float[Tensor, " 3"]
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """The completed mesh over the background, its alpha, and which pixels show triangles of `compared`."""
+        face, camera = face.to(self.colors), camera.to(self.colors)
+        vertices = self.face_model(face)[0]
+        vertices = vertices + self.height[:, None] * vertex_normals(vertices, self.face_model.faces)
+        index = rasterize_mesh(vertices, self.face_model.faces, camera).face_index.long()
+        matte = np.where(index.numpy() >= 0, 255, 0).astype(np.uint8)
+        alpha = torch.from_numpy(head_cutter(self.face_model, self.neck, face)(matte, camera)).float() / 255
+        triangle: Int[Tensor, "h w"] = index.clamp_min(0)
+        picture = background + alpha[..., None] * (self.colors[triangle] - background)
+        return picture, alpha, self.compared[triangle] & (alpha > 0)
+
+    def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
+        """The expression with some coefficients anywhere between 0 and their largest value."""
+        count = expression.shape[1]
+        chosen = torch.randperm(count, generator=random)[:_RAISED]
+        values = torch.rand(len(chosen), generator=random) * self.face_model.expression_bounds[chosen, 1].float().cpu()
+        result = expression.clone()
+        result[0, chosen.to(expression.device)] = values.to(expression)
+        return result
+
+
+def side_views(
+    face_model: FaceModel, weight: float, colors: Float[Tensor, "f 3"], height: Float[Tensor, " f"]
+) -> SideViews:
+    """The side views of a head.
+
+    Args:
+        face_model: The face model, on the CPU in float32.
+        weight: Weight of the loss.
+        colors: Completed colours of the triangles, 0..1.
+        height: Height of the surface above each triangle, in metres, which is that of fills.
+    """
+    parts, over = head_parts(face_model), _at_vertices(face_model, height)
+    compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)
+    return SideViews(face_model, weight, colors, over, NeckParts.of(face_model), compared)
+
+
+def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Tensor, " v"]:
+    """The mean value of the triangles around each vertex."""
+    return vertex_means(face_model, values[:, None].expand(-1, 3))[:, 0]
+
+
+def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideViews | None:
+    """The side views of a filled head, or None if nothing is filled or the weight is 0."""
+    if unseen is None or unseen.prior.made_up is None or weight == 0:
+        return None
+    model, prior = avatar.face_model, unseen.prior
+    like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
+    assert prior.colors is not None
+    return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
+
+
+def turned_aside(face: FaceParams, angle: float) -> FaceParams:
+    """The head turned about its own upright axis by an angle in radians, at the same place.
+
+    A camera sees it as one that goes around the head by this angle.
+    """
+    turn = matrix_from_axis_angle(torch.tensor([0.0, angle, 0.0]).to(face.head_rotation))
+    rotation = matrix_from_axis_angle(face.head_rotation) @ turn
+    return replace(face, head_rotation=axis_angle_from_matrix(rotation))
+
+
+def _drawn_angle(raised: bool, random: torch.Generator) -> float:
+    """An angle to either side, in radians."""
+    share, side = torch.rand(2, generator=random, dtype=torch.float64).tolist()
+    low, high = (0.0, _EXPRESSION_MOST) if raised else (_LEAST, _MOST)
+    degrees = low + share * (high - low)
+    return math.radians(degrees if side < 0.5 else -degrees)

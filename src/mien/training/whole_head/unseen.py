@@ -1,0 +1,221 @@
+"""Sides of the head that no training picture shows: a closed surface in completed colours from the first step on.
+
+What no picture shows must not help to explain pictures. Gaussians on such triangles are made up: opaque and flat, at
+the height of hair, in completed colours. Training changes only their height along the normal, where pictures clearly
+contradict it, as where they stand out beyond the outline.
+"""
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.avatar import Avatar, DensityControl, GaussianStore, Photometric, SurfacePrior
+from mien.face import FaceModel, FaceParams
+from mien.face.head_parts import head_parts
+from mien.parallel import stream_in_threads
+from mien.render.rendering import Rendering
+from mien.training.footage import (
+    Coverage,
+    Frame,
+    Sequence,
+    drawn_share,
+    hidden_triangles,
+    measure_coverage,
+    smoothstep,
+    spread_frames,
+)
+from mien.training.settings import TrainSettings
+from mien.training.whole_head.completion import complete_colors
+from mien.training.whole_head.hair_curtain import hair_curtain
+from mien.training.whole_head.hair_height import hair_height, hanging_hair
+from mien.training.whole_head.spreading import Surface
+
+_RARE = 0.02
+"""Confidence below which a triangle is made up."""
+_SIGHTS, _RARELY = 240, 0.02
+"""Number of frames in which the inside of the mouth is looked for, and the share of them that have to show it."""
+_MOVING, _LOOSE = ("lips", "eyelids", "eyes", "irises"), 3.0
+"""Regions that move most, and the factor on the limits there and inside the mouth. The tracked mesh is millimetres off
+there, and its folds are not those of the skin."""
+_NEAR = (0.008, 0.024)
+"""Distances in metres from these regions between which the factor falls to 1."""
+_STRANDS_FROM = 0.003
+"""Height of hair in metres from which made-up hair has strands."""
+_CONTRADICTION = 1e-6
+"""Gradient of a centre, in triangle units, from which pictures contradict the height of a fill. A little light shines
+through every avatar, so smaller gradients reach what is hidden."""
+
+
+_ALPHA = 0.2
+"""Least weight of the loss of alpha. Without it, white Gaussians hide fills that stand out beyond the outline."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """What the training pictures show of a head, and what is known of the rest."""
+
+    coverage: Coverage | None
+    """None if only limits to the surface were asked for."""
+    prior: SurfacePrior
+
+    @property
+    def fills(self) -> bool:
+        """Whether some sides are filled rather than trained."""
+        return self.prior.made_up is not None
+
+    def weights(self, weights: Photometric) -> Photometric:
+        """The weights of the losses, with a loss of alpha if anything is filled."""
+        if not self.fills:
+            return weights
+        return replace(weights, alpha_weight=max(weights.alpha_weight, _ALPHA))
+
+    def made_up(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
+        """The Gaussians that are filled rather than trained."""
+        surface = avatar.surface()
+        return None if self.prior.made_up is None or surface is None else self.prior.made_up[surface.triangles()]
+
+    def guard(self, avatar: Avatar, *renderings: Rendering) -> None:
+        """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
+        made_up = self.made_up(avatar)
+        if made_up is None:
+            return
+        store = avatar.gaussian_store()
+        for name in store.trained:
+            gradient = store[name].grad
+            if gradient is None:
+                continue
+            # The second axis of a triangle's frame is its normal.
+            height = gradient[:, 1].clone() if name == "means" else None
+            gradient.masked_fill_(made_up.view(-1, *[1] * (gradient.ndim - 1)), 0)
+            if height is not None:
+                strong = height.sign() * (height.abs() - _CONTRADICTION).clamp_min(0)
+                gradient[:, 1] = torch.where(made_up, strong, height)
+        for rendering in renderings:
+            if rendering.means2d_offset.grad is not None:
+                rendering.means2d_offset.grad.masked_fill_(made_up[:, None], 0)
+
+
+def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -> bool:
+    """Whether sides that no picture shows are filled.
+
+    If the settings leave it open, they are if one camera took all frames and Gaussians are `bound` to triangles.
+    """
+    if settings.unseen == "auto":
+        return bound and len({frame.camera for frame in frames}) == 1
+    return settings.unseen == "filled"
+
+
+def spare_fills(avatar: Avatar, density: DensityControl, unseen: Unseen) -> DensityControl:
+    """An avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
+    if unseen.prior.closed is None:
+        return density
+
+    def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
+        closed, surface = unseen.prior.closed, avatar.surface()
+        assert closed is not None
+        assert surface is not None
+        return ~closed[surface.triangles()]
+
+    made_up = unseen.made_up(avatar)
+    return density.sparing(may_reset, 0 if made_up is None else int(made_up.sum()))
+
+
+@torch.no_grad()
+def unseen_of(
+    avatar: Avatar, sequences: Items[Sequence], faces: Items[FaceParams], frames: Items[Frame], *, filled: bool
+) -> Unseen:
+    """What some frames show of an avatar's head. The avatar is on the CPU, in float32."""
+    model = avatar.face_model
+    hair = hair_height(model, sequences, faces, frames)
+    hanging = hanging_hair(model, sequences, faces, frames)
+    if not filled:
+        return Unseen(None, SurfacePrior(hair, hanging))
+    found = measure_coverage(model, sequences, faces, frames)
+    neutral = model.head_vertices(avatar.subject)[0].detach()
+    parts = head_parts(model)
+    # The mesh cannot say exactly which part of a mouth a picture shows, so no colour from there is believed.
+    seen = torch.where(parts.interior, 0.0, found.seen)
+    colors = complete_colors(model, neutral, seen, found.colors)
+    shown = drawn_share(model, found)
+    doubt: Float[Tensor, " f"] = (1 - shown) * found.above
+    if avatar.surface() is None:
+        return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
+    made_up = (shown < _RARE) & (found.above > 0.5)
+    made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)
+    looseness = looser_where_faces_move(model, neutral, parts.interior)
+    curtain = hair_curtain(model, neutral, hair, hanging)
+    behind = made_up & (curtain > hair)
+    colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
+    hair, hanging = torch.where(behind, curtain, hair), torch.maximum(hanging, curtain)
+    strands = made_up & (parts.scalp | behind) & (hair > _STRANDS_FROM)
+    return Unseen(
+        found, SurfacePrior(hair, hanging, colors, doubt, made_up, made_up | parts.interior, strands, looseness)
+    )
+
+
+def _hair_colors(
+    face_model: FaceModel,
+    vertices: Float[Tensor, "v 3"],
+    scalp: Bool[Tensor, " f"],
+    behind: Bool[Tensor, " f"],
+    colors: Float[Tensor, "f 3"],
+) -> Float[Tensor, "f 3"]:
+    """Colours in which those of the scalp go on over triangles behind hanging hair."""
+    return Surface.of(vertices, face_model.faces).spread(colors, scalp.to(colors), scalp | behind)
+
+
+def looser_where_faces_move(
+    face_model: FaceModel, vertices: Float[Tensor, "v 3"], interior: Bool[Tensor, " f"]
+) -> Float[Tensor, " f"]:
+    """Factors on the limits to the surface: above 1 at and around lips and lids, and inside the mouth.
+
+    Args:
+        face_model: The face model.
+        vertices: The person's neutral head in the head frame, in metres.
+        interior: Triangles inside the mouth.
+    """
+    middles, moving = vertices[face_model.faces.long()].mean(1), face_model.region_mask(*_MOVING)
+    if not bool(moving.any()):
+        return torch.where(interior, _LOOSE, 1.0)
+    distances = torch.cdist(middles, middles[moving], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    near = smoothstep((_NEAR[1] - distances) / (_NEAR[1] - _NEAR[0]))
+    return 1 + (_LOOSE - 1) * torch.where(interior, 1.0, near)
+
+
+def hidden_inside(
+    face_model: FaceModel,
+    interior: Bool[Tensor, " f"],
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+) -> Bool[Tensor, " f"]:
+    """Which triangles inside a mouth hardly any picture shows, because lips, cheeks or tongue are in front of them."""
+
+    def shown_in(frame: Frame) -> Bool[Tensor, " f"]:
+        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
+        camera = sequences[frame.sequence].tracking.cameras[frame.camera]
+        return interior & ~hidden_triangles(vertices, face_model, interior, camera)
+
+    looked = spread_frames(frames, _SIGHTS)
+    sights = torch.zeros(len(interior))
+    for shown in stream_in_threads(shown_in, looked):
+        sights += shown
+    return interior & (sights < _RARELY * len(looked))
+
+
+def moved(unseen: Unseen, like: Tensor) -> Unseen:
+    """The same on the device of `like`."""
+    prior = unseen.prior
+    put = {
+        "hanging": None if prior.hanging is None else prior.hanging.to(like),
+        "colors": None if prior.colors is None else prior.colors.to(like),
+        "doubt": None if prior.doubt is None else prior.doubt.to(like),
+        "made_up": None if prior.made_up is None else prior.made_up.to(like.device),
+        "closed": None if prior.closed is None else prior.closed.to(like.device),
+        "strands": None if prior.strands is None else prior.strands.to(like.device),
+        "looseness": None if prior.looseness is None else prior.looseness.to(like),
+    }
+    return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))
