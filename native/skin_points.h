@@ -1,5 +1,5 @@
-// Points from their places in one pose of a skeleton to those in others (src/mien/avatar/ops/skin_points.py has the same in
-// PyTorch): skinning undone, displacements added, skinned again.
+// Points from their places in one pose of a skeleton to those in others (src/mien/avatar/ops/skin_points.py has the
+// same in PyTorch): skinning undone, displacements added, skinned again.
 #pragma once
 
 #include <cstdint>
