@@ -1,7 +1,9 @@
 """Conversion of tensors for the native core."""
 
 import math
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -9,6 +11,7 @@ from torch.utils.dlpack import to_dlpack
 
 from mien import _native
 
+_Operation = TypeVar("_Operation", bound=Callable[..., Any])
 _MIN_RECYCLED = 1 << 18
 """Smallest number of elements for which memory is recycled. Smaller blocks come back from the allocator without fresh
 pages."""
@@ -22,6 +25,35 @@ def recycled(*shape: int) -> Tensor:
     if math.prod(shape) < _MIN_RECYCLED:
         return torch.empty(shape)
     return _native.recycled(shape)
+
+
+def is_native(*tensors: Tensor) -> bool:
+    """Whether the native core can compute with these tensors: float32, or integers, on a CPU."""
+    return all(
+        tensor.device.type == "cpu" and (tensor.dtype is torch.float32 or not tensor.is_floating_point())
+        for tensor in tensors
+    )
+
+
+def native(reference: Callable[..., Any]) -> Callable[[_Operation], _Operation]:
+    """Decorate an operation that calls the native core, so that `reference` computes what the core cannot take.
+
+    Every native operation is dispatched in this way. Both functions take the same arguments. The tensors among them
+    decide, but not those inside of records.
+
+    Args:
+        reference: The operation in plain PyTorch, for any dtype and device.
+    """
+
+    def decorate(operation: _Operation) -> _Operation:
+        @wraps(operation)
+        def dispatch(*arguments: Any, **named: Any) -> Any:
+            tensors = (given for given in (*arguments, *named.values()) if isinstance(given, Tensor))
+            return (operation if is_native(*tensors) else reference)(*arguments, **named)
+
+        return dispatch  # pyright: ignore[reportReturnType]
+
+    return decorate
 
 
 def unpacked(*tensors: Tensor | None) -> list[Any]:

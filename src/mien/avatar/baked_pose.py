@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from mien import runtime
+from mien.arrays import is_native
 from mien.face import FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.runtime.baked import BakedAvatar
@@ -36,7 +37,7 @@ class Kept(Generic[T]):
 def can_pose_baked(like: Tensor, face: FaceParams) -> bool:
     """Whether the runtime can pose a face: on a CPU, in float32, without gradients."""
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in face.tensors().values())
-    return like.device.type == "cpu" and like.dtype == torch.float32 and not wanted
+    return is_native(like) and not wanted
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import is_native, unpacked
 from mien.face.params import FaceParams
 
 if TYPE_CHECKING:
@@ -25,8 +25,7 @@ def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
     """Whether `pose_vertices` supports this model and these parameters."""
     if model.expression_basis.shape[0] + 9 * len(model.free_joint_names) > _MAX_SHAPES:
         return False
-    tensors = (model.template, *face.tensors().values())
-    return all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+    return is_native(model.template, *face.tensors().values())
 
 
 def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float[Tensor, "b v 3"]:
@@ -45,9 +44,7 @@ def head_poses(face: FaceParams) -> Float[Tensor, "b 4 4"]:
     The two agree to 1e-6. Avatars pass this one to renderers, so that pictures are the same as those without torch.
     """
     rotation, translation = face.head_rotation, face.head_translation
-    if any(tensor.dtype != torch.float32 or tensor.device.type != "cpu" for tensor in (rotation, translation)):
-        return face.T_world_head
-    return _HeadPoses.apply(rotation, translation)
+    return _HeadPoses.apply(rotation, translation) if is_native(rotation, translation) else face.T_world_head
 
 
 class _HeadPoses(torch.autograd.Function):

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
+from mien.arrays import is_native
 from mien.avatar import PerceptualLoss, Photometric
 from mien.perceptual import TrainingFeatures, load_training_features
 from mien.pictures import Box
@@ -97,7 +98,7 @@ def drawn_crop(target: Target, side: int, random: torch.Generator) -> Box:
 def train_psnr(rendering: Rendering, target: Target) -> float:
     """Peak signal-to-noise ratio of a training picture in dB, over the whole picture."""
     image, picture = rendering.image.detach(), target.picture
-    if image.dtype == torch.float32 and image.device.type == "cpu":
+    if is_native(image):
         error = _native.mean_squared_difference(image.contiguous(), picture.contiguous())
     else:
         error = float((image - picture.to(image) / 255).square().mean())

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from mien import _native
-from mien.arrays import recycled, unpacked
+from mien.arrays import is_native, recycled, unpacked
 from mien.pictures import Box
 
 WINDOW_RADIUS = 5
@@ -42,8 +42,7 @@ def photometric_loss(
     """
     assert image.shape == target.shape, (image.shape, target.shape)
     assert not target.requires_grad
-    native_types = image.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
-    if not native_types or image.device.type != "cpu" or image.shape[1] < _NATIVE_MIN_WIDTH:
+    if not is_native(image, target) or image.shape[1] < _NATIVE_MIN_WIDTH:
         return photometric_loss_reference(
             image, target, l1_weight, ssim_weight, box if drawn is None else None, parts, part_weight
         )

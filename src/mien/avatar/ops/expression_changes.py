@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import recycled, unpacked
+from mien.arrays import native, recycled, unpacked
 from mien.face import FaceParams
 
 SEEN_SHARE = 0.98
@@ -51,10 +51,7 @@ class ExpressionActivations(nn.Module):
 
     def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
         """The activations of some timesteps. Differentiable in `face`; native for float32 on a CPU."""
-        inputs = expression_inputs(face)
-        if inputs.dtype != torch.float32 or inputs.device.type != "cpu":
-            return activations_reference(inputs, self.rest, self.directions, self.reach)
-        return _Activations.apply(inputs, self.rest, self.directions, self.reach)
+        return _activations(expression_inputs(face), self.rest, self.directions, self.reach)
 
 
 def activations_reference(
@@ -65,6 +62,11 @@ def activations_reference(
 ) -> Float[Tensor, "b r"]:
     """(inputs - rest) directions, shortened to the reach (`within_reach`), in plain PyTorch, any dtype and device."""
     return within_reach((inputs - rest) @ directions, reach)
+
+
+@native(activations_reference)
+def _activations(*arguments: Tensor) -> Tensor:
+    return _Activations.apply(*arguments)  # pyright: ignore[reportReturnType]
 
 
 class _Activations(torch.autograd.Function):
@@ -123,16 +125,15 @@ def within_reach(values: Float[Tensor, "b r"], reach: Float[Tensor, " 1"]) -> Fl
     return values * torch.where(over > 0, shortened / lengths, 1.0)
 
 
-def expression_change(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
-    """The sum of a basis' columns, weighted by 1 to 8 activations. Differentiable; native for float32 on a CPU."""
-    if basis.dtype != torch.float32 or basis.device.type != "cpu":
-        return expression_change_reference(basis, activations)
-    return _Change.apply(basis, activations)
-
-
 def expression_change_reference(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
     """`expression_change` in plain PyTorch, any dtype and device."""
     return (basis.flatten(0, -2) @ activations).view(basis.shape[:-1])
+
+
+@native(expression_change_reference)
+def expression_change(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
+    """The sum of a basis' columns, weighted by 1 to 8 activations. Differentiable; native for float32 on a CPU."""
+    return _Change.apply(basis, activations)
 
 
 class _Change(torch.autograd.Function):

@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.adam import FactoredGradient
-from mien.arrays import recycled, unpacked
+from mien.arrays import native, recycled, unpacked
 
 SLOPE = 0.01
 """Slope of the leaky ReLU below 0."""
@@ -34,6 +34,13 @@ class Layers(NamedTuple):
     bias2: Float[Tensor, " o"]
 
 
+def _plain_network(
+    bases: Tensor, inputs: Tensor, neutral: Tensor, own: Tensor, layers: Layers, gradient: FactoredGradient
+) -> tuple[Tensor, Tensor]:
+    return _network(blended_features(bases, inputs, neutral, gradient), own, layers)
+
+
+@native(_plain_network)
 def feature_network(
     bases: Float[Tensor, "n k f"],
     inputs: Float[Tensor, " k"],
@@ -52,9 +59,6 @@ def feature_network(
         layers: The network.
         gradient: Takes the gradient of the bases, if they require one.
     """
-    if bases.dtype != torch.float32 or bases.device.type != "cpu":
-        features = blended_features(bases, inputs, neutral, gradient)
-        return _network(features, own, layers)
     return _Network.apply(gradient, bases, inputs, neutral, own, *layers)
 
 

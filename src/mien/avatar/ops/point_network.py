@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import recycled, unpacked
+from mien.arrays import native, recycled, unpacked
 
 SHARPNESS = 100.0
 """Sharpness of the softplus: ln(1 + exp(100 x)) / 100."""
@@ -31,18 +31,6 @@ class Layer(NamedTuple):
     """Whose values are read after those of the previous layer: 0 for the inputs, 1 for the first layer, and so on."""
 
 
-def point_network(inputs: Float[Tensor, "n i"], layers: Sequence[Layer]) -> Float[Tensor, "n o"]:
-    """The outputs of the last layer, which has no activation. Differentiable in inputs, weights and biases.
-
-    Native for float32 on a CPU: one call forward and one backward, which skips points without gradients. The result
-    does not depend on the number of threads.
-    """
-    if inputs.dtype != torch.float32 or inputs.device.type != "cpu":
-        return point_network_reference(inputs, layers)
-    structure = tuple((_CODES[layer.activation], -1 if layer.extra is None else layer.extra) for layer in layers)
-    return _PointNetwork.apply(structure, inputs, *(tensor for layer in layers for tensor in layer[:2]))
-
-
 def point_network_reference(inputs: Float[Tensor, "n i"], layers: Sequence[Layer]) -> Float[Tensor, "n o"]:
     """`point_network` in plain PyTorch."""
     values = [inputs]
@@ -50,6 +38,17 @@ def point_network_reference(inputs: Float[Tensor, "n i"], layers: Sequence[Layer
         read = values[-1] if layer.extra is None else torch.cat([values[-1], values[layer.extra]], dim=-1)
         values.append(_ACTIVATIONS[layer.activation](torch.addmm(layer.bias, read, layer.weight.T)))
     return values[-1]
+
+
+@native(point_network_reference)
+def point_network(inputs: Float[Tensor, "n i"], layers: Sequence[Layer]) -> Float[Tensor, "n o"]:
+    """The outputs of the last layer, which has no activation. Differentiable in inputs, weights and biases.
+
+    Native for float32 on a CPU: one call forward and one backward, which skips points without gradients. The result
+    does not depend on the number of threads.
+    """
+    structure = tuple((_CODES[layer.activation], -1 if layer.extra is None else layer.extra) for layer in layers)
+    return _PointNetwork.apply(structure, inputs, *(tensor for layer in layers for tensor in layer[:2]))
 
 
 _ACTIVATIONS = {

@@ -12,9 +12,23 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import native, unpacked
 
 
+def skin_points_reference(
+    points: Float[Tensor, "n 3"],
+    moved: Float[Tensor, "b n 3"],
+    weights: Float[Tensor, "n k"],
+    from_bones: Float[Tensor, "k 3 4"],
+    to_bones: Float[Tensor, "b k 3 4"],
+) -> Float[Tensor, "b n 3"]:
+    """`skin_points` in plain PyTorch."""
+    shaped = unskin(points, blend_transforms(weights, from_bones[None])[0]) + moved
+    skinning = blend_transforms(weights, to_bones)
+    return (skinning[..., :3] @ shaped[..., None])[..., 0] + skinning[..., 3]
+
+
+@native(skin_points_reference)
 def skin_points(
     points: Float[Tensor, "n 3"],
     moved: Float[Tensor, "b n 3"],
@@ -31,22 +45,7 @@ def skin_points(
         from_bones: Transforms of the bones in the first pose.
         to_bones: Transforms of the bones in the other poses.
     """
-    if points.dtype != torch.float32 or points.device.type != "cpu":
-        return skin_points_reference(points, moved, weights, from_bones, to_bones)
     return _SkinPoints.apply(points, moved, weights, from_bones, to_bones)
-
-
-def skin_points_reference(
-    points: Float[Tensor, "n 3"],
-    moved: Float[Tensor, "b n 3"],
-    weights: Float[Tensor, "n k"],
-    from_bones: Float[Tensor, "k 3 4"],
-    to_bones: Float[Tensor, "b k 3 4"],
-) -> Float[Tensor, "b n 3"]:
-    """`skin_points` in plain PyTorch."""
-    shaped = unskin(points, blend_transforms(weights, from_bones[None])[0]) + moved
-    skinning = blend_transforms(weights, to_bones)
-    return (skinning[..., :3] @ shaped[..., None])[..., 0] + skinning[..., 3]
 
 
 def blend_transforms(weights: Float[Tensor, "n k"], transforms: Float[Tensor, "b k 3 4"]) -> Float[Tensor, "b n 3 4"]:

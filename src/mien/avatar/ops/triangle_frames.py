@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from torch.utils.weak import WeakIdKeyDictionary
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import native, unpacked
 from mien.rotation import multiply_quaternions, quaternion_from_matrix
 
 DEGENERATE_LENGTH = 1e-7
@@ -89,6 +89,11 @@ def frames_to_world(
     return means, multiply_quaternions(triangle_quats, local_quats), k * log_scales.exp()
 
 
+def _bind_to_world_reference(vertices: Tensor, faces: Tensor, *gaussians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return frames_to_world(triangle_frames(vertices, faces), *gaussians)
+
+
+@native(_bind_to_world_reference)
 def bind_to_world(
     vertices: Float[Tensor, "*b v 3"],
     faces: Int[Tensor, "f 3"],
@@ -102,9 +107,6 @@ def bind_to_world(
     Gaussian i follows triangle `face_index[i]`. Leading axes of `vertices` are timesteps. Differentiable in everything
     except the indices.
     """
-    floats = (vertices, local_means, local_quats, log_scales)
-    if any(tensor.device.type != "cpu" or tensor.dtype != torch.float32 for tensor in floats):
-        return frames_to_world(triangle_frames(vertices, faces), face_index, local_means, local_quats, log_scales)
     one_axis = vertices.ndim == 3  # no views in this case, because each is a node of the graph
     flat = vertices if one_axis else vertices.reshape(-1, *vertices.shape[-2:])
     means, quats, scales = _BindToWorld.apply(flat, faces, face_index, local_means, local_quats, log_scales)

@@ -8,12 +8,28 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import native, unpacked
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
 
 
+def triangle_penalties_reference(
+    means: Float[Tensor, "n 3"],
+    log_scales: Float[Tensor, "n 3"],
+    radii: Int[Tensor, " n"],
+    thresholds: _Pair,
+    weights: _Pair,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """`triangle_penalties` in plain PyTorch, any dtype and device."""
+    in_view = radii > 0
+    share = in_view / in_view.sum().clamp_min(1)
+    too_far = torch.relu(torch.linalg.vector_norm(means, dim=-1) - thresholds[0])
+    too_large = torch.linalg.vector_norm(torch.relu(log_scales.exp() - thresholds[1]), dim=-1)
+    return weights[0] * (too_far * share).sum(), weights[1] * (too_large * share).sum()
+
+
+@native(triangle_penalties_reference)
 def triangle_penalties(
     means: Float[Tensor, "n 3"],
     log_scales: Float[Tensor, "n 3"],
@@ -33,24 +49,7 @@ def triangle_penalties(
         thresholds: Distance and scale up to which there is no penalty.
         weights: Weights of the two penalties.
     """
-    if means.dtype != torch.float32 or means.device.type != "cpu":
-        return triangle_penalties_reference(means, log_scales, radii, thresholds, weights)
     return _TrianglePenalties.apply(means, log_scales, radii, thresholds, weights)
-
-
-def triangle_penalties_reference(
-    means: Float[Tensor, "n 3"],
-    log_scales: Float[Tensor, "n 3"],
-    radii: Int[Tensor, " n"],
-    thresholds: _Pair,
-    weights: _Pair,
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """`triangle_penalties` in plain PyTorch, any dtype and device."""
-    in_view = radii > 0
-    share = in_view / in_view.sum().clamp_min(1)
-    too_far = torch.relu(torch.linalg.vector_norm(means, dim=-1) - thresholds[0])
-    too_large = torch.linalg.vector_norm(torch.relu(log_scales.exp() - thresholds[1]), dim=-1)
-    return weights[0] * (too_far * share).sum(), weights[1] * (too_large * share).sum()
 
 
 class _TrianglePenalties(torch.autograd.Function):

@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import is_native, unpacked
 from mien.avatar import GaussianStore, GradientDensity, Posed, Progress
 from mien.render.rendering import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
@@ -56,7 +56,7 @@ class GradientStrategy(DensityStrategy):
         # Scale pixels to normalised device coordinates, which span -1..1: the unit of the thresholds.
         scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
         statistics = (self._gradient_sums, self._views, self._largest_radii, self._highest_opacities)
-        if gradient.device.type == "cpu" and gradient.dtype == torch.float32:
+        if is_native(gradient):
             arrays = unpacked(gradient, rendering.radii, opacities, *statistics)
             _native.observe_view(scale, *arrays)
         else:

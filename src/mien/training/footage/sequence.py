@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien import _native
+from mien.arrays import is_native
 from mien.camera import Camera
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.errors import UserError
@@ -162,7 +163,7 @@ class Targets:
         cameras = (camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
         self.cameras = tuple(camera.to(like) for camera in cameras)
         self._like = like
-        self._on_cpu = like.device.type == "cpu" and like.dtype == torch.float32
+        self._on_cpu = is_native(like)
         self._cache: dict[tuple[int, int, bytes], Target] = {}
         self._soft: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         """Indices of soft pixels, in rows, and their cleaned colours, by timestep and camera."""
