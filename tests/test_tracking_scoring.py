@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from mien.camera import look_at
-from mien.tracking import Tracking, draw_overlay, make_scoring, write_overlay
+from mien.tracking import Tracking, make_scoring, write_overlay
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.neck_line import bottom_vertices, fit_neck_lines
+from mien.tracking.report.overlay import OverlayPainter
 from mien.tracking.scoring import cut_matte, head_crop
 from small_face_model import make_small_face_model
 from tracking_case import SIZE, capture_of, still_camera
@@ -193,7 +194,7 @@ def test_overlay(tmp_path):
     tracking = _tracking(model, face)
     tracking = replace(tracking, residuals=torch.tensor([[0.5], [torch.nan], [0.5]]))
     capture = capture_of(torch.full((3, 478, 2), 100.0), missing=(1,))
-    picture = draw_overlay(capture, tracking, model, 0)
+    picture = OverlayPainter(capture, tracking, model).picture(0)
     assert picture.shape == (SIZE, 2 * SIZE, 3)
     assert (picture[256, SIZE + 256] != 128).any(), "the mesh is drawn"
     assert (picture[100, 100] == (60, 255, 60)).all(), "detected landmarks are green"

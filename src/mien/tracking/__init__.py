@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
     from mien.tracking.pipeline import track, track_subject
     from mien.tracking.report import (
-        draw_overlay,
-        draw_overlay_grid,
         frontal_camera,
         overlay_stride,
         residual_report,
@@ -36,8 +34,6 @@ __all__ = [
     "Tracking",
     "TrackingSettings",
     "check_tracking_of",
-    "draw_overlay",
-    "draw_overlay_grid",
     "fit_neck_cut",
     "frontal_camera",
     "has_enough_faces",

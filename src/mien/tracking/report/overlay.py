@@ -52,13 +52,6 @@ def overlay_stride(timesteps: int) -> int:
     return max(1, math.ceil(timesteps / _MAX_PICTURES))
 
 
-def draw_overlay(
-    capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int, camera_index: int = 0
-) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """One picture of the overlay video (`OverlayPainter.picture`)."""
-    return OverlayPainter(capture, tracking, face_model).picture(timestep, camera_index)
-
-
 class OverlayPainter:
     """Draws a tracking over its capture. It is immutable, so several threads may use it at once."""
 
@@ -172,13 +165,6 @@ def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
     """Colours of the corners of every triangle, which tell lips, lids, irises, ears and other regions apart."""
     palette = torch.tensor([_REGION_COLORS.get(name, _SKIN) for name in face_model.region_names])
     return palette[face_model.face_regions.long()][:, None].expand(-1, 3, -1)
-
-
-def draw_overlay_grid(
-    capture: Capture, tracking: Tracking, face_model: FaceModel, timestep: int
-) -> UInt8[np.ndarray, "h w 3"]:
-    """One timestep of the overlay video: the pictures of all cameras in a roughly square grid."""
-    return _grid(OverlayPainter(capture, tracking, face_model), len(tracking.cameras), timestep)
 
 
 def _grid(painter: OverlayPainter, cameras: int, timestep: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -168,7 +168,7 @@ def _seen_colors(
     weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
     line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
     corners, _ = camera.project(vertices)
-    # Masks of workspaces from before 2026-11-23 end at the neck line, later ones at the cut.
+    # What is below the neck line in the picture, or below the cut in space, is not scored.
     above = torch.minimum((corners @ line[:2] + line[2]).clamp(0, 1), (cut.heights(vertices) / _SOFT + 2).clamp(0, 1))
     # All of the triangle has to be above: what hangs over the cut is scored as background.
     return colors, torch.where(inside, weight, 0.0), above[faces.long()].amin(1)
