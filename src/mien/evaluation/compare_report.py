@@ -19,9 +19,9 @@ from mien.evaluation.page import (
     metric_groups,
     metric_headings,
     picture_of,
-    render,
 )
 from mien.evaluation.report_sections import frame_name
+from mien.pages import render
 from mien.pictures import Box, error_heat, to_uint8
 from mien.progress import track_progress
 from mien.storage import write_atomically

@@ -1,22 +1,15 @@
-"""Parts of report.html, compare.html and analysis.html: the templates, explanations, tables, pictures and videos.
-
-A page is one file that can be sent around. It needs no network and no scripts, and works in light, in dark and on
-paper. Its HTML is in `templates/`, which escapes every text. Python code prepares what the templates show.
-"""
+"""Parts of report.html, compare.html and analysis.html: explanations, tables, pictures and videos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
 from mien.evaluation.metrics_file import COLUMNS
-from mien.pictures import ERROR_LIMIT, data_uri, heat_gradient, picture_uri, shrink
+from mien.pictures import data_uri, picture_uri, shrink
 
 GLOSSARY = {
     "Held-out frames": (
@@ -137,25 +130,6 @@ class ReportVideo:
         """The video of truth, rendering and error."""
         part = "" if self.shown == self.scored else f", {self.shown} of {self.scored} frames"
         return video_of(self.path, page_folder, f"Truth, rendering, error{part}")
-
-
-def render(template: str, **content: object) -> Markup:
-    """HTML from a template, which is named by its path in `mien`. Text in `content` is escaped, `Markup` is not."""
-    return Markup(_templates().get_template(template).render(content))
-
-
-@cache
-def _templates() -> jinja2.Environment:
-    folder = files("mien")
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda name: folder.joinpath(name).read_text(encoding="utf-8")),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals |= {"heat_gradient": heat_gradient(), "error_limit": f"{ERROR_LIMIT * 255:.0f}"}
-    return environment
 
 
 def metric_headings(crops: int | None = None) -> list[Cell]:

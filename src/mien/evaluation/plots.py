@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
-from mien.evaluation.page import render
+from mien.pages import render
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 34
 _MAX_POINTS = 400

@@ -23,9 +23,9 @@ from mien.evaluation.page import (
     figure_text,
     metric_groups,
     metric_headings,
-    render,
 )
 from mien.evaluation.protocols import Evaluation
+from mien.pages import render
 from mien.storage import write_atomically
 from mien.training.footage import Coverage
 

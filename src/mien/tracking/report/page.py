@@ -1,26 +1,17 @@
 """The page report.html of a tracking: findings, figures, and pictures of typical frames and of those that stand out."""
 
-import re
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from mien.capture.capture import Capture
 from mien.face import FaceModel
+from mien.pages import render
 from mien.pictures import data_uri, picture_uri
 from mien.storage import write_atomically
 from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames
 from mien.tracking.tracking import Tracking
 
-_STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1100px;padding:0 1rem;color:#222;"
-    "background:#fff}"
-    "img,video{max-width:100%;height:auto}table{border-collapse:collapse}td,th{padding:.2rem .8rem .2rem 0;text-align:"
-    "left;font-weight:400}td{font-variant-numeric:tabular-nums}.odd{color:#a40000}"
-    ".sheet{width:min(94vw,1924px);max-width:none;margin-left:calc(50% - min(47vw,962px))}"
-    "@media(prefers-color-scheme:dark){body{background:#181818;color:#ddd}.odd{color:#ff8a80}}"
-)
 _JPEG_QUALITY = 85
 _SOME = 40
 """Largest number of frames, or runs of frames, that a finding names."""
@@ -67,21 +58,15 @@ def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, 
         panels = ("the picture, the tracked mesh over it, the model's own picture (its texture in the fitted light), "
                   "and the difference of colours (black is none; grey parts, such as hair, eyes and mouth, are not "
                   "compared)")  # fmt: skip
-    paragraphs = "".join(f'<p class="{kind}">{_with_code(text)}</p>' for kind, text in findings(tracking, report))
-    rows = "".join(f"<tr><th>{escape(what)}</th><td>{escape(value)}</td></tr>" for what, value in _figures(report))
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(name)}: tracking</title>'
-        f"<style>{_STYLE}</style></head><body><h1>{escape(name)}: how the face was tracked</h1>{paragraphs}"
-        f"<table>{rows}</table><h2>Frames</h2><p>Evenly spread frames, and frames that stand out. Each shows "
-        f'{escape(panels)}.</p><img class="sheet" alt="contact sheet" src="{sheet}">'
-        f'<h2>Over time</h2><img alt="residuals over time" src="{plot}">'
-        '<h2>Overlay</h2><video controls preload="none" src="overlay.mp4"></video></body></html>\n'
+    return render(
+        "tracking/report/templates/report.html",
+        name=name,
+        findings=findings(tracking, report),
+        figures=_figures(report),
+        panels=panels,
+        sheet=sheet,
+        plot=plot,
     )
-
-
-def _with_code(text: str) -> str:
-    """The text as html, with text between backticks as code."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]]:

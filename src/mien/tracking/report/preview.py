@@ -12,6 +12,7 @@ from jaxtyping import Float, Int, UInt8
 
 from mien.capture.capture import Capture
 from mien.face import FaceModel
+from mien.pages import render
 from mien.picture_files import encode_picture
 from mien.pictures import data_uri
 from mien.storage import write_atomically
@@ -110,11 +111,10 @@ class Preview:
 
     def _write(self, picture: UInt8[np.ndarray, "h w 3"], last: bool) -> None:
         png = encode_picture(picture)
-        refresh = "" if last else f'<meta http-equiv="refresh" content="{_INTERVAL_SECONDS:.0f}">'
-        page = (
-            f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">{refresh}<title>Tracking</title></head>'
-            '<body style="margin:0;background:#222"><img alt="the present state of the fit" style="max-width:100%" '
-            f'src="{data_uri("image/png", png)}"></body></html>\n'
+        page = render(
+            "tracking/report/templates/preview.html",
+            refresh=None if last else f"{_INTERVAL_SECONDS:.0f}",
+            picture=data_uri("image/png", png),
         )
         write_atomically(self._path.with_suffix(".png"), lambda path: path.write_bytes(png))
         write_atomically(self._path, lambda path: path.write_text(page, encoding="utf-8"))
