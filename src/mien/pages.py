@@ -21,7 +21,7 @@ def render(template: str, **content: object) -> Markup:
 
 def with_code(text: str) -> Markup:
     """The text as HTML, with text between backticks as code. Templates know it as the filter `with_code`."""
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text)))
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 @cache
