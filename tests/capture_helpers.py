@@ -79,7 +79,7 @@ def write_planes(
     path: Path,
     pictures: list[np.ndarray],
     pixel_format: str,
-    colours: tuple[int, int, int, int] = (1, 1, 1, 1),
+    colors: tuple[int, int, int, int] = (1, 1, 1, 1),
     ticks: list[int] | None = None,
 ) -> None:
     """Write a lossless clip (FFV1 in Matroska, 25 frames a second) of exactly these Y'CbCr planes [3, h, w], 4:4:4.
@@ -88,7 +88,7 @@ def write_planes(
         path: Path of the clip; it ends in .mkv.
         pictures: Planes as uint8 or uint16, depending on the pixel format.
         pixel_format: FFmpeg's name of the pixel format, such as yuv444p10le.
-        colours: Codes of matrix, primaries, transfer and range.
+        colors: Codes of matrix, primaries, transfer and range.
         ticks: Times in milliseconds; by default the rate is even.
     """
     _, height, width = pictures[0].shape
@@ -96,10 +96,10 @@ def write_planes(
         stream = container.add_stream("ffv1", rate=25 if ticks is None else 1000)
         stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
         context = stream.codec_context
-        context.colorspace, context.color_primaries, context.color_trc, context.color_range = colours
+        context.colorspace, context.color_primaries, context.color_trc, context.color_range = colors
         for index, planes in enumerate(pictures):
             frame = av.VideoFrame(width, height, pixel_format)
-            frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range = colours
+            frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range = colors
             frame.pts = index if ticks is None else ticks[index]
             for plane, values in zip(frame.planes, planes, strict=True):
                 padded = np.zeros((height, plane.line_size // values.itemsize), values.dtype)

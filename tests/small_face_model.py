@@ -15,8 +15,8 @@ def make_small_face_model(identities: int = 6, expressions: int = 8, seed: int =
     skull, skull_faces = _sphere(28, 24, open_below=True)
     skull = skull * torch.tensor([0.075, 0.11, 0.095])
     ball, ball_faces = _sphere(10, 8, open_below=False)
-    centres = torch.tensor([[0.032, 0.02, 0.075], [-0.032, 0.02, 0.075]])
-    template = torch.cat([skull, *(ball * 0.013 + centre for centre in centres)])
+    centers = torch.tensor([[0.032, 0.02, 0.075], [-0.032, 0.02, 0.075]])
+    template = torch.cat([skull, *(ball * 0.013 + center for center in centers)])
     offsets = (0, len(skull), len(skull) + len(ball))
     faces = torch.cat([skull_faces + offsets[0], ball_faces + offsets[1], ball_faces + offsets[2]])
     regions = torch.cat([torch.full((len(part),), index) for index, part in enumerate((skull_faces, ball_faces))])
@@ -36,7 +36,7 @@ def make_small_face_model(identities: int = 6, expressions: int = 8, seed: int =
     rotation_basis[0, 4, 0] = 0.25
     bounds = torch.tensor([[0.0, 1.0]]).repeat(expressions, 1)
     bounds[-1] = 0
-    joints = torch.cat([torch.tensor([[0.0, 0, 0], [0, -0.08, -0.03]]), centres, torch.tensor([[0.0, -0.02, 0.0]])])
+    joints = torch.cat([torch.tensor([[0.0, 0, 0], [0, -0.08, -0.03]]), centers, torch.tensor([[0.0, -0.02, 0.0]])])
     return FaceModel(
         name="small", template=template, faces=faces, uv=torch.zeros(len(template), 2), uv_faces=faces,
         region_names=("skin", "eyes"), face_regions=regions,

@@ -50,11 +50,11 @@ _plain = toy_scene.toy_face_model
 def toy_with_teeth(rings: int = 9, around: int = 12) -> FaceModel:
     """Return the toy face model with teeth among the triangles of its lower front, and lips around them."""
     model = _plain(rings, around)
-    centres = model.template[model.faces].mean(1)
-    ahead = centres[:, 2] > 0.05
+    centers = model.template[model.faces].mean(1)
+    ahead = centers[:, 2] > 0.05
     regions = torch.zeros(len(model.faces), dtype=torch.long)
-    regions[ahead & (centres[:, 1].abs() < 0.05)] = 1
-    regions[ahead & (centres[:, 1].abs() < 0.02)] = 2
+    regions[ahead & (centers[:, 1].abs() < 0.05)] = 1
+    regions[ahead & (centers[:, 1].abs() < 0.02)] = 2
     return replace(model, region_names=("skin", "lips", "teeth"), face_regions=regions)
 
 
@@ -242,15 +242,15 @@ def test_parts_of_another_method_give_charts_pictures_and_films(workspace: Path,
 
 
 def part_of_everything(context: Any) -> PartResult:
-    grey = np.full((16, 16, 3), 128, np.uint8)
-    write_video(context.folder / "film.mp4", [grey] * 3, 25.0)
+    gray = np.full((16, 16, 3), 128, np.uint8)
+    write_video(context.folder / "film.mp4", [gray] * 3, 25.0)
     dots = Series("dots", np.arange(3.0), np.array([1.0, np.nan, 3.0]), points=True)
     return PartResult(
         {"figure": 1},
         ("It is found.",),
         (Table(("name", "value"), (("some", 1234), ("none", None)), "a caption"),),
         (Chart("dots", "Dots", (dots,), Axes("x", "y", shaded=((0.0, 1.0),))),),
-        (Picture("grey", grey, "grey"),),
+        (Picture("grey", gray, "grey"),),
         (Film("film.mp4", "a film"),),
         ("a <b> note",),
     )

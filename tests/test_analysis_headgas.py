@@ -22,7 +22,7 @@ from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas import ablations, beyond, layers, sizes
 from mien.lab.analysis.headgas.basis import start_of_bases
 from mien.lab.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
-from mien.lab.analysis.views import head_camera, labelled, mouth_camera
+from mien.lab.analysis.views import head_camera, labeled, mouth_camera
 from mien.runtime.filmed import head_angles
 from toy_scene import toy_camera, toy_face, toy_face_model
 from toy_workspace import write_toy_workspace
@@ -196,10 +196,10 @@ def test_views_hold_the_head() -> None:
     assert float((pixels.amax(0) - pixels.amin(0)).max()) > 70
     # A face model without regions of a mouth gives the whole head.
     assert mouth_camera(model, face, toy_camera(64), 50).K[0, 0] < 0.6 * camera.K[0, 0]
-    grey = np.full((10, 40, 3), 128, np.uint8)
-    picture = labelled(grey, "text")
+    gray = np.full((10, 40, 3), 128, np.uint8)
+    picture = labeled(gray, "text")
     assert picture.shape == (30, 40, 3)
-    assert (picture[20:] == grey).all()
+    assert (picture[20:] == gray).all()
     assert picture[:20].min() < 200
 
 

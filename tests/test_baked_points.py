@@ -68,7 +68,7 @@ def test_other_avatars_keep_the_path_of_numpy() -> None:
         replace(baked, network=softplus),
         replace(baked, network=no_scales),
         replace(baked, scale_activation="exp"),
-        replace(baked, colour_activation="sh"),
+        replace(baked, color_activation="sh"),
         replace(baked, attributes=replace(baked.attributes, sh=np.zeros((20, 4, 3), np.float32))),
     ):
         assert not posing._has_native_activations(other)

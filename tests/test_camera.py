@@ -33,7 +33,7 @@ def apply(transform: Tensor, point: Tensor) -> Tensor:
 
 
 @given(st.floats(0.2, 2.5), sizes, sizes)
-def test_the_optical_axis_meets_the_picture_at_its_centre(fov_x: float, width: int, height: int) -> None:
+def test_the_optical_axis_meets_the_picture_at_its_center(fov_x: float, width: int, height: int) -> None:
     pixel, depth = camera_from_fov(fov_x, width, height).project(torch.tensor([0.0, 0.0, 2.0]))
     close(pixel, torch.tensor([width / 2, height / 2]))
     assert depth == 2
@@ -97,7 +97,7 @@ def test_opengl_cameras_look_along_minus_z_with_y_up(T_world_camera: Tensor, poi
 
 
 @given(vectors, vectors)
-def test_look_at_puts_its_target_at_the_centre_with_up_upwards(position: Tensor, target: Tensor) -> None:
+def test_look_at_puts_its_target_at_the_center_with_up_upwards(position: Tensor, target: Tensor) -> None:
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     forward = target - position
     if torch.linalg.cross(forward, up).norm() < 1e-2:

@@ -54,8 +54,8 @@ def drawing(size: int = 8) -> Rendering:
     random = torch.Generator().manual_seed(0)
     alpha = torch.rand(size, size, generator=random)
     alpha[:, : size // 2] = 0
-    colour = torch.rand(size, size, 3, generator=random)
-    image = alpha[..., None] * colour + (1 - alpha[..., None]) * torch.tensor([0.2, 0.5, 0.9])
+    color = torch.rand(size, size, 3, generator=random)
+    image = alpha[..., None] * color + (1 - alpha[..., None]) * torch.tensor([0.2, 0.5, 0.9])
     return Rendering(image, alpha, torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
 
 
@@ -109,7 +109,7 @@ def test_one_camera_is_refused_before_anything_is_written(rig, tmp_path: Path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_stopped_run_resumes_with_its_colours(rig, tmp_path: Path):
+def test_a_stopped_run_resumes_with_its_colors(rig, tmp_path: Path):
     """The same bytes result with and without a stop, and the colours have moved."""
     face_model, sequence = rig
     train([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, tmp_path / "whole")

@@ -238,7 +238,7 @@ def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
     boxes[0, 4] += 80  # the back camera mistakes something else
     boxes[1, :4] = np.nan
     path = find_head_path(boxes, cameras)
-    np.testing.assert_allclose(path.centres[0], true.numpy(), atol=1e-4)
+    np.testing.assert_allclose(path.centers[0], true.numpy(), atol=1e-4)
     assert path.agrees.tolist() == [[True] * 4 + [False], [False] * 5]
     assert not path.known[1]
     crops, size = choose_crops(path, cameras, 512, whole=False)

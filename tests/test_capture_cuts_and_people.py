@@ -119,9 +119,9 @@ def survey_of(frames: list[list[tuple[float, float, float, float]]]) -> Survey:
     count = len(frames)
     boxes, looks = np.full((count, MAX_FACES, 4), np.nan), np.full((count, MAX_FACES, 27), np.nan)
     for frame, faces in enumerate(frames):
-        for place, (x, y, side, colour) in enumerate(faces):
+        for place, (x, y, side, color) in enumerate(faces):
             boxes[frame, place] = [x - side / 2, y - side / 2, x + side / 2, y + side / 2]
-            looks[frame, place] = colour
+            looks[frame, place] = color
     numbers = np.arange(count, dtype=np.int64)
     thumbnails = np.zeros((count, 18, 32, 3), np.uint8)
     plain = np.zeros(count, bool), np.full(count, np.nan)
@@ -131,16 +131,16 @@ def survey_of(frames: list[list[tuple[float, float, float, float]]]) -> Survey:
 ANN, BOB = (0.3, 0.5, 0.3, 0.7), (0.75, 0.5, 0.2, 0.4)
 
 
-def centres(person) -> list[float]:
+def centers(person) -> list[float]:
     return np.round((person.boxes[:, 0] + person.boxes[:, 2]) / 2, 2).tolist()
 
 
 def test_the_largest_and_most_persistent_is_followed():
-    assert centres(choose_person(survey_of([[BOB, ANN]] * 10))) == [0.3] * 10
+    assert centers(choose_person(survey_of([[BOB, ANN]] * 10))) == [0.3] * 10
     # A larger face that passes by does not win.
     passing = (0.5, 0.5, 0.45, 0.5)
     person = choose_person(survey_of([[ANN]] * 40 + [[passing, ANN]] * 4 + [[ANN]] * 10))
-    assert centres(person) == [0.3] * 54
+    assert centers(person) == [0.3] * 54
     assert np.flatnonzero(person.crowded).tolist() == [40, 41, 42, 43]
 
 

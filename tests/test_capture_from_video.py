@@ -37,7 +37,7 @@ def face_capture(face_clip, tmp_path_factory):
 
 
 def test_head_is_cropped_steadily_and_landmarks_follow(face_clip, face_capture):
-    _, centres = face_clip
+    _, centers = face_clip
     path, capture = face_capture
     crop = capture.source["crop"]
     assert crop["width"] == crop["height"] < 360
@@ -45,12 +45,12 @@ def test_head_is_cropped_steadily_and_landmarks_follow(face_clip, face_capture):
     assert capture.valid.all()
     assert capture.fps == 25.0
     scale = 200 / crop["width"]
-    expected_centre = (np.array([320, 180]) - [crop["left"], crop["top"]]) * scale
-    np.testing.assert_allclose(capture.principal_point, expected_centre[None])
+    expected_center = (np.array([320, 180]) - [crop["left"], crop["top"]]) * scale
+    np.testing.assert_allclose(capture.principal_point, expected_center[None])
     # The texture moves by 4 source pixels a frame, and so must every landmark.
     moved = np.diff(capture.landmarks[:, 0].mean(axis=1), axis=0)
     np.testing.assert_allclose(moved, np.tile([4 * scale, 0], (11, 1)), atol=0.6)
-    in_texture = capture.landmarks[:, 0] / scale + [crop["left"], crop["top"]] - centres[:, None] + 120
+    in_texture = capture.landmarks[:, 0] / scale + [crop["left"], crop["top"]] - centers[:, None] + 120
     nose = in_texture[:, 1] / 240
     np.testing.assert_allclose(nose, np.tile([0.5, 0.42], (12, 1)), atol=0.03)
     report = json.loads((path / "report.json").read_text())

@@ -52,11 +52,11 @@ def dotted(points: np.ndarray) -> np.ndarray:
 def found_dots(picture: np.ndarray) -> np.ndarray:
     """Return the centre of brightness near each of DOTS."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    centres = []
+    centers = []
     for x, y in DOTS:
         weights = picture * ((abs(columns - x) < 14) & (abs(rows - y) < 14)).astype(float)
-        centres.append(((columns * weights).sum() / weights.sum(), (rows * weights).sum() / weights.sum()))
-    return np.array(centres)
+        centers.append(((columns * weights).sum() / weights.sum(), (rows * weights).sum() / weights.sum()))
+    return np.array(centers)
 
 
 def write(path: Path, entry: dict, **others: object) -> Path:

@@ -9,19 +9,19 @@ from mien.capture.matte import guided_filter, refine_matte
 from mien.capture.source import list_images
 
 
-def face_box(centre_x: float, centre_y: float, side: float, width: int, height: int) -> np.ndarray:
+def face_box(center_x: float, center_y: float, side: float, width: int, height: int) -> np.ndarray:
     half = side / 2
-    sides = np.array([centre_x - half, centre_y - half, centre_x + half, centre_y + half])
+    sides = np.array([center_x - half, center_y - half, center_x + half, center_y + half])
     return sides / [width, height, width, height]
 
 
 def test_crop_holds_the_head_of_every_frame():
-    centres = np.linspace(600, 1000, 50)
-    boxes = np.array([face_box(x, 500, 200, 1920, 1080) for x in centres])
+    centers = np.linspace(600, 1000, 50)
+    boxes = np.array([face_box(x, 500, 200, 1920, 1080) for x in centers])
     boxes[7] = np.nan
     crop = choose_crop(boxes, 1920, 1080, 512)
     assert (crop.width, crop.height) == (512, 512)
-    for x in centres[1:-1]:
+    for x in centers[1:-1]:
         corners = crop.to_output(np.array([[x - 200, 300], [x + 200, 700]]))
         assert (corners >= 0).all()
         assert (corners <= 512).all()
@@ -34,9 +34,9 @@ def test_one_false_detection_does_not_widen_the_crop():
     assert choose_crop(boxes, 1920, 1080, 512) == narrow
 
 
-@pytest.mark.parametrize("centre", [(30, 30), (1900, 1060), (960, 1070)])
-def test_crop_stays_inside_the_picture(centre):
-    x, y = centre
+@pytest.mark.parametrize("center", [(30, 30), (1900, 1060), (960, 1070)])
+def test_crop_stays_inside_the_picture(center):
+    x, y = center
     crop = choose_crop(face_box(x, y, 300, 1920, 1080)[None], 1920, 1080, 512)
     assert crop.left >= 0
     assert crop.top >= 0

@@ -14,7 +14,7 @@ from mien.capture.video import count_frames, probe_video, read_video_frames
 from mien.cli import main
 
 BT2020, BT709 = (0.2627, 0.0593), (0.2126, 0.0722)
-COLOURS = np.array([[200, 120, 100], [90, 60, 50], [40, 90, 60], [20, 30, 120], [128, 128, 128], [0, 0, 0]])
+COLORS = np.array([[200, 120, 100], [90, 60, 50], [40, 90, 60], [20, 30, 120], [128, 128, 128], [0, 0, 0]])
 """Colours of sRGB below the knee, like those of faces."""
 
 
@@ -44,15 +44,15 @@ def hdr_signal(light, transfer):
 
 
 @pytest.mark.parametrize("transfer", [PQ, HLG])
-def test_hdr_comes_back_as_the_colours_it_was_made_of(tmp_path, transfer):
+def test_hdr_comes_back_as_the_colors_it_was_made_of(tmp_path, transfer):
     path = tmp_path / "hdr.mkv"
-    light = to_bt2020(light_of(COLOURS))
+    light = to_bt2020(light_of(COLORS))
     signal = np.repeat(np.repeat(hdr_signal(light, transfer)[None], 8, axis=0), 8, axis=1)
     write_planes(path, [to_planes(signal, BT2020, 10)], "yuv444p10le", (9, 9, transfer, 1))
     assert probe_video(path).hdr == {PQ: "PQ", HLG: "HLG"}[transfer]
     _, picture = next(read_video_frames(path))
     found = picture[4, 4::8].astype(int)
-    assert np.abs(found - COLOURS).max() <= 3, found
+    assert np.abs(found - COLORS).max() <= 3, found
 
 
 def test_hdr_highlights_are_pressed_together_without_a_step(tmp_path):
@@ -60,11 +60,11 @@ def test_hdr_highlights_are_pressed_together_without_a_step(tmp_path):
     levels = np.linspace(0, 1200 / 203, 200)
     signal = hdr_signal(to_bt2020(np.repeat(levels[:, None], 3, axis=1)), PQ)
     write_planes(path, [to_planes(np.repeat(signal[None], 4, axis=0), BT2020, 10)], "yuv444p10le", (9, 9, PQ, 1))
-    grey = next(read_video_frames(path))[1][1].astype(int)
-    assert np.ptp(grey, axis=1).max() <= 2  # grey stays grey
-    assert (np.diff(grey[:, 1]) >= 0).all()
-    assert 230 <= grey[np.searchsorted(levels, 1.0), 1] <= 245  # diffuse white
-    assert (grey[levels >= 1000 / 203, 1] == 255).all()
+    gray = next(read_video_frames(path))[1][1].astype(int)
+    assert np.ptp(gray, axis=1).max() <= 2  # grey stays grey
+    assert (np.diff(gray[:, 1]) >= 0).all()
+    assert 230 <= gray[np.searchsorted(levels, 1.0), 1] <= 245  # diffuse white
+    assert (gray[levels >= 1000 / 203, 1] == 255).all()
     np.testing.assert_allclose(roll_off(np.array([0.75, 1000 / 203, 50.0])), [0.75, 1, 1])
     slope = np.diff(roll_off(np.array([0.75, 0.7501])))
     np.testing.assert_allclose(slope, 1e-4, rtol=1e-3)
@@ -73,8 +73,8 @@ def test_hdr_highlights_are_pressed_together_without_a_step(tmp_path):
 def test_ten_bits_are_rounded_exactly(tmp_path):
     path = tmp_path / "ramp.mkv"
     ramp = np.tile(np.arange(64, 941, dtype=np.uint16), (4, 1))
-    grey = np.full_like(ramp, 512)
-    write_planes(path, [np.stack([ramp, grey, grey])], "yuv444p10le")
+    gray = np.full_like(ramp, 512)
+    write_planes(path, [np.stack([ramp, gray, gray])], "yuv444p10le")
     _, picture = next(read_video_frames(path))
     exact = (ramp[0].astype(float) - 64) * 255 / 876
     assert np.abs(picture[0] - exact[:, None]).max() <= 0.51

@@ -10,7 +10,7 @@ import pytest
 from capture_helpers import face_picture
 from mien.capture import CaptureSettings, capture_video
 from mien.capture.faces import LandmarkDetector
-from mien.capture.quality import measure_face, quality_report, relative_quality, skin_colours
+from mien.capture.quality import measure_face, quality_report, relative_quality, skin_colors
 from mien.capture.tone import srgb_signal
 from mien.capture.video import read_lazily, read_video_frames, write_video
 from mien.cli import main
@@ -109,7 +109,7 @@ def lit(picture: np.ndarray, light: tuple[float, float, float]) -> np.ndarray:
 def test_a_cast_is_told_with_its_remedy_and_is_in_the_report(face, tmp_path, capsys, cast):
     wide = np.pad(face, ((30, 30), (60, 60), (0, 0)), mode="edge")
     said, report = capture_said(tmp_path, capsys, [lit(wide, TINTS.get(cast, (1.0, 1.0, 1.0)))] * 4)
-    assert report["colour_cast"] == (cast or None)
+    assert report["color_cast"] == (cast or None)
     warned = [line.removeprefix("warning: clip: ") for line in said.splitlines() if line.startswith("warning:")]
     assert report["hints"] == warned
     assert len(warned) == bool(cast)
@@ -121,15 +121,15 @@ def test_a_cast_is_told_with_its_remedy_and_is_in_the_report(face, tmp_path, cap
 def seen_at(picture: np.ndarray, corners: np.ndarray) -> tuple[str, bool]:
     """Return the cast of a face in a picture, and whether it counts as dark."""
     measured = measure_face(picture, corners)
-    report = quality_report("clip", relative_quality(measured[None]), skin_colours(measured[None]))
-    return report["colour_cast"] or "", report["dark"]
+    report = quality_report("clip", relative_quality(measured[None]), skin_colors(measured[None]))
+    return report["color_cast"] or "", report["dark"]
 
 
 def check_light(picture: np.ndarray, corners: np.ndarray) -> None:
     """Check that a face has no cast as it is and in black and white, and that coloured and dim light are told."""
     assert seen_at(picture, corners) == ("", False)
-    grey = np.repeat(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
-    assert seen_at(grey, corners) == ("", False)
+    gray = np.repeat(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
+    assert seen_at(gray, corners) == ("", False)
     for cast, light in TINTS.items():
         assert seen_at(lit(picture, light), corners)[0] == cast
     assert seen_at(lit(picture, (0.05, 0.05, 0.05)), corners) == ("", True)

@@ -21,17 +21,17 @@ def test_written_frames_are_read_back(tmp_path):
     assert info.fps == pytest.approx(29.97, abs=1e-4)
 
 
-def test_colours_keep_their_level(tmp_path):
+def test_colors_keep_their_level(tmp_path):
     """Colours keep their level.
 
     Wrong matrices or ranges shift whole colours, which a mean over a picture would hide.
     """
-    colours = np.array([[200, 30, 40], [30, 180, 60], [20, 60, 220], [128, 128, 128], [255, 255, 255], [0, 0, 0]])
-    for colour in colours.astype(np.uint8):
-        path = tmp_path / "colour.mp4"
-        write_video(path, [np.broadcast_to(colour, (32, 32, 3)).copy()] * 2, 25, crf=1)
+    colors = np.array([[200, 30, 40], [30, 180, 60], [20, 60, 220], [128, 128, 128], [255, 255, 255], [0, 0, 0]])
+    for color in colors.astype(np.uint8):
+        path = tmp_path / "color.mp4"
+        write_video(path, [np.broadcast_to(color, (32, 32, 3)).copy()] * 2, 25, crf=1)
         _, frame = next(read_video_frames(path))
-        assert np.abs(frame.astype(int) - colour).max() <= 3, colour
+        assert np.abs(frame.astype(int) - color).max() <= 3, color
 
 
 def test_equal_pictures_give_equal_files(tmp_path):

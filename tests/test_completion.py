@@ -78,7 +78,7 @@ def test_a_triangle_without_a_counterpart_has_no_mirror_image(anny):
 # Completion -----------------------------------------------------------------------------------------------------------
 
 
-def test_seen_colours_are_untouched(anny):
+def test_seen_colors_are_untouched(anny):
     random = torch.Generator().manual_seed(2)
     colors = torch.rand(len(anny.faces), 3, generator=random)
     seen = (torch.rand(len(anny.faces), generator=random) > 0.5).float()
@@ -88,7 +88,7 @@ def test_seen_colours_are_untouched(anny):
         assert torch.equal(completed[seen == 1], colors[seen == 1])
 
 
-def test_an_unseen_side_gets_the_mirror_images_colours(anny):
+def test_an_unseen_side_gets_the_mirror_images_colors(anny):
     """A mole on one cheek appears on the other, which the camera did not see."""
     colors = _painted(anny)
     middles = _middles(anny)

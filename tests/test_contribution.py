@@ -15,7 +15,7 @@ from mien.gaussians import rgb_from_sh, sh_from_rgb
 from mien.render import rasterize
 from mien.training import PRESETS
 from mien.training.footage.coverage import triangle_views
-from mien.training.whole_head.contribution import contributions, tidy
+from mien.training.whole_head.contribution import contributions, prune_hidden
 from mien.training.whole_head.unseen import Unseen
 from toy_scene import surface_of
 
@@ -39,15 +39,15 @@ def _closed_avatar(model: FaceModel) -> GaussianAvatars:
     avatar = method_named("gaussian_avatars").avatar(config, model, _view(model)[0])
     assert isinstance(avatar, GaussianAvatars)
     every = torch.ones(len(model.faces), dtype=torch.bool)
-    surface_of(avatar).furnish(every, 0.97, torch.full((len(model.faces), 3), 0.6))
+    surface_of(avatar).fill_interior(every, 0.97, torch.full((len(model.faces), 3), 0.6))
     return avatar
 
 
-def _unseen(model: FaceModel, made_up: torch.Tensor) -> Unseen:
+def _unseen(model: FaceModel, filled_in: torch.Tensor) -> Unseen:
     parts = head_parts(model)
     prior = SurfacePrior(
-        0.01 * parts.scalp.float(), colors=torch.full((len(model.faces), 3), _COLOR), made_up=made_up,
-        closed=made_up | parts.interior,
+        0.01 * parts.scalp.float(), colors=torch.full((len(model.faces), 3), _COLOR), filled_in=filled_in,
+        closed=filled_in | parts.interior,
     )  # fmt: skip
     return Unseen(None, prior)
 
@@ -96,7 +96,7 @@ def test_of_hidden_copies_one_stays(anny):
     rows, n = back.nonzero()[:, 0], len(avatar.store)
     _doubled(avatar.store, rows)
     _doubled(avatar.store, rows)
-    removed = tidy(avatar, _unseen(anny, _none(anny)), [view], close=True)
+    removed = prune_hidden(avatar, _unseen(anny, _none(anny)), [view], close=True)
     bound, stay = avatar.store["face_index"], (~removed).long()
     assert len(removed) == n + 2 * len(rows)
     left = torch.zeros(len(anny.faces), dtype=torch.long).index_add(0, bound, stay)
@@ -113,19 +113,19 @@ def test_hidden_copies_below_what_is_shown_go(anny):
     _doubled(avatar.store, rows)
     means = avatar.store["means"].detach()
     means[n:, 1] -= 0.01 / surface_of(avatar).sizes[rows]
-    removed = tidy(avatar, _unseen(anny, _none(anny)), [view], close=True)
+    removed = prune_hidden(avatar, _unseen(anny, _none(anny)), [view], close=True)
     assert not removed[rows].any()
     assert float(removed[n:].float().mean()) > 0.8
 
 
 @pytest.mark.parametrize("close", [True, False])
-def test_what_stays_becomes_a_surface_in_completed_colours(anny, close):
+def test_what_stays_becomes_a_surface_in_completed_colors(anny, close):
     avatar, view, back = _closed_avatar(anny), _view(anny), _back(anny)
     store, unseen = avatar.store, _unseen(anny, _none(anny))
     store.assign("opacity_logits", torch.full_like(store["opacity_logits"], -1.0))
     store.assign("opacity_logits", torch.where(back, -3.0, 4.0))
     store.assign("offset_basis", torch.ones_like(store["offset_basis"]))
-    tidy(avatar, unseen, [view], close=close)
+    prune_hidden(avatar, unseen, [view], close=close)
     torch.testing.assert_close(rgb_from_sh(store["sh_constant"][back, 0]), torch.full((int(back.sum()), 3), _COLOR))
     shapes = triangle_ellipses(anny.head_vertices(avatar.subject)[0], anny.faces)[1]
     height = store["means"].detach()[:, 1] * surface_of(avatar).sizes
@@ -147,7 +147,7 @@ def test_made_up_sides_and_the_mouth_are_left_alone(anny):
     rows = (back | inside).nonzero()[:, 0]
     _doubled(avatar.store, rows)
     before = avatar.store["sh_constant"].detach().clone()
-    removed = tidy(avatar, _unseen(anny, back), [view], close=True)
+    removed = prune_hidden(avatar, _unseen(anny, back), [view], close=True)
     own = (back | inside)[avatar.store["face_index"]]
     assert not removed[own].any()
     assert torch.equal(avatar.store["sh_constant"].detach()[own], before[own])

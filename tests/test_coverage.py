@@ -73,7 +73,7 @@ def test_the_front_is_seen_and_the_back_is_not(toy: tuple[FaceModel, Sequence]) 
     assert torch.equal(threaded.seen, found.seen)
 
 
-def test_colours_are_those_of_the_pictures(toy: tuple[FaceModel, Sequence]) -> None:
+def test_colors_are_those_of_the_pictures(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
     painted = replace(sequence, capture=replace(sequence.capture, images=np.full_like(sequence.capture.images, 51)))
     found = covered((model, painted))
@@ -127,28 +127,28 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     unseen = known(toy, avatar)
     surface_of(avatar).close(unseen.prior)
-    made_up = unseen.made_up(avatar)
-    assert made_up is not None
-    assert made_up.any()
-    assert not made_up.all()
+    filled_in = unseen.filled_in(avatar)
+    assert filled_in is not None
+    assert filled_in.any()
+    assert not filled_in.all()
     assert unseen.weights(Photometric(alpha_weight=0.0)).alpha_weight > 0
     behind = replace(sequence.tracking.face[0], head_rotation=torch.tensor([[0.0, 3.0, 0.0]]))
     rendering = rasterize(avatar.pose(behind).gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3))
     rendering.image[:, :24].sum().backward()
     store = avatar.gaussian_store()
     before = {name: gradient.clone() for name in store.trained if (gradient := store[name].grad) is not None}
-    assert before["sh_constant"][made_up].any()
-    unseen.guard(avatar, rendering)
+    assert before["sh_constant"][filled_in].any()
+    unseen.mask_gradients(avatar, rendering)
     for name, gradient in before.items():
         guarded = store[name].grad
         assert guarded is not None
-        assert torch.equal(guarded[~made_up], gradient[~made_up])
+        assert torch.equal(guarded[~filled_in], gradient[~filled_in])
         if name != "means":
-            assert not guarded[made_up].any()
+            assert not guarded[filled_in].any()
     moved = store["means"].grad
     assert moved is not None
-    assert moved[made_up][:, 1].any()
-    assert not moved[made_up][:, [0, 2]].any()
+    assert moved[filled_in][:, 1].any()
+    assert not moved[filled_in][:, [0, 2]].any()
 
 
 def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> None:
@@ -157,18 +157,18 @@ def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> 
     unseen = known(toy, avatar)
     surface_of(avatar).close(unseen.prior)
     before = avatar.gaussian_store()["opacity_logits"].sigmoid()
-    control, fills = spare_fills(avatar, avatar.density(), unseen), unseen.made_up(avatar)
+    control, fills = spare_fills(avatar, avatar.density(), unseen), unseen.filled_in(avatar)
     assert isinstance(control, GradientDensity)
     assert fills is not None
     assert control.settings.max_gaussians == GaussianAvatarsConfig().density.max_gaussians + int(fills.sum())
     density = density_strategy(control, avatar.gaussian_store())
     posed = avatar.pose(sequence.tracking.face[0])
     density.adapt(avatar.gaussian_store(), posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
-    opacities, made_up = avatar.gaussian_store()["opacity_logits"].sigmoid(), unseen.made_up(avatar)
-    assert made_up is not None
-    assert opacities[made_up].equal(before[made_up])
-    assert (opacities[made_up] > 0.69).all(), "fills have 0.97, and strands 0.7"
-    assert (opacities[~made_up] < 0.011).all()
+    opacities, filled_in = avatar.gaussian_store()["opacity_logits"].sigmoid(), unseen.filled_in(avatar)
+    assert filled_in is not None
+    assert opacities[filled_in].equal(before[filled_in])
+    assert (opacities[filled_in] > 0.69).all(), "fills have 0.97, and strands 0.7"
+    assert (opacities[~filled_in] < 0.011).all()
 
 
 def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> None:
@@ -176,7 +176,7 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
     avatar = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, sequence.tracking.face)
     unseen = known(toy, avatar)
     assert unseen.coverage is not None
-    assert unseen.made_up(avatar) is None
+    assert unseen.filled_in(avatar) is None
     weights = Photometric(alpha_weight=0.0)
     assert unseen.weights(weights) == weights
     density = avatar.density()
@@ -188,10 +188,10 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     """From behind, where nothing was seen, the head is opaque and has the colours of the fill."""
     model, sequence = toy
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
-    made_up = facing(model) <= 0
-    colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(made_up), 3)
-    surface_of(avatar).close(SurfacePrior(torch.zeros(len(made_up)), None, colors, made_up.float(), made_up))
-    assert len(avatar.gaussian_store()) == len(made_up)
+    filled_in = facing(model) <= 0
+    colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(filled_in), 3)
+    surface_of(avatar).close(SurfacePrior(torch.zeros(len(filled_in)), None, colors, filled_in.float(), filled_in))
+    assert len(avatar.gaussian_store()) == len(filled_in)
     vertices = model.head_vertices(avatar.subject)[0]
     camera = view_of_head(vertices, 180)
     turned = replace(avatar.subject, head_rotation=torch.zeros(1, 3), head_translation=torch.zeros(1, 3))
@@ -200,19 +200,19 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     assert rendering.alpha[middle, middle].min() > 0.95
     color = rendering.image[middle, middle].reshape(-1, 3).mean(0)
     torch.testing.assert_close(color, colors[0], atol=0.03, rtol=0)
-    hair = SurfacePrior(torch.full((len(made_up),), 0.02), None, colors, made_up.float(), made_up)
+    hair = SurfacePrior(torch.full((len(filled_in),), 0.02), None, colors, filled_in.float(), filled_in)
     surface_of(avatar).close(hair)
     assert (avatar.gaussian_store()["means"][:, 1] > 0).all()
 
 
-def test_colours_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Sequence]) -> None:
+def test_colors_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
     avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
     doubt = (facing(model) <= 0).float()
     before = avatar.gaussian_store()["sh_constant"].detach().clone()
     prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt)
     for _ in range(200):
-        surface_of(avatar).keep_to(replace(prior, made_up=doubt > 0))
+        surface_of(avatar).keep_to(replace(prior, filled_in=doubt > 0))
     assert torch.equal(avatar.gaussian_store()["sh_constant"], before), "what is made up keeps its colours"
     for _ in range(200):
         surface_of(avatar).keep_to(prior)
@@ -237,18 +237,18 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Seque
     torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
 
 
-@pytest.mark.parametrize(("hair", "loose"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
-def test_limits_keep_gaussians_on_the_surface(hair: float, loose: float) -> None:
+@pytest.mark.parametrize(("hair", "widen"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
+def test_limits_keep_gaussians_on_the_surface(hair: float, widen: float) -> None:
     torch.manual_seed(0)
     count, limits = 200, SurfaceLimits(enabled=True)
     values = {"means": torch.randn(count, 3), "quats": torch.randn(count, 4), "log_scales": torch.randn(count, 3)}
     store = GaussianStore(values, {"face_index": torch.arange(count) % 5})
     sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
-    looseness = torch.full((5,), loose)
-    keep_on_surface(store, limits, sizes, torch.full((5,), hair), looseness)
+    widening = torch.full((5,), widen)
+    keep_on_surface(store, limits, sizes, torch.full((5,), hair), widening)
     size = sizes[store["face_index"]]
     height, scales = store["means"][:, 1] * size, store["log_scales"].exp() * size[:, None]
-    depth, thickness = loose * limits.depth, loose * limits.thickness
+    depth, thickness = widen * limits.depth, widen * limits.thickness
     assert (height <= depth + limits.hair_share * hair + 1e-7).all()
     assert (height >= -depth - 1e-7).all()
     assert (height.abs() > 0.9 * depth).any()
@@ -257,9 +257,9 @@ def test_limits_keep_gaussians_on_the_surface(hair: float, loose: float) -> None
     assert (flat <= limits.width + limits.hair_width * hair + 1e-7).all()
     assert (flat.amax(1) / flat.amin(1) <= limits.ratio * 1.0001).all()
     normal = matrix_from_quaternion(torch.nn.functional.normalize(store["quats"], dim=1))[:, 1, 1]
-    assert (normal >= math.cos(math.radians(loose * limits.tilt)) - 1e-5).all()
+    assert (normal >= math.cos(math.radians(widen * limits.tilt)) - 1e-5).all()
     before = {name: store[name].clone() for name in store.names()}
-    keep_on_surface(store, limits, sizes, torch.full((5,), hair), looseness)
+    keep_on_surface(store, limits, sizes, torch.full((5,), hair), widening)
     for name, value in before.items():
         torch.testing.assert_close(store[name], value)
 
@@ -318,9 +318,9 @@ def test_a_filled_avatar_is_exported_as_it_is_posed(toy: tuple[FaceModel, Sequen
     """Fills are Gaussians like all others in each format: .mien, .ply, .glb and .html."""
     model, sequence = toy
     avatar = train([sequence], model, GaussianAvatarsConfig(), SETTINGS, tmp_path / "run")
-    made_up = known(toy, avatar).made_up(avatar)
-    assert made_up is not None
-    assert made_up.any()
+    filled_in = known(toy, avatar).filled_in(avatar)
+    assert filled_in is not None
+    assert filled_in.any()
     portable = make_portable(avatar, sequence.tracking.cameras[0], "filled")
     runtime.write_portable(tmp_path / "a.mien", portable)
     carried = runtime.load(tmp_path / "a.mien")
@@ -333,7 +333,7 @@ def test_a_filled_avatar_is_exported_as_it_is_posed(toy: tuple[FaceModel, Sequen
         expected = getattr(posed, name)
         torch.testing.assert_close(torch.from_numpy(getattr(ours, name)), expected, atol=1e-6, rtol=1e-4)
         torch.testing.assert_close(getattr(ply, name), expected, atol=1e-6, rtol=1e-4)
-    assert (posed.opacities[made_up] > 0.69).all()
+    assert (posed.opacities[filled_in] > 0.69).all()
     baked = portable.baked
     assert isinstance(baked, runtime.MeshBound)
     unwrapped = MeshModel(baked.rig, baked.faces, model.uv.numpy(), model.uv_faces.numpy())

@@ -51,8 +51,8 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def part(number: int, timesteps: int) -> tuple[Capture, Tracking]:
     _, sequence = toy_sequence(timesteps, 32)
     face = replace(sequence.tracking.face, head_rotation=torch.full((timesteps, 3), 0.01 * number))
-    grey = np.full_like(sequence.capture.images, 10 * number)
-    return replace(sequence.capture, images=grey), replace(sequence.tracking, face=face)
+    gray = np.full_like(sequence.capture.images, 10 * number)
+    return replace(sequence.capture, images=gray), replace(sequence.tracking, face=face)
 
 
 def test_a_video_with_cuts_drives_part_after_part(video: Path) -> None:

@@ -94,45 +94,45 @@ def test_other_face_models_are_refused() -> None:
         drive(other, neutral_of(other), neutral_of(_face(3)))
 
 
-def test_turntable_keeps_the_centre_in_its_place() -> None:
+def test_turntable_keeps_the_center_in_its_place() -> None:
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     camera = camera_from_fov(0.5, 64, 48, viewmat)
-    centre = torch.tensor([0.02, 0.05, -0.6])
-    path = turntable(camera, centre, 8)
-    place, depth = camera.project(centre)
+    center = torch.tensor([0.02, 0.05, -0.6])
+    path = turntable(camera, center, 8)
+    place, depth = camera.project(center)
     for view in path:
-        pixel, far = view.project(centre)
+        pixel, far = view.project(center)
         torch.testing.assert_close(pixel, place, atol=1e-3, rtol=0)
         torch.testing.assert_close(far, depth)
         assert float(view.position[1]) == pytest.approx(0, abs=1e-6)
     torch.testing.assert_close(path[0].viewmat, camera.viewmat)
     # A quarter turn, counter-clockwise from above (from +z towards +x), looks along -x.
-    torch.testing.assert_close(path[2].position, centre + torch.tensor([0.6, -0.05, 0.02]), atol=1e-6, rtol=0)
-    opposite = path[4].position - centre
+    torch.testing.assert_close(path[2].position, center + torch.tensor([0.6, -0.05, 0.02]), atol=1e-6, rtol=0)
+    opposite = path[4].position - center
     torch.testing.assert_close(opposite, torch.tensor([0.02, -0.05, -0.6]), atol=1e-5, rtol=0)
 
 
 def test_swing_stays_within_its_span() -> None:
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
-    centre = torch.tensor([0.0, 0.0, -0.6])
-    path = turntable(camera, centre, 8, span=1.0)
-    torch.testing.assert_close(path[2].viewmat, orbit(camera, centre, 0.5).viewmat)
-    torch.testing.assert_close(path[6].viewmat, orbit(camera, centre, -0.5).viewmat)
+    center = torch.tensor([0.0, 0.0, -0.6])
+    path = turntable(camera, center, 8, span=1.0)
+    torch.testing.assert_close(path[2].viewmat, orbit(camera, center, 0.5).viewmat)
+    torch.testing.assert_close(path[6].viewmat, orbit(camera, center, -0.5).viewmat)
     torch.testing.assert_close(path[4].viewmat, camera.viewmat, atol=1e-6, rtol=0)
 
 
 def test_a_camera_aside_looks_at_the_same_place() -> None:
     """A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit."""
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
-    centre = torch.tensor([0.0, 0.0, -0.6])
-    left = aside(camera, centre, math.pi / 2, 0.0).position - centre
+    center = torch.tensor([0.0, 0.0, -0.6])
+    left = aside(camera, center, math.pi / 2, 0.0).position - center
     torch.testing.assert_close(left, torch.tensor([0.6, 0.0, 0.0]), atol=1e-6, rtol=0)
-    above = aside(camera, centre, 0.0, math.pi / 6).position - centre
+    above = aside(camera, center, 0.0, math.pi / 6).position - center
     torch.testing.assert_close(above, torch.tensor([0.0, 0.3, 0.6 * math.sqrt(0.75)]), atol=1e-6, rtol=0)
-    both = aside(camera, centre, math.pi / 2, math.pi / 6)
+    both = aside(camera, center, math.pi / 2, math.pi / 6)
     torch.testing.assert_close(
-        both.position - centre, torch.tensor([0.6 * math.sqrt(0.75), 0.3, 0.0]), atol=1e-6, rtol=0
+        both.position - center, torch.tensor([0.6 * math.sqrt(0.75), 0.3, 0.0]), atol=1e-6, rtol=0
     )
-    pixel, _ = both.project(centre)
-    torch.testing.assert_close(pixel, camera.project(centre)[0], atol=1e-3, rtol=0)
-    assert aside(camera, centre, 0.0, 0.0).viewmat.equal(camera.viewmat)
+    pixel, _ = both.project(center)
+    torch.testing.assert_close(pixel, camera.project(center)[0], atol=1e-3, rtol=0)
+    assert aside(camera, center, 0.0, 0.0).viewmat.equal(camera.viewmat)

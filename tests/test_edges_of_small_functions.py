@@ -84,9 +84,9 @@ def test_normals_of_triangles_point_to_where_corners_run_counterclockwise() -> N
 
 
 def test_a_figure_eight_crosses_itself_in_the_middle_and_an_oval_does_not() -> None:
-    camera, centre = toy_camera(64), torch.tensor([0.0, 0.0, -0.5])
+    camera, center = toy_camera(64), torch.tensor([0.0, 0.0, -0.5])
     for crossing in (True, False):
-        places = torch.stack([view.position for view in sway(camera, centre, 8, 0.6, 0.2, crossing)])
+        places = torch.stack([view.position for view in sway(camera, center, 8, 0.6, 0.2, crossing)])
         height, side = places[:, 1], places[:, 0]
         assert float(side[2]) > 0.1 > -0.1 > float(side[6])
         # A quarter of the way it is farthest to one side. A figure eight is at half its height there.
@@ -107,11 +107,11 @@ def test_the_first_of_chosen_timesteps_keeps_its_pictures() -> None:
     assert some.detected[:, 0, 0].tolist() == [0, 2, 8]
 
 
-def test_a_guided_filter_is_the_locally_affine_fit_to_colours() -> None:
+def test_a_guided_filter_is_the_locally_affine_fit_to_colors() -> None:
     """Values that are affine in the guide stay, with channels that vary together, as in real pictures."""
     random = np.random.default_rng(5)
-    grey = random.random((40, 40, 1))
-    guide = (0.7 * grey + 0.3 * random.random((40, 40, 3))).astype(np.float32)
+    gray = random.random((40, 40, 1))
+    guide = (0.7 * gray + 0.3 * random.random((40, 40, 3))).astype(np.float32)
     guide = np.repeat(np.repeat(guide, 2, 0), 2, 1)  # The filter works on every second pixel.
     values = guide @ np.array([0.6, -0.4, 0.8], np.float32) + 0.1
     found = guided_filter(guide, values, 8, 1e-7)

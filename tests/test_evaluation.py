@@ -65,7 +65,7 @@ def test_mean_frame_is_the_mean_of_training_targets_only(experiment: Experiment)
     torch.testing.assert_close(mean, stack.mean(0), atol=1e-5, rtol=0)
 
 
-def test_mesh_baseline_wears_the_colours_it_saw(experiment: Experiment) -> None:
+def test_mesh_baseline_wears_the_colors_it_saw(experiment: Experiment) -> None:
     """Vertex colours equal the paint where the camera looks, and the mesh baseline beats the mean frame."""
     baselines = make_baselines(experiment)
     template = experiment.avatar.face_model.template
@@ -209,7 +209,7 @@ def test_perceptual_metric_on_some_frames_only(experiment: Experiment, evaluatio
     assert content["perceptual"] == pytest.approx((known[0] + known[4] + known[8]) / 3)
 
 
-def test_spans_join_neighbours() -> None:
+def test_spans_join_neighbors() -> None:
     assert spans([]) == ()
     assert spans([3, 4, 5, 9]) == ((2.5, 5.5), (8.5, 9.5))
 

@@ -28,11 +28,11 @@ def disc(size: int = 64) -> np.ndarray:
     rows, columns = np.mgrid[:size, :size] + 0.5
     distance = np.hypot(rows - size / 2, columns - size / 2)
     alpha = np.clip((size / 3 - distance) / 4 + 0.5, 0, 1).astype(np.float32)
-    colours = np.broadcast_to(np.array([0.8, 0.3, 0.2], np.float32), (size, size, 3))
-    return to_rgba(colours * alpha[..., None], alpha)
+    colors = np.broadcast_to(np.array([0.8, 0.3, 0.2], np.float32), (size, size, 3))
+    return to_rgba(colors * alpha[..., None], alpha)
 
 
-def test_colours_are_straight() -> None:
+def test_colors_are_straight() -> None:
     picture = disc()
     seen = picture[..., 3] > 8
     assert np.abs(picture[seen][:, :3].astype(int) - [204, 77, 51]).max() <= 1
@@ -56,10 +56,10 @@ def test_webm_keeps_alpha_and_outlines_have_no_fringe(tmp_path: Path) -> None:
             frames += [straight(frame) for frame in decoder.decode(packet if packet.size else None)]
     assert len(frames) == 3
     expected = np.pad(disc(65), ((0, 1), (0, 1), (0, 0)), mode="edge")
-    colours, alpha = frames[1]
+    colors, alpha = frames[1]
     assert np.abs(alpha.astype(int) - expected[..., 3]).mean() < 1
     edge = (expected[..., 3] > 40) & (expected[..., 3] < 220)
-    assert np.abs(colours[edge].astype(int) - [204, 77, 51]).max() < 25, "black bleeds into the outline"
+    assert np.abs(colors[edge].astype(int) - [204, 77, 51]).max() < 25, "black bleeds into the outline"
 
 
 def straight(frame: av.VideoFrame) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +103,7 @@ def test_what_cannot_be_written_is_told_first(
 
 def test_options_of_pictures(tmp_path: Path) -> None:
     """Impossible sizes and colours of pictures are refused by name."""
-    assert PictureOptions(background="#3060a0").colour() == (48 / 255, 96 / 255, 160 / 255)
+    assert PictureOptions(background="#3060a0").color() == (48 / 255, 96 / 255, 160 / 255)
     for options, part in (
         (PictureOptions(size=8193), "--size 8193"),
         (PictureOptions(width=5), "--width 5"),
@@ -138,16 +138,16 @@ def test_other_shapes_keep_the_head_whole() -> None:
 
 
 def test_sway_loops_around_the_head() -> None:
-    camera, centre = camera_from_fov(0.5, 64, 64, FACING), torch.tensor([0.0, 0.0, -0.6])
-    views = sway(camera, centre, 8, math.radians(40), math.radians(20))
+    camera, center = camera_from_fov(0.5, 64, 64, FACING), torch.tensor([0.0, 0.0, -0.6])
+    views = sway(camera, center, 8, math.radians(40), math.radians(20))
     torch.testing.assert_close(views[0].viewmat, camera.viewmat, atol=1e-6, rtol=0)
     for view in views:
-        torch.testing.assert_close(view.project(centre)[0], torch.tensor([32.0, 32.0]), atol=1e-3, rtol=0)
-        assert float((view.position - centre).norm()) == pytest.approx(0.6, abs=1e-5)
-    right, high = views[2].position - centre, views[1].position
+        torch.testing.assert_close(view.project(center)[0], torch.tensor([32.0, 32.0]), atol=1e-3, rtol=0)
+        assert float((view.position - center).norm()) == pytest.approx(0.6, abs=1e-5)
+    right, high = views[2].position - center, views[1].position
     assert float(right[0]) == pytest.approx(0.6 * math.sin(math.radians(20)), abs=1e-5)
     assert float(high[1]) == pytest.approx(0.6 * math.sin(math.radians(10)), abs=1e-5)
-    oval = sway(camera, centre, 8, math.radians(40), math.radians(20), crossing=False)
+    oval = sway(camera, center, 8, math.radians(40), math.radians(20), crossing=False)
     assert float(oval[0].position[1]) == pytest.approx(0.6 * math.sin(math.radians(10)), abs=1e-5)
 
 

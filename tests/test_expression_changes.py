@@ -32,7 +32,7 @@ from mien.render.rendering import Rendering
 from mien.training import train
 from toy_scene import toy_camera, toy_face, toy_face_model, toy_sequence
 
-BASES = ("colour_basis", "opacity_basis", "offset_basis")
+BASES = ("color_basis", "opacity_basis", "offset_basis")
 PARTS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -124,7 +124,7 @@ def test_rank_0_is_the_method_without_changes() -> None:
     plain, none = (
         new_avatar(0),
         new_avatar(
-            4, expression_colour_rate=Rate(0.0), expression_opacity_rate=Rate(0.0), expression_offset_rate=Rate(0.0)
+            4, expression_color_rate=Rate(0.0), expression_opacity_rate=Rate(0.0), expression_offset_rate=Rate(0.0)
         ),
     )
     for avatar in (plain, none):
@@ -234,7 +234,7 @@ def test_impossible_changes_are_refused(tmp_path: Path) -> None:
     assert isinstance(baked, runtime.MeshBound)
     changes = baked.changes
     assert changes is not None
-    parts = {name: getattr(changes, name) for name in ("colour", "opacity_logits", "means")}
+    parts = {name: getattr(changes, name) for name in ("color", "opacity_logits", "means")}
     fixed = {name: getattr(changes, name) for name in ("rest", "directions", "reach")}
     none = {name: array[..., :0] for name, array in (parts | fixed).items() if name not in ("rest", "reach")}
     for wrong, part in (

@@ -123,26 +123,26 @@ def bowls(at: np.ndarray, depth: float = 400.0) -> np.ndarray:
     return depth * (POSITIONS - at[:, None]) ** 2
 
 
-def test_colours_that_agree_change_little():
+def test_colors_that_agree_change_little():
     tracked = 0.1 + 0.02 * np.random.default_rng(0).standard_normal(50)
     np.testing.assert_allclose(weigh_positions(bowls(tracked), tracked, 1.0), tracked, atol=0.02)
 
 
-def test_a_few_frames_that_disagree_follow_the_colours():
+def test_a_few_frames_that_disagree_follow_the_colors():
     tracked = np.full(50, 0.1)
     seen = tracked.copy()
     seen[20:23] = (0.5, 1.0, 0.5)
     np.testing.assert_allclose(weigh_positions(bowls(seen), tracked, 1.0), seen, atol=0.05)
 
 
-def test_colours_that_contradict_every_frame_count_for_nothing():
+def test_colors_that_contradict_every_frame_count_for_nothing():
     random = np.random.default_rng(0)
     tracked = np.full(50, 0.1)
     found = weigh_positions(bowls(random.uniform(0.0, 1.0, 50)), tracked, 1.0)
     np.testing.assert_allclose(found, tracked, atol=0.05)
 
 
-def test_what_colours_find_too_open_throughout_is_corrected_but_where_lids_meet():
+def test_what_colors_find_too_open_throughout_is_corrected_but_where_lids_meet():
     tracked = np.full(50, 0.2)
     tracked[30] = 0.5
     seen = np.full(50, 0.1)

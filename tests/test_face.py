@@ -138,7 +138,7 @@ def test_the_jaw_has_no_free_parameter(model):
 
 
 @pytest.mark.parametrize("side", ["left_eye", "right_eye"])
-def test_an_eye_turns_about_its_own_centre(model, side):
+def test_an_eye_turns_about_its_own_center(model, side):
     identity = 1.5 * someone(model, seed=3)
     rest, turned = model(posed(model, identity))[0], model(posed(model, identity, **{side: (0.1, 0.4, 0.0)}))[0]
     ball = joint_vertices(model, side)

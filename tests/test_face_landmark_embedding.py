@@ -75,11 +75,11 @@ def test_landmarks_of_lids_are_not_inside_the_eyeballs(few):
     model, landmarks, _ = few
     points = landmarks["mediapipe"].positions(model.template, model.faces)
     for name, lids in (("left_eye", LEFT_EYELIDS), ("right_eye", RIGHT_EYELIDS)):
-        centre = model.joint_template[model.joint_names.index(name)]
+        center = model.joint_template[model.joint_names.index(name)]
         ball = model.faces[model.region_mask("eyes", "irises")].unique()
-        ball = ball[model.template[ball, 0] * centre[0] > 0]
-        radius = (model.template[ball] - centre).norm(dim=1).median()
-        assert ((points[list(lids)] - centre).norm(dim=1) - radius).min() > -0.0015
+        ball = ball[model.template[ball, 0] * center[0] > 0]
+        radius = (model.template[ball] - center).norm(dim=1).median()
+        assert ((points[list(lids)] - center).norm(dim=1) - radius).min() > -0.0015
 
 
 def test_written_landmarks_are_read_by_the_loader(few, tmp_path, monkeypatch):

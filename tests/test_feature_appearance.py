@@ -31,7 +31,7 @@ from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_se
 RANK, DIRECTIONS = 3, 5
 CONFIG = GaussianAvatarsConfig(
     expression_rank=RANK,
-    expression_colour_rate=Rate(0.0),
+    expression_color_rate=Rate(0.0),
     appearance="features",
     appearance_directions=DIRECTIONS,
     appearance_features=6,
@@ -55,14 +55,14 @@ def new_avatar(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True) -
 
 
 def test_starts_as_without_features() -> None:
-    plain = GaussianAvatarsConfig(expression_rank=RANK, expression_colour_rate=Rate(0.0))
+    plain = GaussianAvatarsConfig(expression_rank=RANK, expression_color_rate=Rate(0.0))
     torch.manual_seed(0)
     static = GaussianAvatars(plain, toy_face_model(), toy_face(5))
     ours, theirs = (avatar.pose(toy_face(5)).gaussians for avatar in (new_avatar(filled=False), static))
     assert all(torch.equal(getattr(ours, part), getattr(theirs, part)) for part in PARTS)
 
 
-def test_colour_and_opacity_change_by_the_network() -> None:
+def test_color_and_opacity_change_by_the_network() -> None:
     """By the plain formula from the activations, the features and the triangles' places, in float64."""
     avatar, face = new_avatar(), toy_face(5)[2]
     assert avatar.appearance is not None
@@ -72,15 +72,15 @@ def test_colour_and_opacity_change_by_the_network() -> None:
     layers = avatar.appearance._layers()
     exact = Layers(*(tensor.double() for tensor in layers))
     bases, neutral = store["feature_bases"].double(), store["neutral_features"].double()
-    colour, opacity = feature_network_reference(bases, activations.double(), neutral, places.double(), exact)
+    color, opacity = feature_network_reference(bases, activations.double(), neutral, places.double(), exact)
     posed, still = avatar.pose(face).gaussians, replace(CONFIG, expression_rank=RANK, appearance="static")
     static = GaussianAvatars(still, toy_face_model(), toy_face(5))
     static.store.load_state_dict({name: store.state_dict()[name] for name in static.store.state_dict()})
     plain = static.pose(face).gaussians
     logits = store["opacity_logits"] + opacity + store["opacity_basis"] @ activations[:RANK]
-    torch.testing.assert_close(posed.sh.view(-1, 3).double(), store["sh_constant"][:, 0] + colour, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(posed.sh.view(-1, 3).double(), store["sh_constant"][:, 0] + color, atol=1e-6, rtol=1e-5)
     torch.testing.assert_close(posed.opacities.view(-1).double(), logits.sigmoid(), atol=1e-6, rtol=1e-5)
-    assert colour.abs().max() > 0.1
+    assert color.abs().max() > 0.1
     for part in ("means", "quats", "scales"):
         assert torch.equal(getattr(posed, part), getattr(plain, part))
 
@@ -120,7 +120,7 @@ def test_changes_have_a_penalty_of_their_own() -> None:
     radii = torch.zeros(count, dtype=torch.int32)
     rendering = Rendering(torch.zeros(4, 4, 3), torch.zeros(4, 4), radii, torch.zeros(count, 2))
     losses = avatar.regularizers(posed, rendering, Progress(0, 1))
-    squares = sum(posed.aux[name].square().mean() for name in ("feature_colour", "feature_opacity"))
+    squares = sum(posed.aux[name].square().mean() for name in ("feature_color", "feature_opacity"))
     torch.testing.assert_close(losses["appearance"], 0.5 * squares)
 
 

@@ -28,7 +28,7 @@ def _person(side: int, red: float = 150.0) -> np.ndarray:
     return np.array([red, 90.0, 60.0]) - np.where(np.arange(side) > side / 2, 20.0, 0.0)[:, None, None]
 
 
-def test_soft_edges_have_the_colour_of_the_person() -> None:
+def test_soft_edges_have_the_color_of_the_person() -> None:
     image, matte = _filmed()
     found = foreground_colors(image, matte)
     share, soft = matte[..., None] / 255.0, (matte > 0) & (matte < 252)

@@ -29,7 +29,7 @@ def rendering_of(radii: torch.Tensor) -> Rendering:
     return Rendering(torch.zeros(4, 4, 3), torch.zeros(4, 4), radii.int(), torch.zeros(len(radii), 2))
 
 
-def test_starts_with_one_grey_faint_gaussian_a_triangle() -> None:
+def test_starts_with_one_gray_faint_gaussian_a_triangle() -> None:
     avatar = new_avatar()
     face_model = avatar.face_model
     gaussians = avatar.pose(toy_face(5)).gaussians
@@ -40,7 +40,7 @@ def test_starts_with_one_grey_faint_gaussian_a_triangle() -> None:
     assert (rgb_from_sh(gaussians.sh) - 0.5).abs().max() < 0.002
 
 
-def test_first_colours_are_the_means_of_the_triangles_corners() -> None:
+def test_first_colors_are_the_means_of_the_triangles_corners() -> None:
     """Every Gaussian gets its own triangle's colour, also if the Gaussians are in another order than the triangles."""
     avatar = new_avatar(GaussianAvatarsConfig(sh_degree=1, first_colors="pictures"))
     assert surface_of(avatar).wants_first_colors

@@ -228,7 +228,7 @@ def test_the_same_avatar_gives_the_same_bytes(written: Path, portable: runtime.P
         write_glb(tmp_path / "b.glb", broken, mesh_model(portable), SIZE)
 
 
-def test_the_texture_has_the_colours_of_the_gaussians() -> None:
+def test_the_texture_has_the_colors_of_the_gaussians() -> None:
     """A head that is red on the left and blue on the right gets such a texture, also behind closed lips."""
     model = load_face_model("anny")
     avatar = GaussianAvatars(GaussianAvatarsConfig(), model, model.neutral())
@@ -237,20 +237,20 @@ def test_the_texture_has_the_colours_of_the_gaussians() -> None:
     assert isinstance(baked, runtime.MeshBound)
     vertices = rig_points(baked.rig, at_rest(plain))
     middle = vertices[baked.faces].mean(1)[baked.face_index]
-    colour = np.where(middle[:, :1] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]])
+    color = np.where(middle[:, :1] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]])
     n = len(baked.face_index)
     attributes = runtime.Attributes(
         np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         np.tile(np.log(np.array([0.5, 0.02, 0.5], np.float32)), (n, 1)),
         np.full(n, 6, np.float32),
-        ((colour - 0.5) / SH_C0).astype(np.float32)[:, None],
+        ((color - 0.5) / SH_C0).astype(np.float32)[:, None],
     )
     baked = replace(baked, attributes=attributes, means=np.zeros((n, 3), np.float32))
     gaussians = runtime.pose(baked, at_rest(plain))
     surface = Surface(model.faces, model.uv, model.uv_faces)
     texture = bake_texture(surface, [Shot(torch.from_numpy(vertices), gaussians)], 256)
-    centres = model.uv[model.uv_faces].mean(1).numpy()
-    texels = texture[((1 - centres[:, 1]) * 256).astype(int), (centres[:, 0] * 256).astype(int)]
+    centers = model.uv[model.uv_faces].mean(1).numpy()
+    texels = texture[((1 - centers[:, 1]) * 256).astype(int), (centers[:, 0] * 256).astype(int)]
     sides = vertices[baked.faces].mean(1)[:, 0]
     clear = np.abs(sides) > 0.02
     assert (np.sign(texels[:, 0] - texels[:, 2]) == np.sign(sides))[clear].mean() > 0.97

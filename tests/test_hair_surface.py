@@ -41,7 +41,7 @@ def _prior(model: FaceModel) -> SurfacePrior:
     scalp = head_parts(model).scalp
     back = scalp & (model.template[model.faces].mean(1)[:, 2] < 0)
     colors = torch.full((len(model.faces), 3), 0.3)
-    return SurfacePrior(_HAIR * scalp.float(), colors=colors, doubt=back.float(), made_up=back)
+    return SurfacePrior(_HAIR * scalp.float(), colors=colors, doubt=back.float(), filled_in=back)
 
 
 def _surface(avatar: GaussianAvatars, prior: SurfacePrior) -> HairSurface:
@@ -82,7 +82,7 @@ def test_hair_moves_against_the_slope(anny, slope):
     _pull(avatar, surface, slope, rounds=5)
     shift, scalp = surface.shift, head_parts(anny).scalp
     assert not shift[~scalp].any()
-    front = scalp & ~(prior.made_up if prior.made_up is not None else scalp)
+    front = scalp & ~(prior.filled_in if prior.filled_in is not None else scalp)
     assert (shift[front] * slope < -0.5 * _RATE).all()
     assert float((shift[front] * slope).median()) < -3 * _RATE
     moved = (avatar.store["means"].detach()[:, 1] - before) * surface_of(avatar).sizes

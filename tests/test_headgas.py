@@ -9,7 +9,7 @@ from torch import Tensor
 from mien.avatar import HeadGas, HeadGasConfig, Progress
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.headgas.avatar import input_directions, neighbour_distances, sample_surface, spread_out
+from mien.avatar.headgas.avatar import input_directions, neighbor_distances, sample_surface, spread_out
 from mien.avatar.headgas.settings import PRESET_STEPS, PRESETS
 from mien.avatar.settings import Photometric
 from mien.face import FaceModel, FaceParams, head_poses
@@ -65,7 +65,7 @@ def test_all_directions_span_the_inputs_and_few_the_largest_spread() -> None:
     torch.testing.assert_close((offsets - offsets.mean(0)) @ used @ torch.linalg.pinv(used), offsets - offsets.mean(0))
 
 
-def test_colour_and_opacity_are_the_networks_of_features_and_place() -> None:
+def test_color_and_opacity_are_the_networks_of_features_and_place() -> None:
     avatar, face = new_avatar(), toy_face(5)[2]
     fill(avatar.store["bases"])
     fill(avatar.store["neutral_features"], 2)
@@ -93,13 +93,13 @@ def test_nothing_moves_in_the_head_frame() -> None:
     assert torch.equal(avatar.pose(still).gaussians.sh, gaussians.sh)
 
 
-def test_starts_grey_faint_and_the_same_for_all_expressions() -> None:
+def test_starts_gray_faint_and_the_same_for_all_expressions() -> None:
     gaussians = new_avatar().pose(toy_face(5)).gaussians
     assert (gaussians.opacities - 0.1).abs().max() < 0.1
     assert torch.equal(gaussians.sh[0], gaussians.sh[3])
 
 
-def test_joints_change_colours_also_when_baked() -> None:
+def test_joints_change_colors_also_when_baked() -> None:
     avatar, face = new_avatar(), toy_face(5)
     fill(avatar.store["bases"])
     turned = replace(face, joints=face.joints + 0.2)
@@ -186,10 +186,10 @@ def test_points_are_on_the_mesh_evenly_by_area() -> None:
     torch.testing.assert_close(points[large, :2].mean(0), torch.ones(2), atol=0.05, rtol=0)
 
 
-def test_neighbour_distances_are_means_over_three() -> None:
+def test_neighbor_distances_are_means_over_three() -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [10, 0, 0]])
     expected = torch.tensor([2.0, (9 + 10 + 104**0.5) / 3])
-    torch.testing.assert_close(neighbour_distances(points)[[0, 4]], expected)
+    torch.testing.assert_close(neighbor_distances(points)[[0, 4]], expected)
 
 
 def test_positional_encoding_is_sines_and_cosines_of_octaves() -> None:

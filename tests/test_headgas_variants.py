@@ -64,7 +64,7 @@ def test_every_variant_has_parts() -> None:
 
 
 @ablation
-def test_starts_faint_grey_and_still(variant: Variant) -> None:
+def test_starts_faint_gray_and_still(variant: Variant) -> None:
     avatar, face = new_avatar(variant, disturbed=False), toy_face(5)
     gaussians = avatar.pose(face).gaussians
     assert (gaussians.opacities - 0.1).abs().max() < 0.1
@@ -106,7 +106,7 @@ def test_change_all_paints_too() -> None:
     assert set(avatar.regularizers(posed, rasterize(found, toy_camera(32), torch.ones(3)), Progress(1, 2))) == {"shift"}
 
 
-def test_no_mlp_averages_colours_and_opacities() -> None:
+def test_no_mlp_averages_colors_and_opacities() -> None:
     avatar, face = new_avatar("no_mlp"), toy_face(5)
     e = inputs_of(avatar, face)[2]
     total = 1 + e.abs().sum()

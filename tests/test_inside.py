@@ -16,7 +16,7 @@ from mien.training.density_control import density_strategy
 from mien.training.footage.frames import training_frames
 from mien.training.footage.hidden import hidden_triangles, inside_triangles
 from mien.training.footage.sequence import Targets
-from mien.training.whole_head.mouth_interior import Inside, disguise, disguised_reference
+from mien.training.whole_head.mouth_interior import Inside, cover_hidden, covered_reference
 from mien.training.whole_head.unseen import spare_fills, unseen_of
 from toy_scene import surface_of, toy_face, toy_sequence
 
@@ -107,17 +107,17 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
     frames = training_frames([sequence], SETTINGS)
     unseen = unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
     prior, inside = unseen.prior, inside_triangles(model)
-    assert prior.made_up is not None
+    assert prior.filled_in is not None
     assert prior.closed is not None
-    assert prior.looseness is not None
-    assert bool(prior.made_up[inside].all()) != opened
-    assert prior.made_up[inside].any()
+    assert prior.widening is not None
+    assert bool(prior.filled_in[inside].all()) != opened
+    assert prior.filled_in[inside].any()
     front = inside & (facing(model) > 0.94)
     assert front.any()
-    assert bool(prior.made_up[front].any()) != opened
+    assert bool(prior.filled_in[front].any()) != opened
     assert prior.closed[inside].all()
-    assert (prior.looseness[inside] > 1).all()
-    assert (prior.looseness[~inside] == 1).all()
+    assert (prior.widening[inside] > 1).all()
+    assert (prior.widening[~inside] == 1).all()
     surface_of(avatar).close(prior)
     store = avatar.gaussian_store()
     density = density_strategy(spare_fills(avatar, avatar.density(), unseen), store)
@@ -128,13 +128,13 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_hidden_gaussians_have_another_colour_and_do_not_fade(toy: tuple[FaceModel, Sequence], degree: int) -> None:
+def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceModel, Sequence], degree: int) -> None:
     model, sequence = toy
     config = GaussianAvatarsConfig(sh_degree=degree)
     avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
     hidden = model.face_regions == 1
     posed = avatar.pose(sequence.tracking.face[0])
-    changed = disguise(posed, avatar, hidden, torch.Generator().manual_seed(3))
+    changed = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(3))
     colors = rgb_from_sh(changed.gaussians.sh[hidden, 0])
     torch.testing.assert_close(colors, torch.rand(3, generator=torch.Generator().manual_seed(3)).expand_as(colors))
     assert not changed.gaussians.sh[hidden, 1:].any()
@@ -149,16 +149,16 @@ def test_hidden_gaussians_have_another_colour_and_do_not_fade(toy: tuple[FaceMod
         assert gradient[~hidden].any(), name
 
 
-def test_the_fast_disguise_is_the_reference(toy: tuple[FaceModel, Sequence]) -> None:
+def test_the_fast_cover_is_the_reference(toy: tuple[FaceModel, Sequence]) -> None:
     config = GaussianAvatarsConfig(sh_degree=1)
     avatar = METHODS["gaussian_avatars"].avatar(config, toy[0], toy[1].tracking.face)
     posed = avatar.pose(toy[1].tracking.face[0])
     sh, opacities = (getattr(posed.gaussians, name).detach().requires_grad_() for name in ("sh", "opacities"))
     hidden = torch.arange(len(sh)) % 3 == 0
     posed = replace(posed, gaussians=replace(posed.gaussians, sh=sh, opacities=opacities))
-    fast = disguise(posed, avatar, hidden, torch.Generator().manual_seed(5)).gaussians
+    fast = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(5)).gaussians
     color = sh_from_rgb(torch.rand(3, generator=torch.Generator().manual_seed(5)))
-    plain = disguised_reference(sh, opacities, hidden, color)
+    plain = covered_reference(sh, opacities, hidden, color)
     factors = torch.rand_like(sh), torch.rand_like(opacities)
     found = torch.autograd.grad((fast.sh, fast.opacities), (sh, opacities), factors)
     expected = torch.autograd.grad(plain, (sh, opacities), factors)
@@ -167,12 +167,12 @@ def test_the_fast_disguise_is_the_reference(toy: tuple[FaceModel, Sequence]) -> 
     assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
 
 
-def test_other_methods_have_nothing_to_disguise(toy: tuple[FaceModel, Sequence]) -> None:
+def test_other_methods_have_nothing_to_cover(toy: tuple[FaceModel, Sequence]) -> None:
     avatar = made(toy, "headgas")
     posed = avatar.pose(toy[1].tracking.face[0])
     assert avatar.surface() is None
-    assert disguise(posed, avatar, toy[0].face_regions == 1, torch.Generator()) is posed
-    assert disguise(posed, made(toy), None, torch.Generator()) is posed
+    assert cover_hidden(posed, avatar, toy[0].face_regions == 1, torch.Generator()) is posed
+    assert cover_hidden(posed, made(toy), None, torch.Generator()) is posed
 
 
 def test_open_surface_is_closed_and_the_rest_stays(toy: tuple[FaceModel, Sequence]) -> None:
@@ -184,9 +184,9 @@ def test_open_surface_is_closed_and_the_rest_stays(toy: tuple[FaceModel, Sequenc
     before = {name: store[name].detach().clone() for name in store.names()}
     colors = torch.tensor([0.2, 0.1, 0.1]).expand(len(inside), 3)
     furniture = Inside(inside, colors)
-    furniture.furnish(surface_of(avatar), 59, 120)
+    furniture.fill_interior(surface_of(avatar), 59, 120)
     assert all(torch.equal(store[name], tensor) for name, tensor in before.items()), "it is not due"
-    furniture.furnish(surface_of(avatar), 60, 120)
+    furniture.fill_interior(surface_of(avatar), 60, 120)
     opened = inside.clone()
     opened[half] = False
     for name, tensor in before.items():
@@ -220,7 +220,7 @@ def test_a_run_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) 
     """It stops after the step at which the surface is closed, and before it."""
     model, sequence = toy
     settings, config = (
-        replace(SETTINGS, inside="furnished", steps=6, checkpoint_every=2, record_every=1),
+        replace(SETTINGS, inside="filled", steps=6, checkpoint_every=2, record_every=1),
         GaussianAvatarsConfig(),
     )
     whole = train([sequence], model, config, settings, tmp_path / "cut")

@@ -92,8 +92,8 @@ def write_woven(path: Path, kind: str, pattern: np.ndarray, order: str) -> None:
 
 def bend_ratio(picture: np.ndarray) -> float:
     """Return the vertical relative to the horizontal second difference: combs raise it."""
-    grey = picture.astype(float)
-    return float(np.abs(np.diff(grey, 2, axis=0)).mean() / np.abs(np.diff(grey, 2, axis=1)).mean())
+    gray = picture.astype(float)
+    return float(np.abs(np.diff(gray, 2, axis=0)).mean() / np.abs(np.diff(gray, 2, axis=1)).mean())
 
 
 def green(frame: LazyFrame) -> np.ndarray:
@@ -265,8 +265,8 @@ def test_single_fields_of_hevc_are_told(pattern, tmp_path):
         stream = container.add_stream("libx265", rate=50, options=options)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for field in range(4):
-            grey = np.repeat(moment(pattern, field)[..., None], 3, axis=2)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(grey), format="rgb24")))
+            gray = np.repeat(moment(pattern, field)[..., None], 3, axis=2)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(gray), format="rgb24")))
         container.mux(stream.encode())
     assert probe_video(path).has_field_pictures
     assert len(list(read_video_frames(path))) == count_frames(path) == 4

@@ -46,12 +46,12 @@ class Scene:
     edges: MeshEdges
 
 
-def ball(rings: int, around: int, radius: float, centre: list[float], random: torch.Generator) -> tuple[Tensor, Tensor]:
+def ball(rings: int, around: int, radius: float, center: list[float], random: torch.Generator) -> tuple[Tensor, Tensor]:
     polar, angle = torch.meshgrid(
         torch.linspace(0.1, 3.0, rings), torch.arange(around) * 2 * torch.pi / around, indexing="ij"
     )
     points = torch.stack([polar.sin() * angle.cos(), polar.cos(), polar.sin() * angle.sin()], -1).reshape(-1, 3)
-    points = points * radius * (1 + 0.05 * torch.randn(len(points), 1, generator=random)) + torch.tensor(centre)
+    points = points * radius * (1 + 0.05 * torch.randn(len(points), 1, generator=random)) + torch.tensor(center)
     ring, column = torch.meshgrid(torch.arange(rings - 1), torch.arange(around), indexing="ij")
     first, second = ring * around + column, ring * around + (column + 1) % around
     quads = torch.stack([first, second, first + around, second, second + around, first + around], -1)

@@ -51,7 +51,7 @@ def pictured(n: int) -> Rendering:
     return Rendering(torch.zeros(4, 4, 3), torch.zeros(4, 4), torch.ones(n).int(), torch.zeros(n, 2))
 
 
-def test_starts_on_a_sphere_with_grey_translucent_points() -> None:
+def test_starts_on_a_sphere_with_gray_translucent_points() -> None:
     avatar = new_avatar(disturbed=False)
     gaussians = avatar.pose(toy_face(5)[0], Progress(0, 100)).gaussians
     torch.testing.assert_close(avatar.store["means"].norm(dim=-1), torch.full((30,), 0.125))
@@ -257,7 +257,7 @@ def test_attribute_network_has_the_published_layers() -> None:
             values = torch.cat([values, encoding], dim=-1) / 2**0.5
         values = softplus(layer(values))
     hidden = [softplus(head(values)) for head in network.heads]
-    hidden[3] = network.colour(hidden[3])
+    hidden[3] = network.color(hidden[3])
     expected = torch.cat([output(one) for output, one in zip(network.outputs, hidden, strict=True)], dim=-1)
     torch.testing.assert_close(network(points), expected)
 
@@ -412,14 +412,14 @@ def test_points_start_on_the_canonical_face() -> None:
 def test_lessons_teach_the_motion_of_the_face_model() -> None:
     face = toy_face(5)
 
-    def error(lessons: int) -> float:
-        avatar = new_avatar(replace(SMALL, start="face", points=200, lessons=lessons), disturbed=False)
+    def error(pretraining: int) -> float:
+        avatar = new_avatar(replace(SMALL, start="face", points=200, pretraining=pretraining), disturbed=False)
         torch.manual_seed(1)
         corners, weights = random_places(avatar._at_rest().vertices, avatar.face_model.faces, 200)
         with torch.no_grad():
             avatar.store["means"].copy_(at_places(avatar._at_rest().vertices, corners, weights))
-        taught = avatar.extras.lessons
-        assert (0 if taught is None else len(list(taught.teach(face)))) == lessons == (taught.count if taught else 0)
+        taught = avatar.extras.pretraining
+        assert (0 if taught is None else len(list(taught.run(face)))) == pretraining == (taught.count if taught else 0)
         target = at_places(avatar.face_model.head_vertices(face), corners, weights)
         return float((avatar.pose(face).gaussians.means - target).norm(dim=-1).mean().detach())
 

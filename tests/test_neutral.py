@@ -138,7 +138,7 @@ def test_what_counts_as_ahead_is_the_camera_of_any_world() -> None:
     aside = ahead @ matrix_from_axis_angle(torch.tensor([0.0, 1.0, 0.0]))
     rest = rest_of(replace(calm, head_rotation=axis_angle_from_matrix(aside)[None]), model(), ahead)
     torch.testing.assert_close(matrix_from_axis_angle(rest.face.head_rotation)[0], ahead, atol=1e-5, rtol=0)
-    assert rest.moved == ("the head 57 degrees aside",)
+    assert rest.moved == ("the head 57 degrees to the side",)
 
 
 def test_an_avatar_that_never_rests_still_follows_itself() -> None:

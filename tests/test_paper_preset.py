@@ -52,7 +52,7 @@ def test_density_control() -> None:
     assert density.max_gaussians >= 200_000
 
 
-def test_colours_gain_a_degree_every_thousand_steps() -> None:
+def test_colors_gain_a_degree_every_thousand_steps() -> None:
     avatar = GaussianAvatars(PAPER, toy_face_model(), toy_face(5))
     steps = (0, 999, 1_000, 1_999, 2_000, 2_999, 3_000, 599_999)
     counts = [avatar.pose(toy_face(5)[0], Progress(step, STEPS)).gaussians.sh.shape[-2] for step in steps]
@@ -177,9 +177,9 @@ def test_docs_have_the_counts_and_radii_of_both_schedules() -> None:
 # -- the extent of the cameras ----------------------------------------------------------------------------------------
 
 
-def camera_at(*centre: float) -> Camera:
+def camera_at(*center: float) -> Camera:
     viewmat = torch.eye(4)
-    viewmat[:3, 3] = -torch.tensor(centre)
+    viewmat[:3, 3] = -torch.tensor(center)
     return Camera(torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), viewmat, 16, 16)
 
 

@@ -110,7 +110,7 @@ def test_sequences_of_one_subject_share_texture_and_identity(case):
         assert tracking.pixel_residuals.median() < 0.06
 
 
-def test_residuals_tell_how_well_colours_agree(by_pixels, by_landmarks):
+def test_residuals_tell_how_well_colors_agree(by_pixels, by_landmarks):
     assert by_landmarks.pixel_residuals is None
     assert by_pixels.pixel_residuals.isfinite().all()
     assert 0 < by_pixels.pixel_residuals.median() < 0.06

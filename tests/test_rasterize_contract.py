@@ -42,7 +42,7 @@ def stacked(scenes: list[Scene]) -> Gaussians:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_ball_on_the_axis_shows_its_colour_at_the_centre(backend: Backend) -> None:
+def test_a_ball_on_the_axis_shows_its_color_at_the_center(backend: Backend) -> None:
     rendering = rasterize(one_gaussian(), front_camera(), torch.zeros(3), backend)
     assert rendering.alpha[7, 10].item() == pytest.approx(0.8, abs=1e-4)
     torch.testing.assert_close(rendering.image[7, 10], 0.8 * torch.tensor([1.0, 0.5, 0.1]), atol=1e-4, rtol=0)

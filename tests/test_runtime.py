@@ -70,7 +70,7 @@ def test_pictures_equal_those_of_training(method: str, tmp_path: Path) -> None:
 
 
 @torch.no_grad()
-def test_colours_that_depend_on_the_view_in_either_frame(tmp_path: Path) -> None:
+def test_colors_that_depend_on_the_view_in_either_frame(tmp_path: Path) -> None:
     """Colours that depend on the view equal those of training, in world and in head frame."""
     for frame in ("world", "head"):
         avatar = new_avatar(DEFAULT_METHOD, sh_degree=2, sh_frame=frame)

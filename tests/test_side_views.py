@@ -1,4 +1,4 @@
-"""Side views: pictures that no camera took, of a head from aside and of raised expressions."""
+"""Side views: pictures that no camera took, of a head from the side and of raised expressions."""
 
 import math
 from dataclasses import replace
@@ -17,7 +17,7 @@ from mien.rotation import matrix_from_axis_angle
 from mien.tracking import NeckParts, head_cutter
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame, resolved
-from mien.training.whole_head.side_views import SideViews, side_views, turned_aside
+from mien.training.whole_head.side_views import SideViews, side_views, turned_to_side
 from mien.training.whole_head.unseen import fills_sides
 from toy_scene import surface_of
 
@@ -53,7 +53,7 @@ def _opaque_avatar(model: FaceModel, color: float):
     """One flat opaque Gaussian of one colour on each triangle."""
     torch.manual_seed(0)
     avatar = method_named("gaussian_avatars").avatar(PRESETS["paper"].config("gaussian_avatars"), model, _face(model))
-    surface_of(avatar).furnish(
+    surface_of(avatar).fill_interior(
         torch.ones(len(model.faces), dtype=torch.bool), 0.97, torch.full((len(model.faces), 3), color)
     )
     return avatar
@@ -62,7 +62,7 @@ def _opaque_avatar(model: FaceModel, color: float):
 def test_a_head_turns_about_its_own_upright_axis(anny):
     face = _face(anny)
     face.head_rotation[:, 0] = 0.3
-    turned = turned_aside(face, math.pi / 2)
+    turned = turned_to_side(face, math.pi / 2)
     before, after = (matrix_from_axis_angle(one.head_rotation[0]) for one in (face, turned))
     torch.testing.assert_close(after[:, 1], before[:, 1])
     torch.testing.assert_close(after[:, 2], before[:, 0], atol=1e-6, rtol=0)
@@ -70,7 +70,7 @@ def test_a_head_turns_about_its_own_upright_axis(anny):
 
 
 @pytest.mark.parametrize(("step", "most"), [(0, 0.7), (4, 0.3)])  # From aside, the neck below the cut costs too.
-def test_a_head_in_the_colours_of_the_mesh_costs_less_than_one_in_others(anny, step, most):
+def test_a_head_in_the_colors_of_the_mesh_costs_less_than_one_in_others(anny, step, most):
     views = _views(anny)
     costs = [
         float(views.loss(_opaque_avatar(anny, color), _face(anny), _camera(), _PROGRESS, step, _random()).detach())
@@ -115,7 +115,7 @@ def test_the_outline_has_the_hair(anny):
 
 
 def test_the_outline_ends_at_the_cut_at_the_neck(anny):
-    face, camera = turned_aside(_face(anny), 1.0), _camera()
+    face, camera = turned_to_side(_face(anny), 1.0), _camera()
     views = _views(anny)
     picture, alpha, _ = views._target(face, camera, torch.tensor([1.0, 0.0, 0.0]))
     bare = np.where(rasterize_mesh(anny(face)[0], anny.faces, camera).face_index.numpy() >= 0, 255, 0).astype(np.uint8)

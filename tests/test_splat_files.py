@@ -54,11 +54,11 @@ def some(n: int, coefficients: int, seed: int = 0) -> Gaussians:
 class Loss:
     """Largest differences that a format may make."""
 
-    metres: float
+    meters: float
     radians: float
     log_scale: float
     opacity: float
-    colour: float
+    color: float
     """Of the first SH coefficient."""
     higher: float
     """Of the other SH coefficients."""
@@ -82,7 +82,7 @@ def expect_near(found: Gaussians, expected: Gaussians, loss: Loss) -> None:
         "radians": 2 * torch.arccos(cosines.clamp(max=1)),
         "log_scale": found.scales.log() - expected.scales.log(),
         "opacity": found.opacities - expected.opacities,
-        "colour": found.sh[:, 0] - expected.sh[:, 0],
+        "color": found.sh[:, 0] - expected.sh[:, 0],
         "higher": found.sh[:, 1:] - expected.sh[:, 1:],
     }
     for name, difference in differences.items():
@@ -147,7 +147,7 @@ def test_another_program_opens_spz(tmp_path: Path, coefficients: int) -> None:
     found = opened_elsewhere(tmp_path / "a.spz", tmp_path / "a.ply")
     back = in_world(replace(found, T_world_local=HALF_TURN))
     expect_near(back, written, SPZ_LOSS)
-    expect_near(back, read_spz(tmp_path / "a.spz"), replace(NO_LOSS, colour=1e-5, higher=1e-5, opacity=1e-6))
+    expect_near(back, read_spz(tmp_path / "a.spz"), replace(NO_LOSS, color=1e-5, higher=1e-5, opacity=1e-6))
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 16])
@@ -164,7 +164,7 @@ def test_far_positions_in_spz_are_coarser(tmp_path: Path) -> None:
     near = some(10, 1)
     far = replace(near, means=near.means + 1000)
     write_spz(tmp_path / "a.spz", far)
-    expect_near(read_spz(tmp_path / "a.spz"), far, replace(SPZ_LOSS, metres=2**-13))
+    expect_near(read_spz(tmp_path / "a.spz"), far, replace(SPZ_LOSS, meters=2**-13))
     with pytest.raises(UserError, match=r"a\.spz: a Gaussian is 1e\+09 m away, too far for \.spz"):
         write_spz(tmp_path / "a.spz", replace(near, means=near.means + 1e9))
 

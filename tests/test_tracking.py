@@ -125,9 +125,9 @@ def test_fast_turns_neither_lag_nor_shrink():
     range_ratio = (tracked_yaw.max() - tracked_yaw.min()) / (yaw.max() - yaw.min())
     assert 0.95 < range_ratio < 1.05
     # The yaw crosses the middle of its way less than half a frame late or early.
-    centred = tracked_yaw - (tracked_yaw.max() + tracked_yaw.min()) / 2
-    crossing = int((centred > 0).nonzero()[0, 0])
-    exact = crossing - float(centred[crossing] / (centred[crossing] - centred[crossing - 1]))
+    centered = tracked_yaw - (tracked_yaw.max() + tracked_yaw.min()) / 2
+    crossing = int((centered > 0).nonzero()[0, 0])
+    exact = crossing - float(centered[crossing] / (centered[crossing] - centered[crossing - 1]))
     assert abs(exact - 33) < 0.5
     assert (tracked_yaw.diff().max() / yaw.diff().max()) > 0.85
 

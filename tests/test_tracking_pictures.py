@@ -95,7 +95,7 @@ def test_heat_grows_with_the_difference():
     assert heat[5] == heat[0]
 
 
-def test_the_overlay_shows_where_colours_differ(case, truth, tmp_path):
+def test_the_overlay_shows_where_colors_differ(case, truth, tmp_path):
     off = truth.face.head_translation.clone()
     off[3] += torch.tensor([0.01, 0.0, 0.0])
     painter = OverlayPainter(case.capture, replace(truth, face=replace(truth.face, head_translation=off)), case.model)

@@ -137,11 +137,11 @@ def _moved(face: FaceParams, T_other_world: torch.Tensor) -> FaceParams:
 
 def _ring(angles: tuple[float, ...], T_other_world: torch.Tensor) -> tuple[Camera, ...]:
     """Return cameras 0.9 m from a head at (0, 0, -0.9), at angles in radians to the subject's left."""
-    centre, up = torch.tensor([0.0, 0.0, -0.9]).double(), torch.tensor([0.0, 1.0, 0.0]).double()
+    center, up = torch.tensor([0.0, 0.0, -0.9]).double(), torch.tensor([0.0, 1.0, 0.0]).double()
     cameras = []
     for angle in torch.tensor(angles).double():
-        position = centre + 0.9 * torch.stack([angle.sin(), angle * 0, angle.cos()])
-        viewmat = look_at(position, centre, up) @ torch.linalg.inv(T_other_world)
+        position = center + 0.9 * torch.stack([angle.sin(), angle * 0, angle.cos()])
+        viewmat = look_at(position, center, up) @ torch.linalg.inv(T_other_world)
         cameras.append(replace(still_camera(), viewmat=viewmat))
     return tuple(camera.to(torch.zeros(())) for camera in cameras)
 

@@ -57,9 +57,9 @@ def test_every_integer_is_the_rounded_one() -> None:
     """All pairs of a value and an opacity, over a few backgrounds."""
     value, matte = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
     image = np.repeat(value[..., None], 3, axis=2)
-    for grey in (0, 1, 100, 255):
-        found = composite(image, np.ascontiguousarray(matte), np.full(3, grey, np.uint8))
-        total = value.astype(int) * matte + grey * (255 - matte.astype(int))
+    for gray in (0, 1, 100, 255):
+        found = composite(image, np.ascontiguousarray(matte), np.full(3, gray, np.uint8))
+        total = value.astype(int) * matte + gray * (255 - matte.astype(int))
         np.testing.assert_array_equal(found[..., 0], (2 * total + 255) // 510)
 
 

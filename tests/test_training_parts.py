@@ -164,8 +164,8 @@ def test_fixed_background_pictures_are_kept() -> None:
     _, sequence = toy_sequence(3, 16)
     targets, white = Targets(sequence, 0), np.full(3, 255, dtype=np.uint8)
     assert targets.target(1, 0, white, keep=True) is targets.target(1, 0, white, keep=True)
-    grey = np.full(3, 99, dtype=np.uint8)
-    assert targets.target(1, 0, grey, keep=False) is not targets.target(1, 0, grey, keep=False)
+    gray = np.full(3, 99, dtype=np.uint8)
+    assert targets.target(1, 0, gray, keep=False) is not targets.target(1, 0, gray, keep=False)
 
 
 @pytest.mark.parametrize(("drawn", "matte"), [((3, 5), (20, 26)), ((30, 31), None), (None, (8, 9)), (None, None)])
@@ -272,12 +272,12 @@ def test_one_expression_only_gives_even_weights() -> None:
     assert expression_rarity([sequence], frames[:1]).isfinite().all()
 
 
-def test_first_colours_come_from_training_frames_only() -> None:
+def test_first_colors_come_from_training_frames_only() -> None:
     face_model, sequence = toy_sequence(60, 48)
     config, settings = GaussianAvatarsConfig(first_colors="pictures"), TrainSettings(split="blocks")
     painted = start([sequence], face_model, config, settings).avatar.gaussian_store()["sh_constant"]
-    grey = start([sequence], face_model, GaussianAvatarsConfig(), settings).avatar.gaussian_store()["sh_constant"]
-    assert float((rgb_from_sh(grey.detach()) - 0.5).abs().max()) < 0.01
+    gray = start([sequence], face_model, GaussianAvatarsConfig(), settings).avatar.gaussian_store()["sh_constant"]
+    assert float((rgb_from_sh(gray.detach()) - 0.5).abs().max()) < 0.01
     assert float((rgb_from_sh(painted.detach()) - 0.5).abs().mean()) > 0.05
     for timesteps, same in ((slice(40, 50), True), (slice(0, 10), False)):
         images = sequence.capture.images.copy()

@@ -51,8 +51,8 @@ def filmed_at(folder: Path, times: np.ndarray, fps: float) -> Driver:
     _, sequence = toy_sequence(len(times), 32)
     turned = torch.zeros(len(times), 3)
     turned[:, 1] = 0.01 * torch.from_numpy(times).float()
-    grey = np.zeros_like(sequence.capture.images) + np.arange(len(times), dtype=np.uint8)[:, None, None, None, None]
-    write_capture(folder / "capture", replace(sequence.capture, timestamps=times, fps=fps, images=grey))
+    gray = np.zeros_like(sequence.capture.images) + np.arange(len(times), dtype=np.uint8)[:, None, None, None, None]
+    write_capture(folder / "capture", replace(sequence.capture, timestamps=times, fps=fps, images=gray))
     tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, head_rotation=turned))
     write_tracking(folder / "tracking", tracking)
     crops = np.tile(np.array([4, 4, 20, 20], np.int64), (len(times), 1, 1))

@@ -35,7 +35,7 @@ from mien.viewer.faces import (
 )
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
 from mien.viewer.loop import STILL_SECONDS, DrawingLoop
-from mien.viewer.session import Clip, Session, centre_of
+from mien.viewer.session import Clip, Session, center_of
 from mien.viewer.work import Worker
 from toy_workspace import write_toy_workspace
 from web_case import drawn_head, faces_of
@@ -450,9 +450,9 @@ def test_mesh_and_wireframe(session: Session) -> None:
     inside = mesh[mesh.any(-1)].astype(int)
     assert np.abs(inside - inside.mean(1, keepdims=True)).max() <= 1, "the mesh is grey"
     session.show(surface="confidence")
-    coloured = session.picture(view)
-    assert (coloured[..., 0].astype(int) - coloured[..., 2]).max() > 20
-    assert (coloured[..., 2].astype(int) - coloured[..., 0]).max() > 20
+    colored = session.picture(view)
+    assert (colored[..., 0].astype(int) - colored[..., 2]).max() > 20
+    assert (colored[..., 2].astype(int) - colored[..., 0]).max() > 20
     without = Session(session.avatar)
     without.show(wireframe=True)
     np.testing.assert_array_equal(without.picture(view), plain)
@@ -506,25 +506,25 @@ def test_a_screenshot_has_the_pixels_of_the_window(session: Session) -> None:
 
 def test_videos_hold_the_motion_or_a_turn(session: Session, tmp_path: Path) -> None:
     session.show(height=32)
-    view, centre = front_view(session.avatar, 48, 32), centre_of(session.avatar)
-    (tmp_path / "turn.mp4").write_bytes(video(session, view, centre))
+    view, center = front_view(session.avatar, 48, 32), center_of(session.avatar)
+    (tmp_path / "turn.mp4").write_bytes(video(session, view, center))
     assert count_frames(tmp_path / "turn.mp4") == TURNTABLE_FRAMES
     session.choose("clip")
-    (tmp_path / "clip.mp4").write_bytes(video(session, view, centre))
+    (tmp_path / "clip.mp4").write_bytes(video(session, view, center))
     assert count_frames(tmp_path / "clip.mp4") == 4
     assert session.timestep == 0
     with pytest.raises(Stopped):
-        video(session, view, centre, lambda: False)
+        video(session, view, center, lambda: False)
 
 
 def test_a_turntable_keeps_its_distance(session: Session) -> None:
-    view, centre = front_view(session.avatar), centre_of(session.avatar).astype(float)
-    half = around(view, centre, np.pi)
-    for turned in (half, around(view, centre, 0.3)):
-        before, after = (one.viewmat[:3, :3] @ centre + one.viewmat[:3, 3] for one in (view, turned))
+    view, center = front_view(session.avatar), center_of(session.avatar).astype(float)
+    half = around(view, center, np.pi)
+    for turned in (half, around(view, center, 0.3)):
+        before, after = (one.viewmat[:3, :3] @ center + one.viewmat[:3, 3] for one in (view, turned))
         np.testing.assert_allclose(before, after, atol=1e-6)
     np.testing.assert_allclose(half.viewmat[2, :3], -view.viewmat[2, :3], atol=1e-6)
-    np.testing.assert_allclose(around(half, centre, np.pi).viewmat, view.viewmat, atol=1e-6)
+    np.testing.assert_allclose(around(half, center, np.pi).viewmat, view.viewmat, atol=1e-6)
 
 
 # The door.

@@ -76,7 +76,7 @@ def test_faces_are_posed_as_in_python(built: Path, tmp_path: Path, form: str, ra
             rig_points(baked.rig, face),
             runtime.pose(baked, in_head).means,
             baked.attributes.opacity_logits + changes.get("opacity_logits", 0),
-            baked.attributes.sh[:, 0] + changes.get("colour", 0),
+            baked.attributes.sh[:, 0] + changes.get("color", 0),
         )
         for ours, theirs in zip(found, expected, strict=True):
             np.testing.assert_allclose(ours, theirs.reshape(-1), rtol=0, atol=EQUAL)
@@ -117,11 +117,11 @@ def test_features_are_blended_as_in_python(built: Path, tmp_path: Path, form: st
     baked, faces = portable.baked, faces_of(portable, 3)
     assert isinstance(baked, runtime.MeshBound)
     assert baked.changes is not None
-    for face, (_, centres, logits, colours) in zip(faces, posed_by_node(built, path, portable, faces), strict=True):
+    for face, (_, centers, logits, colors) in zip(faces, posed_by_node(built, path, portable, faces), strict=True):
         changes = expression_changes(baked.changes, face)
-        np.testing.assert_allclose(centres, baked.means.reshape(-1), rtol=0, atol=EQUAL)
+        np.testing.assert_allclose(centers, baked.means.reshape(-1), rtol=0, atol=EQUAL)
         np.testing.assert_allclose(logits, changes["opacity_logits"], rtol=0, atol=1e-3)
-        np.testing.assert_allclose(colours, changes["colour"].reshape(-1), rtol=0, atol=1e-3)
+        np.testing.assert_allclose(colors, changes["color"].reshape(-1), rtol=0, atol=1e-3)
 
 
 def test_a_hundred_thousand_are_posed_and_sorted_in_time(built: Path, tmp_path: Path) -> None:

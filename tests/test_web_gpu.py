@@ -134,19 +134,19 @@ def test_the_gpu_poses_as_python(site: Path, method: str) -> None:
     n, moved = len(baked.face_index), []
     for face, found in zip(faces, told["results"][1:], strict=True):
         frames = numbers(found, "frames")[: 12 * len(baked.faces)].reshape(-1, 3, 4)[baked.face_index]
-        means, colours = (numbers(found, name)[: 4 * n].reshape(n, 4) for name in ("means", "colours"))
+        means, colors = (numbers(found, name)[: 4 * n].reshape(n, 4) for name in ("means", "colors"))
         np.testing.assert_array_equal(means[:, 3], baked.face_index)
-        centres = np.einsum("nij,nj->ni", frames[..., :3], means[:, :3]) + frames[..., 3]
+        centers = np.einsum("nij,nj->ni", frames[..., :3], means[:, :3]) + frames[..., 3]
         in_head = replace(face, head_rotation=np.zeros(3, np.float32), head_translation=np.zeros(3, np.float32))
-        np.testing.assert_allclose(centres, runtime.pose(baked, in_head).means, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(centers, runtime.pose(baked, in_head).means, rtol=0, atol=1e-5)
         assert baked.changes is not None
         changes = expression_changes(baked.changes, face)
         np.testing.assert_allclose(
-            colours[:, :3], baked.attributes.sh[:, 0] + changes.get("colour", 0), rtol=0, atol=1e-3
+            colors[:, :3], baked.attributes.sh[:, 0] + changes.get("color", 0), rtol=0, atol=1e-3
         )
         logits = baked.attributes.opacity_logits + changes.get("opacity_logits", 0)
-        np.testing.assert_allclose(colours[:, 3], logits, rtol=0, atol=1e-3)
-        moved.append(colours)
+        np.testing.assert_allclose(colors[:, 3], logits, rtol=0, atol=1e-3)
+        moved.append(colors)
     assert np.abs(moved[0] - moved[1]).max() > 0.1
 
 

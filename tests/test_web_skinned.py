@@ -73,11 +73,11 @@ def test_skinned_gaussians_are_posed_as_in_python(built: Path, tmp_path: Path, f
     rows = np.fromfile(out, np.float32).reshape(len(faces), 14 * n)
     moved = []
     for face, row in zip(faces, rows, strict=True):
-        centres, logits, colours, quats, scales = np.split(row, np.cumsum([3 * n, n, 3 * n, 4 * n]))
+        centers, logits, colors, quats, scales = np.split(row, np.cumsum([3 * n, n, 3 * n, 4 * n]))
         posed = runtime.pose(portable.baked, face)
-        np.testing.assert_allclose(centres, posed.means.reshape(-1), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(centers, posed.means.reshape(-1), rtol=0, atol=1e-5)
         np.testing.assert_allclose(1 / (1 + np.exp(-logits)), posed.opacities, rtol=0, atol=1e-3)
-        np.testing.assert_allclose(colours, posed.sh.reshape(-1), rtol=0, atol=1e-3)
+        np.testing.assert_allclose(colors, posed.sh.reshape(-1), rtol=0, atol=1e-3)
         np.testing.assert_allclose(quats, posed.quats.reshape(-1), rtol=0, atol=1e-3)
         np.testing.assert_allclose(scales, posed.scales.reshape(-1), rtol=0, atol=1e-5)
         moved.append(posed.means)

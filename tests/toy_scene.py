@@ -88,16 +88,16 @@ def toy_capture(face_model: FaceModel, timesteps: int = 10, size: int = 64) -> t
     camera, face = toy_camera(size), toy_face(timesteps)
     vertices = face_model(face)
     rows = torch.arange(size) + 0.5
-    colours = 0.5 + 0.5 * torch.sin(40 * face_model.template[face_model.faces].mean(1) + torch.tensor([0.0, 2.0, 4.0]))
+    colors = 0.5 + 0.5 * torch.sin(40 * face_model.template[face_model.faces].mean(1) + torch.tensor([0.0, 2.0, 4.0]))
     images, mattes = [], []
     for timestep in range(timesteps):
-        centres = vertices[timestep][face_model.faces].mean(1)
+        centers = vertices[timestep][face_model.faces].mean(1)
         facing = _facing(vertices[timestep], face_model.faces)
-        pixels, _ = camera.project(centres)
+        pixels, _ = camera.project(centers)
         squared = (rows[None, :, None] - pixels[:, 0]) ** 2 + (rows[:, None, None] - pixels[:, 1]) ** 2
         weights = torch.exp(-squared / (2 * (size / 25) ** 2)) * facing
         total = weights.sum(-1)
-        image = (weights[..., None] * colours).sum(-2) / total.clamp_min(1e-6)[..., None]
+        image = (weights[..., None] * colors).sum(-2) / total.clamp_min(1e-6)[..., None]
         images.append((image * 255).to(torch.uint8))
         mattes.append(((total * 2).clamp_max(1) * 255).to(torch.uint8))
     pictures, alpha = torch.stack(images)[:, None].numpy(), torch.stack(mattes)[:, None].numpy()

@@ -202,9 +202,9 @@ def jitter(out: Path) -> None:
     )
     figure = Figure((7.8, 2.4), dpi=100)
     axes = figure.add_axes((0.07, 0.2, 0.91, 0.68))
-    for name, label, colour, settings in kinds:
+    for name, label, color, settings in kinds:
         nose = nose_of(name, settings, out)
-        axes.plot(np.arange(len(nose)) / 25, nose - nose.mean(), colour, label=label, linewidth=1.4)
+        axes.plot(np.arange(len(nose)) / 25, nose - nose.mean(), color, label=label, linewidth=1.4)
     figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=3, frameon=False, fontsize=9)
     axes.set_xlabel("seconds, in which the head does not move", fontsize=9)
     axes.set_ylabel("nose, pixels", fontsize=9)

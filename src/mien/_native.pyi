@@ -488,7 +488,7 @@ class RawPoints(NamedTuple):
     log_scales: Tensor
     quats: Tensor
     opacity_logits: Tensor
-    colours: Tensor
+    colors: Tensor
 
 class ActivatedPoints(NamedTuple):
     """Filled."""

@@ -77,8 +77,8 @@ class Parabola:
 
     def __init__(self, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> None:
         x, y = x.astype(np.float64), y.astype(np.float64)
-        self._centre = x.mean()
-        linear = x - self._centre
+        self._center = x.mean()
+        linear = x - self._center
         square = linear * linear
         self._mean, self._slope = square.mean(), (square * linear).sum() / (linear * linear).sum()
         square = square - self._mean - self._slope * linear
@@ -86,7 +86,7 @@ class Parabola:
 
     def __call__(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """The parabola's values at `x`, in float64."""
-        linear = x - self._centre
+        linear = x - self._center
         square = linear * linear - self._mean - self._slope * linear
         constant, first, second = self._factors
         return constant + first * linear + second * square

@@ -164,7 +164,7 @@ def left_jacobian(axis_angle: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
     return torch.eye(3).to(axis_angle) + first * cross + second * (cross @ cross)
 
 
-def align_centred(
+def align_centered(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "3 3"], float]:
     """Rotation and scale with target ~ scale * rotation @ source, by least squares (Umeyama 1991).

@@ -38,7 +38,7 @@ export interface ExpressionChanges {
   rest: Float32Array; // [i]
   directions: Float32Array; // [i, r]
   reach: Float32Array; // [1]
-  colour: Float32Array | null; // [n, 3, c], where the first c of the r activations count
+  color: Float32Array | null; // [n, 3, c], where the first c of the r activations count
   opacity_logits: Float32Array | null; // [n, c]
   means: Float32Array | null; // [n, 3, c]
   features?: FeatureChanges | null;
@@ -62,7 +62,7 @@ export interface BlendSkinned {
   scale_activation: "exp" | "sigmoid";
   scale_gain: number;
   scale_offset: number; // metres
-  colour_activation: "sh" | "sigmoid";
+  color_activation: "sh" | "sigmoid";
   bases: unknown;
   network: PointNetwork;
   still_weights?: Float32Array | null; // [n]

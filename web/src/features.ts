@@ -42,7 +42,7 @@ export class FeatureNetwork {
   }
 
   /** Adds the changes at these activations to first colour coefficients [n, 3] and raw opacities [n]. */
-  add(activations: ArrayLike<number>, colours: Float32Array, opacityLogits: Float32Array): void {
+  add(activations: ArrayLike<number>, colors: Float32Array, opacityLogits: Float32Array): void {
     const { count, width, rank, hidden, first, own } = this, { neutral, basis, weights, biases } = this.features;
     const second = weights[1], bias = biases[1], blended = new Float32Array(width), active = new Float32Array(rank);
     active.set(activations);
@@ -62,9 +62,9 @@ export class FeatureNetwork {
         blue += second[2 * hidden + h] * sum;
         opacity += second[3 * hidden + h] * sum;
       }
-      colours[3 * i] += red;
-      colours[3 * i + 1] += green;
-      colours[3 * i + 2] += blue;
+      colors[3 * i] += red;
+      colors[3 * i + 1] += green;
+      colors[3 * i + 2] += blue;
       opacityLogits[i] += opacity;
     }
   }

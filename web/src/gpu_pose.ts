@@ -27,7 +27,7 @@ export interface Posed {
   /** Centres in the frames of triangles, and the triangle. */
   means: GPUBuffer;
   /** First colour coefficients, and the raw opacity. */
-  colours: GPUBuffer;
+  colors: GPUBuffer;
 }
 
 export class GpuPoser {
@@ -39,7 +39,7 @@ export class GpuPoser {
   private readonly told: Float32Array<ArrayBuffer>;
 
   /** `means` and `colours` are those at rest, in rows of four as the buffers have them. */
-  constructor(private readonly memory: Memory, baked: MeshBound, posed: Posed, means: Float32Array, colours: Float32Array) {
+  constructor(private readonly memory: Memory, baked: MeshBound, posed: Posed, means: Float32Array, colors: Float32Array) {
     const { rig, faces, changes } = baked, count = baked.face_index.length, triangles = faces.length / 3;
     this.points = memory.storage(rig.template.length);
     this.told = new Float32Array(POSE_SIZE + MOST_RANK);
@@ -52,9 +52,9 @@ export class GpuPoser {
     if (changes.directions.length / changes.rest.length > MOST_RANK) throw new AvatarError(`has more than ${MOST_RANK} activations`);
     const { basis, columns } = basisOf(changes, count);
     words[2] = columns;
-    const rest = [means, colours].map((values) => memory.storage(values));
-    this.changes.push(this.step(CHANGE, count, [this.pose, ...rest, memory.storage(basis), posed.means, posed.colours]));
-    if (changes.features) this.addNetwork(changes.features, count, posed.colours);
+    const rest = [means, colors].map((values) => memory.storage(values));
+    this.changes.push(this.step(CHANGE, count, [this.pose, ...rest, memory.storage(basis), posed.means, posed.colors]));
+    if (changes.features) this.addNetwork(changes.features, count, posed.colors);
   }
 
   /** Poses the Gaussians of the poser's last face. */
@@ -73,7 +73,7 @@ export class GpuPoser {
     device.queue.submit([encoder.finish()]);
   }
 
-  private addNetwork(features: FeatureChanges, count: number, colours: GPUBuffer): void {
+  private addNetwork(features: FeatureChanges, count: number, colors: GPUBuffer): void {
     const { memory } = this, { width, rank, hidden } = sizesOf(features, count), { weights, biases } = features;
     const texels = Math.ceil(width / 4), units = 4 * Math.ceil(hidden / 4), columns = weights[0].length / hidden;
     // For each hidden unit: its weights of the features, then those of the four outputs.
@@ -87,7 +87,7 @@ export class GpuPoser {
     const half = (values: Float32Array, row: number) => memory.storage(halves(padded(values, row)));
     const own = half(ownPart(features, count, width), hidden);
     const inputs = [half(features.neutral, width), half(features.basis, width), own, memory.storage(table)];
-    this.changes.push(this.step(featureNetwork(texels, rank, units), count, [this.pose, ...inputs, colours]));
+    this.changes.push(this.step(featureNetwork(texels, rank, units), count, [this.pose, ...inputs, colors]));
   }
 
   private step(code: string, threads: number, buffers: GPUBuffer[]): Step {
@@ -98,8 +98,8 @@ export class GpuPoser {
 }
 
 /** The bases of centres, raw opacities and colours together: eight numbers for each Gaussian and activation. */
-function basisOf({ means, opacity_logits, colour }: ExpressionChanges, count: number): { basis: Float32Array; columns: number } {
-  const parts = [{ part: means, width: 3, at: 0 }, { part: opacity_logits, width: 1, at: 3 }, { part: colour, width: 3, at: 4 }];
+function basisOf({ means, opacity_logits, color }: ExpressionChanges, count: number): { basis: Float32Array; columns: number } {
+  const parts = [{ part: means, width: 3, at: 0 }, { part: opacity_logits, width: 1, at: 3 }, { part: color, width: 3, at: 4 }];
   const columnsOf = (part: Float32Array | null, width: number) => (part?.length ?? 0) / width / Math.max(count, 1);
   const columns = Math.max(...parts.map(({ part, width }) => columnsOf(part, width)));
   const basis = new Float32Array(8 * count * columns);

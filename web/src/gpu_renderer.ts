@@ -5,7 +5,7 @@ import { dispatch, Memory } from "./gpu_memory";
 import { GpuPoser, type Posed } from "./gpu_pose";
 import { DRAW, PROJECT, SCREEN, THREADS } from "./gpu_shaders";
 import { GpuSorter, SortPipelines } from "./gpu_sort";
-import { spread, type Colour, type Drawer, type View } from "./renderer";
+import { spread, type Color, type Drawer, type View } from "./renderer";
 import type { Poser } from "./rig";
 import type { SkinnedPoser } from "./skinned";
 
@@ -51,7 +51,7 @@ export class GpuRenderer implements Drawer {
   private readonly sorter: GpuSorter;
   /** Numbers of `means`, `colours` and `shapes`. */
   private readonly means: Float32Array;
-  private readonly colours: Float32Array;
+  private readonly colors: Float32Array;
   private readonly shapeValues: Float32Array;
   private readonly project: GPUBindGroup;
   private readonly splats: GPUBindGroup;
@@ -64,29 +64,29 @@ export class GpuRenderer implements Drawer {
     const { device } = pipelines, { baked } = avatar, { attributes, faces, face_index } = baked, memory = (this.memory = new Memory(device));
     const count = (this.count = face_index.length);
     this.shRest = attributes.sh.length / 3 / Math.max(count, 1) - 1;
-    [this.means, this.colours, this.shapeValues] = [4, 4, 8].map((width) => new Float32Array(width * count));
+    [this.means, this.colors, this.shapeValues] = [4, 4, 8].map((width) => new Float32Array(width * count));
     face_index.forEach((face, i) => (this.means[4 * i + 3] = face));
     spread(baked.means, this.means);
     for (let i = 0; i < count; ++i) {
       const at = 3 * i * (1 + this.shRest);
-      this.colours.set([...attributes.sh.subarray(at, at + 3), attributes.opacity_logits[i]], 4 * i);
+      this.colors.set([...attributes.sh.subarray(at, at + 3), attributes.opacity_logits[i]], 4 * i);
     }
     const rest = new Float32Array(4 * count * this.shRest);
     for (let i = 0; i < count * this.shRest; ++i) {
       const from = 3 * (i + Math.floor(i / this.shRest) + 1);
       rest.set(attributes.sh.subarray(from, from + 3), 4 * i);
     }
-    const posed = (this.posed = { frames: memory.storage(4 * faces.length), means: memory.storage(this.means), colours: memory.storage(this.colours) });
+    const posed = (this.posed = { frames: memory.storage(4 * faces.length), means: memory.storage(this.means), colors: memory.storage(this.colors) });
     this.shapes = memory.storage(8 * count);
     this.view = memory.uniform(VIEW_SIZE);
     this.state = memory.indirect(EMPTY_STATE);
     this.sorter = new GpuSorter(pipelines.sort, memory, count, this.view, this.state);
     const splats = memory.storage(12 * count), sorted = this.sorter;
-    const inputs = [posed.frames, posed.means, this.shapes, posed.colours, memory.storage(rest)];
+    const inputs = [posed.frames, posed.means, this.shapes, posed.colors, memory.storage(rest)];
     this.project = memory.group(pipelines.project.getBindGroupLayout(0), [this.view, ...inputs, splats, sorted.keys, this.state]);
     this.splats = memory.group(pipelines.draw.getBindGroupLayout(0), [this.view, splats, sorted.order]);
     this.uploadShapes(attributes.quats, attributes.log_scales.map(Math.exp));
-    this.gpuPoser = baked.skinned ? null : new GpuPoser(memory, baked, posed, this.means, this.colours);
+    this.gpuPoser = baked.skinned ? null : new GpuPoser(memory, baked, posed, this.means, this.colors);
     context.configure({ device, format: pipelines.format, alphaMode: "premultiplied" });
   }
 
@@ -97,7 +97,7 @@ export class GpuRenderer implements Drawer {
   }
 
   /** Draws the Gaussians over a background. The order is the GPU's own. */
-  draw(_order: () => Uint32Array, view: View, background: Colour): void {
+  draw(_order: () => Uint32Array, view: View, background: Color): void {
     const { pipelines, count } = this, { device } = pipelines, [red, green, blue, alpha] = background, d = view.directions;
     const told = new Float32Array(VIEW_SIZE);
     told.set(view.head);
@@ -145,13 +145,13 @@ export class GpuRenderer implements Drawer {
   }
 
   private uploadPosed(poser: Poser, skinned: SkinnedPoser): void {
-    const { memory, posed, means, colours } = this;
+    const { memory, posed, means, colors } = this;
     spread(poser.means, means);
-    spread(poser.colours, colours);
-    poser.opacityLogits.forEach((logit, i) => (colours[4 * i + 3] = logit));
+    spread(poser.colors, colors);
+    poser.opacityLogits.forEach((logit, i) => (colors[4 * i + 3] = logit));
     memory.write(posed.frames, poser.frames);
     memory.write(posed.means, means);
-    memory.write(posed.colours, colours);
+    memory.write(posed.colors, colors);
     this.uploadShapes(skinned.quats, skinned.scales);
   }
 

@@ -51,24 +51,24 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
 /** Centres, first colours and raw opacities at the activations. A basis has centres and opacity, then colours. */
 export const CHANGE = `${POSE}
 @group(0) @binding(1) var<storage, read> restMeans: array<vec4f>;
-@group(0) @binding(2) var<storage, read> restColours: array<vec4f>;
+@group(0) @binding(2) var<storage, read> restColors: array<vec4f>;
 @group(0) @binding(3) var<storage, read> basis: array<vec4f>;
 @group(0) @binding(4) var<storage, read_write> means: array<vec4f>;
-@group(0) @binding(5) var<storage, read_write> colours: array<vec4f>;
+@group(0) @binding(5) var<storage, read_write> colors: array<vec4f>;
 
 @compute @workgroup_size(${THREADS})
 fn main(@builtin(global_invocation_id) id: vec3u) {
   let i = id.x;
   if (i >= pose.count) { return; }
   var mean = restMeans[i];
-  var colour = restColours[i];
+  var color = restColors[i];
   for (var k = 0u; k < pose.columns; k++) {
     let a = activation(k); let first = basis[2 * (i * pose.columns + k)];
     mean += a * vec4f(first.xyz, 0);
-    colour += a * vec4f(basis[2 * (i * pose.columns + k) + 1].xyz, first.w);
+    color += a * vec4f(basis[2 * (i * pose.columns + k) + 1].xyz, first.w);
   }
   means[i] = mean;
-  colours[i] = colour;
+  colors[i] = color;
 }`;
 
 /** Adds the network of features.ts: with `texels` of features, `rank` directions, `hidden` units. */
@@ -78,7 +78,7 @@ export function featureNetwork(texels: number, rank: number, hidden: number): st
 @group(0) @binding(2) var<storage, read> basis: array<vec2u>;
 @group(0) @binding(3) var<storage, read> own: array<vec2u>;
 @group(0) @binding(4) var<storage, read> weights: array<vec4f>;
-@group(0) @binding(5) var<storage, read_write> colours: array<vec4f>;
+@group(0) @binding(5) var<storage, read_write> colors: array<vec4f>;
 fn four(halves: vec2u) -> vec4f { return vec4f(unpack2x16float(halves.x), unpack2x16float(halves.y)); }
 
 @compute @workgroup_size(${THREADS})
@@ -100,7 +100,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     for (var t = 0u; t < ${texels}; t++) { x += dot(weights[w + t], f[t]); }
     sum += weights[w + ${texels}] * select(x, ${SLOPE} * x, x < 0);
   }
-  colours[i] += sum;
+  colors[i] += sum;
 }`;
 }
 
@@ -119,7 +119,7 @@ const SPLAT = `
 struct Splat {
   place: vec4f,   // centre, slope, log2 of the opacity
   shape: vec4f,   // roots of sharpness and falloff; half axes of the parallelogram per unit of reach
-  colour: vec4f,  // and the reach
+  color: vec4f,  // and the reach
 }`;
 
 /** Depths of the visible Gaussians as the bits of positive floats; then the arguments of an indirect draw. */
@@ -132,7 +132,7 @@ struct State { ${STATE_FIELDS.replace(/NUMBER/g, "atomic<u32>")} }
 @group(0) @binding(1) var<storage, read> frames: array<vec4f>;  // three for each triangle
 @group(0) @binding(2) var<storage, read> means: array<vec4f>;   // and the triangle
 @group(0) @binding(3) var<storage, read> shapes: array<vec4f>;  // rotation and scales
-@group(0) @binding(4) var<storage, read> colours: array<vec4f>; // and the raw opacity
+@group(0) @binding(4) var<storage, read> colors: array<vec4f>; // and the raw opacity
 @group(0) @binding(5) var<storage, read> sh: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> splats: array<Splat>;
 @group(0) @binding(7) var<storage, read_write> keys: array<u32>;
@@ -176,7 +176,7 @@ fn shRest(i: u32, d: vec3f) -> vec3f {
 
 // Writes the splat of a Gaussian, and returns its key.
 fn project(i: u32) -> u32 {
-  let colour = colours[i];
+  let color = colors[i];
   let mean = means[i];
   let f = 3 * u32(mean.w);
   let a = frames[f]; let b = frames[f + 1]; let c = frames[f + 2];
@@ -184,7 +184,7 @@ fn project(i: u32) -> u32 {
   let head = vec4f(dot(a, local), dot(b, local), dot(c, local), 1);
   let v = view.head;
   let p = vec3f(dot(v[0], head), dot(v[1], head), dot(v[2], head));
-  let log2Opacity = -log2(1. + exp(min(-colour.a, 80.)));
+  let log2Opacity = -log2(1. + exp(min(-color.a, 80.)));
   if (p.z <= NEAR || log2Opacity < LOG2_ALPHA_MIN) { return UNSEEN; }
   let tangent = p.xy / p.z;
   let margin = FOV_MARGIN * .5 * view.size / view.focal;
@@ -204,7 +204,7 @@ fn project(i: u32) -> u32 {
   let reach = sqrt(max((log2Opacity - LOG2_ALPHA_MIN) * 1.3862943611, 0.)) + .1;
   let box = reach * sqrt(vec2f(xx, yy));
   if (any(centre + box < vec2f(0)) || any(centre - box > view.size)) { return UNSEEN; }
-  var rgb = 0.5 + 0.28209479177387814 * colour.rgb;
+  var rgb = 0.5 + 0.28209479177387814 * color.rgb;
   if (view.shRest > 0) {
     let eye = -(v[0].w * v[0].xyz + v[1].w * v[1].xyz + v[2].w * v[2].xyz);
     let d = normalize(head.xyz - eye); let t = view.directions;
@@ -330,14 +330,14 @@ struct Corner {
   @builtin(position) position: vec4f,
   @location(0) @interpolate(flat) place: vec4f,
   @location(1) @interpolate(flat) roots: vec2f,
-  @location(2) @interpolate(flat) colour: vec3f,
+  @location(2) @interpolate(flat) color: vec3f,
 }
 
 @vertex fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance: u32) -> Corner {
   let s = splats[order[instance]];
-  let at = s.colour.a * (vec2f(f32(vertex & 1), f32(vertex >> 1)) * 2. - 1.) * s.shape.zw;
+  let at = s.color.a * (vec2f(f32(vertex & 1), f32(vertex >> 1)) * 2. - 1.) * s.shape.zw;
   let pixel = s.place.xy + vec2f(s.place.z * at.y + at.x, at.y);
-  return Corner(vec4f(2. * pixel.x / view.size.x - 1., 1. - 2. * pixel.y / view.size.y, 0, 1), s.place, s.shape.xy, s.colour.rgb);
+  return Corner(vec4f(2. * pixel.x / view.size.x - 1., 1. - 2. * pixel.y / view.size.y, 0, 1), s.place, s.shape.xy, s.color.rgb);
 }
 
 @fragment fn blend(c: Corner) -> @location(0) vec4f {
@@ -346,7 +346,7 @@ struct Corner {
   let power = c.place.w - dot(r, r);
   if (power < -7.994353437) { discard; }
   let alpha = min(exp2(power), 0.999);
-  return vec4f(c.colour * alpha, alpha);
+  return vec4f(c.color * alpha, alpha);
 }`;
 
 /** The picture over its background. */

@@ -5,6 +5,6 @@ export { AvatarError, readAny, readMien, readPacked } from "./format";
 export { Poser } from "./rig";
 export { DepthSorter } from "./sort";
 export { Renderer } from "./renderer";
-export type { Backend, Colour, Drawer, View } from "./renderer";
+export type { Backend, Color, Drawer, View } from "./renderer";
 export { Viewer } from "./viewer";
 export type { Matrices } from "./viewer";

@@ -22,14 +22,14 @@ export interface View {
 }
 
 /** RGB and alpha, 0 to 1. */
-export type Colour = [number, number, number, number];
+export type Color = [number, number, number, number];
 
 /** What draws the avatar of a viewer. */
 export interface Drawer {
   /** Takes over what the poser has computed for a new face. */
   upload(): void;
   /** Draws over a background. `order` sorts the Gaussians, for those that cannot. */
-  draw(order: () => Uint32Array, view: View, background: Colour): void;
+  draw(order: () => Uint32Array, view: View, background: Color): void;
   dispose(): void;
 }
 
@@ -65,7 +65,7 @@ class ArrayTexture {
   }
 }
 
-const ARRAYS = ["frames", "means", "quats", "scales", "colours", "sh"] as const;
+const ARRAYS = ["frames", "means", "quats", "scales", "colors", "sh"] as const;
 
 export class Renderer implements Drawer {
   private readonly gl: WebGL2RenderingContext;
@@ -91,7 +91,7 @@ export class Renderer implements Drawer {
     const of = (texels: number) => new ArrayTexture(gl, texels);
     this.arrays = {
       frames: of(baked.faces.length), means: of(this.count), quats: of(this.count), scales: of(this.count),
-      colours: of(this.count), sh: of(this.count * this.shRest),
+      colors: of(this.count), sh: of(this.count * this.shRest),
     };
     const { quats, scales, means, sh } = this.arrays;
     quats.values.set(attributes.quats);
@@ -129,12 +129,12 @@ export class Renderer implements Drawer {
   }
 
   /** Draws the Gaussians in the given order over a background. */
-  draw(order: () => Uint32Array, view: View, background: Colour): void {
+  draw(order: () => Uint32Array, view: View, background: Color): void {
     const { gl, splats, screen } = this;
     this.picture.begin(view.width, view.height);
     splats.use();
     ARRAYS.forEach((name, unit) => {
-      if (name === "colours" && this.features) {
+      if (name === "colors" && this.features) {
         gl.activeTexture(gl.TEXTURE0 + unit);
         gl.bindTexture(gl.TEXTURE_2D, this.features.output);
       } else this.arrays[name].bind(unit);
@@ -176,14 +176,14 @@ export class Renderer implements Drawer {
   }
 
   private uploadChanged(): void {
-    const { means, colours } = this.arrays, { poser } = this;
+    const { means, colors } = this.arrays, { poser } = this;
     spread(poser.means, means.values);
-    spread(poser.colours, colours.values);
+    spread(poser.colors, colors.values);
     const { features } = this;
-    poser.opacityLogits.forEach((logit, i) => (colours.values[4 * i + 3] = features ? logit : 1 / (1 + Math.exp(-logit))));
+    poser.opacityLogits.forEach((logit, i) => (colors.values[4 * i + 3] = features ? logit : 1 / (1 + Math.exp(-logit))));
     means.upload();
-    colours.upload();
-    features?.run((unit) => colours.bind(unit), poser.activations);
+    colors.upload();
+    features?.run((unit) => colors.bind(unit), poser.activations);
     if (poser.skinned) this.uploadShapes(poser.skinned);
   }
 }

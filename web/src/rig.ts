@@ -180,7 +180,7 @@ export class Poser {
   /** Raw opacities. */
   readonly opacityLogits: Float32Array;
   /** First colour coefficients [n, 3]. */
-  readonly colours: Float32Array;
+  readonly colors: Float32Array;
   /** The rig's points in the head frame. */
   points: Float32Array = new Float32Array();
   /** What moves Gaussians that are bound to no mesh. */
@@ -194,7 +194,7 @@ export class Poser {
   runsNetwork = true;
   /** Whether posing goes beyond the rig's points and the activations. Not where the renderer does all else on the GPU. */
   binds = true;
-  private readonly restColours: Float32Array;
+  private readonly restColors: Float32Array;
   private readonly network: FeatureNetwork | null;
   private posed = false;
 
@@ -206,9 +206,9 @@ export class Poser {
     this.means = means.slice();
     this.opacityLogits = attributes.opacity_logits.slice();
     const width = attributes.sh.length / Math.max(count, 1);
-    this.restColours = new Float32Array(3 * count);
-    for (let i = 0; i < count; ++i) this.restColours.set(attributes.sh.subarray(i * width, i * width + 3), 3 * i);
-    this.colours = this.restColours.slice();
+    this.restColors = new Float32Array(3 * count);
+    for (let i = 0; i < count; ++i) this.restColors.set(attributes.sh.subarray(i * width, i * width + 3), 3 * i);
+    this.colors = this.restColors.slice();
     const { changes } = baked, features = changes?.features;
     this.activations = new Float64Array(changes ? changes.directions.length / changes.rest.length : 0);
     this.network = features ? new FeatureNetwork(features, count) : null;
@@ -234,11 +234,11 @@ export class Poser {
     if (!this.binds) return;
     changed(this.baked.means, changes.means, weights, this.means);
     changed(attributes.opacity_logits, changes.opacity_logits, weights, this.opacityLogits);
-    changed(this.restColours, changes.colour, weights, this.colours);
+    changed(this.restColors, changes.color, weights, this.colors);
     if (!this.network || !this.runsNetwork) return;
     if (!changes.opacity_logits) this.opacityLogits.set(attributes.opacity_logits);
-    if (!changes.colour) this.colours.set(this.restColours);
-    this.network.add(weights, this.colours, this.opacityLogits);
+    if (!changes.color) this.colors.set(this.restColors);
+    this.network.add(weights, this.colors, this.opacityLogits);
   }
 
   /** Depths of the centres along a row of a view of the head frame: x view[0] + y view[1] + z view[2] + view[3]. */

@@ -8,7 +8,7 @@ export const TEXTURE_WIDTH = 1024;
 
 export const SPLAT_VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D;
-uniform sampler2D u_frames, u_means, u_quats, u_scales, u_colours, u_sh;
+uniform sampler2D u_frames, u_means, u_quats, u_scales, u_colors, u_sh;
 uniform vec4 u_view[3];    // rows of head to camera
 uniform mat3 u_shFrame;    // head to the frame of the view directions
 uniform vec2 u_focal, u_centre, u_size;
@@ -16,7 +16,7 @@ uniform int u_shRest;      // coefficients per channel after the first
 in uint a_index;
 flat out vec4 v_place;     // centre, slope, log2 of the opacity
 flat out vec2 v_roots;     // of sharpness and falloff
-flat out vec3 v_colour;
+flat out vec3 v_color;
 const float NEAR = 0.01, DILATION = 0.3, FOV_MARGIN = 0.3, LOG2_ALPHA_MIN = -7.994353437, HALF_LOG2E = 0.72134752044;
 
 vec4 at(sampler2D array, int i) { return texelFetch(array, ivec2(i & ${TEXTURE_WIDTH - 1}, i >> ${Math.log2(TEXTURE_WIDTH)}), 0); }
@@ -50,13 +50,13 @@ vec3 shRest(int i, vec3 d) {
 void main() {
   gl_Position = vec4(2, 2, 2, 1);  // outside of the picture
   int i = int(a_index);
-  vec4 mean = at(u_means, i), colour = at(u_colours, i), a, b, c;
+  vec4 mean = at(u_means, i), color = at(u_colors, i), a, b, c;
   int f = 3 * int(mean.w);
   a = at(u_frames, f); b = at(u_frames, f + 1); c = at(u_frames, f + 2);
   vec4 local = vec4(mean.xyz, 1);
   vec4 head = vec4(dot(a, local), dot(b, local), dot(c, local), 1);
   vec3 p = vec3(dot(u_view[0], head), dot(u_view[1], head), dot(u_view[2], head));
-  float log2Opacity = log2(max(colour.a, 1e-30));
+  float log2Opacity = log2(max(color.a, 1e-30));
   if (p.z <= NEAR || log2Opacity < LOG2_ALPHA_MIN) return;
   vec2 tangent = p.xy / p.z, margin = FOV_MARGIN * .5 * u_size / u_focal;
   vec2 centre = u_focal * tangent + u_centre;
@@ -72,13 +72,13 @@ void main() {
   float slope = xy / yy;
   v_place = vec4(centre, slope, log2Opacity);
   v_roots = vec2(sqrt(yy / determinant * HALF_LOG2E), sqrt(HALF_LOG2E / yy));
-  vec3 rgb = 0.5 + 0.28209479177387814 * colour.rgb;
+  vec3 rgb = 0.5 + 0.28209479177387814 * color.rgb;
   if (u_shRest > 0) {
     vec3 t = vec3(u_view[0].w, u_view[1].w, u_view[2].w);
     vec3 eye = -(t.x * u_view[0].xyz + t.y * u_view[1].xyz + t.z * u_view[2].xyz);
     rgb += shRest(i, u_shFrame * normalize(head.xyz - eye));
   }
-  v_colour = max(rgb, 0.);
+  v_color = max(rgb, 0.);
   // A parallelogram around the ellipse where alpha is 1/255, a little larger for what is rounded.
   float reach = sqrt(max((log2Opacity - LOG2_ALPHA_MIN) * 1.3862943611, 0.)) + .1;
   vec2 corner = reach * vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2. - reach;
@@ -90,15 +90,15 @@ void main() {
 export const SPLAT_FRAGMENT = `#version 300 es
 precision highp float;
 uniform vec2 u_size;
-flat in vec4 v_place; flat in vec2 v_roots; flat in vec3 v_colour;
-out vec4 o_colour;
+flat in vec4 v_place; flat in vec2 v_roots; flat in vec3 v_color;
+out vec4 o_color;
 void main() {
   vec2 d = vec2(gl_FragCoord.x, u_size.y - gl_FragCoord.y) - v_place.xy;
   vec2 r = v_roots * vec2(d.x - v_place.z * d.y, d.y);
   float power = v_place.w - dot(r, r);
   if (power < -7.994353437) discard;
   float alpha = min(exp2(power), 0.999);
-  o_colour = vec4(v_colour * alpha, alpha);
+  o_color = vec4(v_color * alpha, alpha);
 }`;
 
 export const SCREEN_VERTEX = `#version 300 es
@@ -108,11 +108,11 @@ export const SCREEN_FRAGMENT = `#version 300 es
 precision highp float;
 uniform sampler2D u_picture;
 uniform vec4 u_background;  // premultiplied
-out vec4 o_colour;
+out vec4 o_color;
 void main() {
   vec4 c = texelFetch(u_picture, ivec2(gl_FragCoord.xy), 0);
   c += (1. - c.a) * u_background;
-  o_colour = vec4(clamp(c.rgb, 0., c.a), c.a);
+  o_color = vec4(clamp(c.rgb, 0., c.a), c.a);
 }`;
 
 /** Width of the textures that hold the arrays of features. Every WebGL2 device has at least 2048. */
@@ -126,7 +126,7 @@ uniform sampler2D u_rest, u_neutral, u_basis, u_own, u_weights;
 uniform float u_activations[${rank}];
 uniform vec4 u_bias;
 uniform int u_count;
-out vec4 o_colour;
+out vec4 o_color;
 vec4 at(sampler2D array, int i) { return texelFetch(array, ivec2(i & ${FEATURE_WIDTH - 1}, i >> ${Math.log2(FEATURE_WIDTH)}), 0); }
 void main() {
   ivec2 place = ivec2(gl_FragCoord.xy);
@@ -149,6 +149,6 @@ void main() {
     }
   }
   sum += texelFetch(u_rest, place, 0);
-  o_colour = vec4(sum.rgb, 1. / (1. + exp(-sum.a)));
+  o_color = vec4(sum.rgb, 1. / (1. + exp(-sum.a)));
 }`;
 }

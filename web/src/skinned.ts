@@ -39,7 +39,7 @@ export function onTriangle(avatar: Avatar): Avatar {
 interface Written {
   readonly means: Float32Array;
   readonly opacityLogits: Float32Array;
-  readonly colours: Float32Array;
+  readonly colors: Float32Array;
 }
 
 export class SkinnedPoser {
@@ -62,12 +62,12 @@ export class SkinnedPoser {
   pose(face: Face, out: Written): void {
     out.means.set(this.rig.pose(face));
     this.addStill(face, out.means);
-    const { attributes, rig, network, scale_activation, scale_gain, scale_offset, colour_activation } = this.baked;
+    const { attributes, rig, network, scale_activation, scale_gain, scale_offset, color_activation } = this.baked;
     const scale = scale_activation === "sigmoid" ? (x: number) => scale_gain * sigmoid(x) + scale_offset : Math.exp;
-    const colour = colour_activation === "sigmoid" ? (x: number) => (sigmoid(x) - 0.5) / SH_C0 : (x: number) => x;
+    const color = color_activation === "sigmoid" ? (x: number) => (sigmoid(x) - 0.5) / SH_C0 : (x: number) => x;
     const parts: Record<string, [Float32Array, Float32Array, (x: number) => number]> = {
       quats: [attributes.quats, this.quats, (x) => x], log_scales: [attributes.log_scales, this.scales, scale],
-      opacity_logits: [attributes.opacity_logits, out.opacityLogits, (x) => x], sh: [attributes.sh, out.colours, colour],
+      opacity_logits: [attributes.opacity_logits, out.opacityLogits, (x) => x], sh: [attributes.sh, out.colors, color],
     };
     for (const name of Object.keys(parts)) {
       if (network.outputs.includes(name)) continue;

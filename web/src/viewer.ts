@@ -1,7 +1,7 @@
 // An avatar on a canvas: face, camera, a packed motion, and drawing when something has changed.
 
 import { copyFace, motionFace, motionLength, type Avatar, type Face, type Motion } from "./avatar";
-import { Renderer, type Backend, type Colour, type Drawer, type View } from "./renderer";
+import { Renderer, type Backend, type Color, type Drawer, type View } from "./renderer";
 import { Poser } from "./rig";
 import { chained, moved, rigid, rotationMatrix } from "./rigid";
 import { DepthSorter } from "./sort";
@@ -27,7 +27,7 @@ export class Viewer {
   /** The camera of another 3D program, in place of the viewer's own. */
   matrices: Matrices | null = null;
   /** Colour behind the head; alpha 0 is transparent. */
-  background: Colour = [0, 0, 0, 0];
+  background: Color = [0, 0, 0, 0];
   /** Timestep of the motion, and whether it runs. */
   timestep = 0;
   playing = false;

@@ -2,7 +2,7 @@
 
 import type { Avatar } from "./avatar";
 import { GpuRenderer, Pipelines } from "./gpu_renderer";
-import type { Backend, Colour, Drawer, Renderer, View } from "./renderer";
+import type { Backend, Color, Drawer, Renderer, View } from "./renderer";
 import type { Poser } from "./rig";
 
 /**
@@ -84,7 +84,7 @@ class LastingRenderer implements Drawer {
     this.drawer.upload();
   }
 
-  draw(order: () => Uint32Array, view: View, background: Colour): void {
+  draw(order: () => Uint32Array, view: View, background: Color): void {
     const { hidden, screen } = this, { width, height } = view;
     if (hidden.width !== width || hidden.height !== height) [hidden.width, hidden.height] = [width, height];
     this.drawer.draw(order, view, background);

@@ -17,7 +17,7 @@ if (out) {
   const written = faces.flatMap((face) => {
     poser.pose(face);
     const shapes = poser.skinned ? [poser.skinned.quats, poser.skinned.scales] : [];
-    return [poser.points, poser.centres(), poser.opacityLogits, poser.colours, ...shapes].map((array) => Buffer.from(array.slice().buffer));
+    return [poser.points, poser.centres(), poser.opacityLogits, poser.colors, ...shapes].map((array) => Buffer.from(array.slice().buffer));
   });
   writeFileSync(out, Buffer.concat(written));
 } else {

@@ -82,13 +82,13 @@ def _one() -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Lessons:
-    """Lessons that a new avatar gets before the first step, without pictures."""
+class Pretraining:
+    """Training of a new avatar before the first picture."""
 
     count: int
-    """Number of lessons."""
-    teach: Callable[[FaceParams], Iterator[None]]
-    """Teaches it, given all training timesteps. Yields after each lesson."""
+    """Number of steps."""
+    run: Callable[[FaceParams], Iterator[None]]
+    """Trains it, given all training timesteps. Yields after each step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +99,8 @@ class Extras:
     """The surface that the Gaussians are bound to."""
     frames_per_step: Callable[[], int] = _one
     """Returns the number of training frames that the next optimiser step uses."""
-    lessons: Lessons | None = None
-    """Lessons before the first step. None if the avatar needs none."""
+    pretraining: Pretraining | None = None
+    """Training before the first picture. None if the avatar needs none."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
 

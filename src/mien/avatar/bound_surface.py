@@ -1,7 +1,7 @@
 """The surface that an avatar's Gaussians are bound to: what is known of it, and what training may do with it.
 
 Methods that bind Gaussians to triangles of the face model have a `BoundSurface` (`Avatar.surface`). Parts of a training
-that close a head, move its hair or furnish its mouth work on it alone, and never know the method.
+that close a head, move its hair or fill its mouth work on it alone, and never know the method.
 """
 
 from abc import ABC, abstractmethod
@@ -26,14 +26,14 @@ class SurfacePrior:
     """Colours, 0..1, completed where no picture shows any. None if nothing was completed."""
     doubt: Float[Tensor, " f"] | None = None
     """0 for triangles that pictures show well, 1 for those that none shows. None if nothing was completed."""
-    made_up: Bool[Tensor, " f"] | None = None
+    filled_in: Bool[Tensor, " f"] | None = None
     """Triangles that are filled rather than trained: no picture shows them, and they are above the cut at the neck."""
     closed: Bool[Tensor, " f"] | None = None
     """Triangles that are an opaque surface before the first step: the made-up ones, and the inside of the mouth, which
     is trained where pictures show it. None if these are the made-up ones."""
     strands: Bool[Tensor, " f"] | None = None
     """Made-up triangles that are covered with strands of hair. None means none."""
-    looseness: Float[Tensor, " f"] | None = None
+    widening: Float[Tensor, " f"] | None = None
     """Factors on the limits to the surface (`BoundSurface.keep_to`), for parts that the mesh fits less well. None
     means 1."""
 
@@ -53,10 +53,10 @@ class BoundSurface(ABC):
     @property
     @abstractmethod
     def wants_first_colors(self) -> bool:
-        """Whether `paint` is to be called before the first step."""
+        """Whether `set_first_colors` is to be called before the first step."""
 
     @abstractmethod
-    def paint(self, colors: Float[Tensor, "v 3"]) -> None:
+    def set_first_colors(self, colors: Float[Tensor, "v 3"]) -> None:
         """Take the face model's vertices' mean colours in the training pictures, 0..1, as first colours."""
 
     @property
@@ -91,7 +91,7 @@ class BoundSurface(ABC):
         """Move Gaussians along the normals of their triangles, by metres."""
 
     @abstractmethod
-    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
+    def fill_interior(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
         """Close the surface of those of the chosen triangles that are less than half opaque.
 
         The number of Gaussians does not change.

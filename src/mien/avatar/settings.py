@@ -96,10 +96,10 @@ class FaceTuning:
     """Learning rate of the head's position, in metres per step."""
     keep_mean_pose: bool = False
     """Whether the corrections of the head's pose have a mean of zero, in the head's own frame. With one camera, heads
-    and Gaussians otherwise move away from the camera together, which shows from aside."""
+    and Gaussians otherwise move away from the camera together, which shows from the side."""
     keep_turns: bool = False
     """Whether what follows the head's turns is removed from the corrections of its pose. A head that is too deep
-    otherwise turns less, which a front camera hardly sees and which shows from aside. It is used only with one
+    otherwise turns less, which a front camera hardly sees and which shows from the side. It is used only with one
     camera."""
     within_bounds: bool = False
     """Whether expression coefficients stay within the face model's bounds. Those that were tracked beyond a bound may

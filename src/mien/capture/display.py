@@ -8,7 +8,7 @@ from av.sidedata.sidedata import Type as SideDataType
 from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
-from mien.capture.colours import UNSPECIFIED, Colours, colours_of
+from mien.capture.colors import UNSPECIFIED, Colors, colors_of
 from mien.capture.tone import ToneMapper
 from mien.capture.video_file import MAX_FRAME_PIXELS, TOO_MANY_PIXELS
 from mien.errors import UserError
@@ -23,7 +23,7 @@ class Display:
     """Converts the frames of one clip to one size, which the first frame decides."""
 
     def __init__(
-        self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0, container: Colours = UNSPECIFIED
+        self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0, container: Colors = UNSPECIFIED
     ) -> None:
         """Create the converter of one clip.
 
@@ -50,20 +50,20 @@ class Display:
             UserError: the aspect ratio differs from that of earlier frames, or the converted frame has too many pixels.
         """
         self._fit(frame)
-        colours = colours_of(frame, self._container)
+        colors = colors_of(frame, self._container)
         same_size = self._size == (frame.width, frame.height)
         shrinks = self._size[0] < frame.width or self._size[1] < frame.height
         converted = self._reformatter.reformat(
             frame,
             width=self._size[0],
             height=self._size[1],
-            format="rgb48le" if colours.hdr else "rgb24",
-            src_colorspace=colours.matrix,
-            src_color_range=colours.range,
+            format="rgb48le" if colors.hdr else "rgb24",
+            src_colorspace=colors.matrix,
+            src_color_range=colors.range,
             interpolation=_SHRINKING if shrinks and not same_size else ACCURATE,
         ).to_ndarray()
-        if colours.hdr:
-            mapper = self._tone_mappers.setdefault(colours.transfer, ToneMapper(colours.transfer))
+        if colors.hdr:
+            mapper = self._tone_mappers.setdefault(colors.transfer, ToneMapper(colors.transfer))
             converted = mapper.to_srgb(converted)
         return _turn(converted, self._matrix) if self._matrix else converted
 

@@ -154,11 +154,11 @@ def combs(frame: av.VideoFrame) -> float:
     A pixel counts if three successive differences down its column have alternating signs and are large. Noise and fine
     patterns do that too, but along rows as well, so what rows have is subtracted. Progressive pictures are near 0.
     """
-    grey = frame.reformat(format="gray").to_ndarray()
-    skipped = 1 + grey.size // _COMB_PIXELS
-    if min(grey.shape) < _LEAST_SIDE * skipped:
+    gray = frame.reformat(format="gray").to_ndarray()
+    skipped = 1 + gray.size // _COMB_PIXELS
+    if min(gray.shape) < _LEAST_SIDE * skipped:
         return 0.0
-    return _alternating(grey[:, ::skipped]) - _alternating(grey.T[:, ::skipped])
+    return _alternating(gray[:, ::skipped]) - _alternating(gray.T[:, ::skipped])
 
 
 def _alternating(lines: UInt8[np.ndarray, "h w"]) -> float:

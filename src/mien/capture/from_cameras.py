@@ -21,10 +21,10 @@ from mien.capture.from_video import (
     STATE,
     CaptureJob,
     check_place,
+    cleaning_up,
     open_job,
     prepare,
     read_finished,
-    tidy,
 )
 from mien.capture.given import read_given
 from mien.capture.head_path import HeadPath, choose_crops, disagreeing, find_head_path
@@ -32,7 +32,7 @@ from mien.capture.pace import frame_rate, tell_pauses
 from mien.capture.parts import Part
 from mien.capture.people import Person, choose_person
 from mien.capture.process import Chunk, Reel, process_part
-from mien.capture.quality import MEASURES, FrameQuality, quality_report, relative_quality, skin_colours
+from mien.capture.quality import MEASURES, FrameQuality, quality_report, relative_quality, skin_colors
 from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
@@ -107,7 +107,7 @@ def capture_cameras(
         if capture is not None:
             return capture
         check_place(out, whole)
-        with tidy(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
+        with cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
             views = _survey_views(jobs, cameras, prepare(survey_folder, whole.key))
             _capture_views(views, whole, settings, out)
     return read_capture(out)
@@ -231,7 +231,7 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
     crops, (width, height) = choose_crops(path, cameras, settings.size, settings.crop == "none")
     work = prepare(partial_folder(out), whole.key)
     ids = tuple(view.camera_id for view in views)
-    layout = FrameLayout(work, ids, len(path.centres), height, width)
+    layout = FrameLayout(work, ids, len(path.centers), height, width)
     check_room(layout, whole.name, out)
     chunks = [
         process_part(
@@ -321,7 +321,7 @@ def _finish(
         "faces_by_camera": dict(zip(layout.camera_ids, found.tolist(), strict=True)),
         "kind_by_camera": {view.camera_id: kind_report(view.job.frames, view.survey) for view in views},
         **tell_pauses(whole.name, timestamps),
-        **quality_report(whole.name, quality, skin_colours(_joined_arrays(chunks, "quality").reshape(-1, MEASURES))),
+        **quality_report(whole.name, quality, skin_colors(_joined_arrays(chunks, "quality").reshape(-1, MEASURES))),
     }
     digests = {FRAMES: _joined_arrays(chunks, "frame_digests"), MATTES: _joined_arrays(chunks, "matte_digests")}
     digests = {kind: array.reshape(array.shape[:2]) for kind, array in digests.items()}
@@ -357,10 +357,10 @@ def _remove_astray(landmarks: Float[np.ndarray, "t c l 2"], path: HeadPath, came
     assert landmarks.shape[2] == LANDMARKS
     for index, camera in enumerate(cameras):
         found = landmarks[:, index]
-        inside = path.centres @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
-        centres = (inside @ camera.K.numpy().T)[:, :2] / inside[:, 2:]
+        inside = path.centers @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
+        centers = (inside @ camera.K.numpy().T)[:, :2] / inside[:, 2:]
         least, most = found.min(axis=1), found.max(axis=1)
         side = np.maximum((most - least).max(axis=1), 1.0)
         with np.errstate(invalid="ignore"):
-            is_astray = np.linalg.norm((least + most) / 2 - centres, axis=1) > _MAX_ASTRAY * side
+            is_astray = np.linalg.norm((least + most) / 2 - centers, axis=1) > _MAX_ASTRAY * side
         found[is_astray] = np.nan

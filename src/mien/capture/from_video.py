@@ -82,7 +82,7 @@ def _capture_whole(out: Path, job: CaptureJob) -> Capture:
         return capture
     check_place(out, job)
     scratch = partial_folder(out).with_suffix(".survey")
-    with tidy(out, scratch) as survey_folder:
+    with cleaning_up(out, scratch) as survey_folder:
         given = read_given(job.settings, job.frames)
         survey = _run_survey(job, survey_folder, given)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
@@ -129,7 +129,7 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
         return finished
     for first in (job.name, f"{job.name}-1"):
         check_place(_capture_dir(sequences, first), job)
-    with tidy(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
+    with cleaning_up(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
         given = read_given(job.settings, job.frames)
         survey = _run_survey(job, survey_folder, given)
         parts = find_parts(survey, job.settings, job.frames.path, job.name)
@@ -219,7 +219,7 @@ def check_place(out: Path, job: CaptureJob) -> None:
 
 
 @contextmanager
-def tidy(out: Path, survey_folder: Path) -> Iterator[Path]:
+def cleaning_up(out: Path, survey_folder: Path) -> Iterator[Path]:
     """Yield the folder for the survey and remove it at the end. After a UserError, remove new empty folders too."""
     missing = [folder for folder in (out.parent, *out.parent.parents) if not folder.exists()]
     threads = cv2.getNumThreads()

@@ -29,7 +29,7 @@ _SQUARISH, _MOSTLY_HEAD = 1.25, 0.7
 class HeadPath:
     """The middle of the face at each timestep, and the cameras that agree on it."""
 
-    centres: Float[np.ndarray, "t 3"]
+    centers: Float[np.ndarray, "t 3"]
     """Position in world space, in metres. NaN where fewer than two cameras agree."""
     agrees: Bool[np.ndarray, "t c"]
     """Whether the face that a camera found is where the others see it."""
@@ -37,7 +37,7 @@ class HeadPath:
     @property
     def known(self) -> Bool[np.ndarray, " t"]:
         """Timesteps at which the position is known."""
-        return np.isfinite(self.centres[:, 0])
+        return np.isfinite(self.centers[:, 0])
 
 
 def find_head_path(
@@ -66,16 +66,16 @@ def find_head_path(
 
 def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> HeadPath:
     """Return the path on which most cameras agree, which is unknown throughout if they never do."""
-    centres, sides = (boxes[..., :2] + boxes[..., 2:]) / 2, _sides(boxes)
+    centers, sides = (boxes[..., :2] + boxes[..., 2:]) / 2, _sides(boxes)
     origins = np.stack([camera.position.numpy() for camera in cameras]).astype(np.float64)
-    directions = rays_of(centres, cameras)
+    directions = rays_of(centers, cameras)
     best, best_cost = np.full((len(boxes), 3), np.nan), np.full(len(boxes), np.inf)
     for first, second in itertools.combinations(range(len(cameras)), 2):
         points = _nearest_point(origins[[first, second]], directions[:, [first, second]])
-        cost = np.minimum(_misses(points, centres, sides, cameras), 1).sum(axis=1)
+        cost = np.minimum(_misses(points, centers, sides, cameras), 1).sum(axis=1)
         better = np.isfinite(points[:, 0]) & (cost < best_cost)
         best[better], best_cost[better] = points[better], cost[better]
-    agrees = _misses(best, centres, sides, cameras) < _MAX_MISS
+    agrees = _misses(best, centers, sides, cameras) < _MAX_MISS
     agrees[agrees.sum(axis=1) < 2] = False
     refined = np.full_like(best, np.nan)
     for timestep in np.flatnonzero(agrees.any(axis=1)):
@@ -138,13 +138,13 @@ def disagreeing(path: HeadPath, boxes: Float[np.ndarray, "t c 4"], cameras: Sequ
     Cameras that find a face in less than half of the timesteps are left out: they look at the back of the head.
     """
     found = np.isfinite(boxes[..., 0]) & path.known[:, None]
-    centres = (boxes[..., :2] + boxes[..., 2:]) / 2
+    centers = (boxes[..., :2] + boxes[..., 2:]) / 2
     result = {}
     for index, camera in enumerate(cameras):
         seen = found[:, index]
         if seen.sum() < 0.5 * path.known.sum() or path.agrees[seen, index].mean() >= 0.5:
             continue
-        distances = np.linalg.norm(project(path.centres[seen], camera) - centres[seen, index], axis=-1)
+        distances = np.linalg.norm(project(path.centers[seen], camera) - centers[seen, index], axis=-1)
         result[index] = float(np.median(distances))  # NaN if the head is behind the camera
     return result
 
@@ -182,13 +182,13 @@ def _intersection(origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarra
 
 
 def _misses(
-    points: Float[np.ndarray, "t 3"], centres: Float[np.ndarray, "t c 2"], sides: Float[np.ndarray, "t c"],
+    points: Float[np.ndarray, "t 3"], centers: Float[np.ndarray, "t c 2"], sides: Float[np.ndarray, "t c"],
     cameras: Sequence[Camera],
 ) -> Float[np.ndarray, "t c"]:  # fmt: skip
     """Distance of the projected point from each found face, in sides of its box; infinite where there is none."""
     projected = np.stack([project(points, camera) for camera in cameras], axis=1)
     with np.errstate(invalid="ignore"):
-        misses = np.linalg.norm(projected - centres, axis=-1) / sides
+        misses = np.linalg.norm(projected - centers, axis=-1) / sides
     return np.where(np.isfinite(misses), misses, np.inf)
 
 
@@ -202,10 +202,10 @@ def project(points: Float[np.ndarray, "*n 3"], camera: Camera) -> Float[np.ndarr
 
 def _span(path: HeadPath, camera: Camera) -> Float[np.ndarray, " 4"]:
     """Left, top, right, bottom in pixels of the head's sphere over the whole path."""
-    centres = path.centres[path.known]
-    depth = (centres @ camera.viewmat[2, :3].numpy().astype(np.float64)) + float(camera.viewmat[2, 3])
+    centers = path.centers[path.known]
+    depth = (centers @ camera.viewmat[2, :3].numpy().astype(np.float64)) + float(camera.viewmat[2, 3])
     radius = _HEAD_RADIUS * np.array([[float(camera.K[0, 0]), float(camera.K[1, 1])]]) / depth[:, None]
-    middle = project(centres, camera)
+    middle = project(centers, camera)
     if not np.isfinite(middle).all():
         raise UserError("--calibration: the head is behind a camera; check that matrices go from world to camera")
     least = np.percentile(middle - radius, _OUTLIERS, axis=0)
@@ -218,13 +218,13 @@ def _check_unit(
     widths = []
     for index, camera in enumerate(cameras):
         chosen = path.agrees[:, index]
-        depth = path.centres[chosen] @ camera.viewmat[2, :3].numpy() + float(camera.viewmat[2, 3])
+        depth = path.centers[chosen] @ camera.viewmat[2, :3].numpy() + float(camera.viewmat[2, 3])
         widths.append(sides[chosen, index] * depth / float(camera.K[0, 0]))
     width = float(np.median(np.concatenate(widths)))
     least, most = _FACE_WIDTHS
     if not least <= width <= most:
-        metres = f"give positions in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
+        meters = f"give positions in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
         raise UserError(
             f"--calibration: according to these cameras the face is {width:.3g} m wide, but it should be about 0.15; "
-            + (advise() or metres)
+            + (advise() or meters)
         )

@@ -19,7 +19,7 @@ from av.container import InputContainer
 from jaxtyping import UInt8
 
 from mien.capture.camera_names import CameraName, remedy
-from mien.capture.colours import UNSPECIFIED
+from mien.capture.colors import UNSPECIFIED
 from mien.capture.display import Display
 from mien.capture.video_file import open_video, read_container_tags
 from mien.errors import UserError

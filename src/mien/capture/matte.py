@@ -53,14 +53,14 @@ class Segmenter:
         """Return the probability of a person in each part of the picture, 0..1, stabilised by the previous one."""
         small = cv2.resize(image, (_MODEL_SIZE, _MODEL_SIZE), interpolation=cv2.INTER_AREA)
         mask = self._model.process(small).segmentation_mask.copy()
-        colours = cv2.blur(small, (5, 5)).astype(np.float32) / 255
+        colors = cv2.blur(small, (5, 5)).astype(np.float32) / 255
         if self._last is not None:
-            last_mask, last_colours = self._last
+            last_mask, last_colors = self._last
             # Blend only where nothing moved: elsewhere the previous mask would leave a ghost.
-            change = np.abs(colours - last_colours).max(axis=-1)
+            change = np.abs(colors - last_colors).max(axis=-1)
             weight = _STEADY * np.exp(-np.square(change / _CHANGE))
             mask = mask + weight * (last_mask - mask)
-        self._last = (mask, colours)
+        self._last = (mask, colors)
         return mask
 
 

@@ -15,7 +15,7 @@ from mien.progress import say
 
 _CUT_REACH = 3
 """Frames on either side of a cut that must all differ. After a flash, the picture from before it comes back."""
-_CUT_NEIGHBOURS = 4
+_CUT_NEIGHBORS = 4
 """Frames on either side of a cut in which the picture may change only a little: motion lasts longer than a cut."""
 _MIN_CHANGE = 0.05
 """Smallest change at a cut, as a fraction of the mean brightness."""
@@ -153,7 +153,7 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
     cuts = []
     for index in np.flatnonzero(changes > _MIN_CHANGE).tolist():
         beside = np.concatenate(
-            [changes[max(index - _CUT_NEIGHBOURS, 0) : index], changes[index + 1 :][:_CUT_NEIGHBOURS]]
+            [changes[max(index - _CUT_NEIGHBORS, 0) : index], changes[index + 1 :][:_CUT_NEIGHBORS]]
         )
         # The largest neighbour may be the other half of a cut that passes through a blended frame.
         loudest = np.sort(beside)[-2] if len(beside) > 1 else 0.0

@@ -16,7 +16,7 @@ _MAX_GAP_SECONDS = 1.0
 """Seconds without detection after which a face that comes back starts a new track."""
 _MAX_SIZE_RATIO = 2.5
 """The same person's face is larger or smaller by at most this factor when it comes back..."""
-_MAX_COLOUR_CHANGE = 0.12
+_MAX_COLOR_CHANGE = 0.12
 """...and its mean colours (0..1) differ by at most this."""
 _MAX_CANDIDATES = 8
 """Number of tracks that are considered: those that fill the picture most."""
@@ -72,7 +72,7 @@ def choose_person(survey: Survey) -> Person:
         return Person(boxes, others)
     areas = np.square(_sizes(survey.boxes))
     lasting.sort(key=lambda track: -_weight([track], areas))
-    people = [_gather(track, lasting, areas, survey.colours) for track in lasting[:_MAX_CANDIDATES]]
+    people = [_gather(track, lasting, areas, survey.colors) for track in lasting[:_MAX_CANDIDATES]]
     accepted = max(people, key=lambda tracks: _weight(tracks, areas))
     for track in accepted:
         for frame, place in track.entries:
@@ -124,8 +124,8 @@ def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> 
     size_before, size_now = (max(math.sqrt(max((b[2] - b[0]) * (b[3] - b[1]), 0)), 1e-6) for b in (before, now))
     if not 1 / _MAX_GROWTH <= size_now / size_before <= _MAX_GROWTH:
         return float("inf")
-    centres = (before[:2] + before[2:] - now[:2] - now[2:]) / 2
-    return float(np.abs(centres).max()) / max(size_before, size_now)
+    centers = (before[:2] + before[2:] - now[:2] - now[2:]) / 2
+    return float(np.abs(centers).max()) / max(size_before, size_now)
 
 
 def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
@@ -133,21 +133,21 @@ def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
     return float(sum(areas[entry] for track in tracks for entry in track.entries))
 
 
-def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, colours: np.ndarray) -> list[_Track]:
+def _gather(first: _Track, tracks: list[_Track], areas: np.ndarray, colors: np.ndarray) -> list[_Track]:
     """Return all tracks that can be of the same person as the first one, the heaviest first."""
     accepted = [first]
     for track in tracks:
-        if track is not first and _is_same_person(accepted, track, areas, colours):
+        if track is not first and _is_same_person(accepted, track, areas, colors):
             accepted.append(track)
     return accepted
 
 
-def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, colours: np.ndarray) -> bool:
+def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, colors: np.ndarray) -> bool:
     frames = track.frames()
     if any(frames & other.frames() for other in accepted):
         return False
     now = tuple(np.array(track.entries).T)
     before = tuple(np.array([entry for other in accepted for entry in other.entries]).T)
     ratio = math.sqrt(float(np.median(areas[now])) / float(np.median(areas[before])))
-    change = np.abs(np.median(colours[now], axis=0) - np.median(colours[before], axis=0)).mean()
-    return bool(1 / _MAX_SIZE_RATIO <= ratio <= _MAX_SIZE_RATIO and change <= _MAX_COLOUR_CHANGE)
+    change = np.abs(np.median(colors[now], axis=0) - np.median(colors[before], axis=0)).mean()
+    return bool(1 / _MAX_SIZE_RATIO <= ratio <= _MAX_SIZE_RATIO and change <= _MAX_COLOR_CHANGE)

@@ -93,9 +93,9 @@ def _shift(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Fl
     # Both get the same grey hole where the person is, so that nothing in it favours any shift.
     prepared = []
     for image in (scene, picture):
-        grey = cv2.resize(image.mean(axis=-1), size, interpolation=cv2.INTER_AREA)
-        grey = grey - cv2.GaussianBlur(grey, (0, 0), 4.0)
-        prepared.append((grey * known).astype(np.float32))
+        gray = cv2.resize(image.mean(axis=-1), size, interpolation=cv2.INTER_AREA)
+        gray = gray - cv2.GaussianBlur(gray, (0, 0), 4.0)
+        prepared.append((gray * known).astype(np.float32))
     window = cv2.createHanningWindow(size, cv2.CV_32F)
     (x, y), _ = cv2.phaseCorrelate(prepared[0], prepared[1], window)
     if max(abs(x), abs(y)) > _MAX_SHIFT:

@@ -107,12 +107,12 @@ class LandmarkFollower:
     def _nearest(faces: np.ndarray, expected: np.ndarray, others: np.ndarray) -> Float[np.ndarray, "l 2"] | None:
         if not len(faces):
             return None
-        centres = np.array([_centre(_box(face)) for face in faces])
-        distances = np.linalg.norm(centres - _centre(expected), axis=1)
+        centers = np.array([_center(_box(face)) for face in faces])
+        distances = np.linalg.norm(centers - _center(expected), axis=1)
         best = int(np.argmin(distances))
         if distances[best] > _MAX_DISTANCE * (expected[2:] - expected[:2]).max():
             return None
-        to_others = np.linalg.norm(centres[best] - (others[:, :2] + others[:, 2:]) / 2, axis=1)
+        to_others = np.linalg.norm(centers[best] - (others[:, :2] + others[:, 2:]) / 2, axis=1)
         # Missing faces are NaN, which never compares as smaller.
         return None if (to_others < distances[best]).any() else faces[best]
 
@@ -125,7 +125,7 @@ def _box(landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " 4"]:
     return np.concatenate([landmarks.min(axis=0), landmarks.max(axis=0)])
 
 
-def _centre(box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 2"]:
+def _center(box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 2"]:
     return (box[:2] + box[2:]) / 2
 
 

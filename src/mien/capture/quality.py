@@ -32,7 +32,7 @@ _CELLS = 8
 _MAX_CAST = 0.92
 """Level of green or blue, relative to red, from which skin counts as tinted. Skin has up to 0.85 of green and 0.83 of
 blue in seven clips, and up to 0.77 and 0.67 in ten drawn people (docs/log.md)."""
-_MIN_COLOUR = 0.05
+_MIN_COLOR = 0.05
 """Relative difference of the channels below which a picture counts as grey: black and white film has no cast."""
 
 
@@ -65,23 +65,23 @@ def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray,
         return np.full(MEASURES, np.nan)
     face = image[top:bottom, left:right]
     clipped = float((face.max(axis=-1) >= _CLIPPED_LEVEL).mean())
-    return np.array([*_detail(face), float(face.mean()) / 255, clipped, *_skin_colour(face)])
+    return np.array([*_detail(face), float(face.mean()) / 255, clipped, *_skin_color(face)])
 
 
 def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
     """Return the mean second derivative along each direction, relative to the contrast."""
-    grey = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
-    scale = _SIDE / min(grey.shape)
-    grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
+    gray = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
+    scale = _SIDE / min(gray.shape)
+    gray = cv2.resize(gray, (_SIDE, _SIDE), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
     # Noise is finer than a face's detail and would count as sharpness, the more so in a small face that is enlarged.
-    grey = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), max(1.0, scale))
-    across, down, mixed = (cv2.Sobel(grey, cv2.CV_32F, x, y, ksize=3) for x, y in ((2, 0), (0, 2), (1, 1)))
+    gray = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), max(1.0, scale))
+    across, down, mixed = (cv2.Sobel(gray, cv2.CV_32F, x, y, ksize=3) for x, y in ((2, 0), (0, 2), (1, 1)))
     diagonal = (across + down) / 2
-    contrast = float(grey.std()) + 1
+    contrast = float(gray.std()) + 1
     return [float(np.abs(bend).mean()) / contrast for bend in (across, down, diagonal + mixed, diagonal - mixed)]
 
 
-def _skin_colour(face: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
+def _skin_color(face: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
     height, width = face.shape[:2]
     top, bottom = (int(part * height) for part in _SKIN_ROWS)
     left, right = (int(part * width) for part in _SKIN_COLUMNS)
@@ -99,7 +99,7 @@ def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
     return FrameQuality(sharpness, others[:, :1], others[:, 1:2])
 
 
-def skin_colours(measured: Float[np.ndarray, "t m"]) -> Float[np.ndarray, "t 3"]:
+def skin_colors(measured: Float[np.ndarray, "t m"]) -> Float[np.ndarray, "t 3"]:
     """Return the skin's colour in every frame (0..1, sRGB) from the results of `measure_face`; NaN for no face."""
     return measured[:, -_CHANNELS:]
 
@@ -110,7 +110,7 @@ def quality_report(name: str, quality: FrameQuality, skin: Float[np.ndarray, "n 
     Args:
         name: name of the capture, for messages.
         quality: quality of all frames.
-        skin: colours of the skin in all pictures (`skin_colours`).
+        skin: colours of the skin in all pictures (`skin_colors`).
     """
     seen = np.isfinite(quality.brightness)
     brightness, clipped = (
@@ -118,10 +118,10 @@ def quality_report(name: str, quality: FrameQuality, skin: Float[np.ndarray, "n 
     )
     blurred = np.flatnonzero(quality.blurred.any(axis=1)).tolist()
     known = skin[np.isfinite(skin).all(axis=1)]
-    colour = np.median(known, axis=0) if len(known) else np.zeros(_CHANNELS)
-    cast = find_cast(colour)
+    color = np.median(known, axis=0) if len(known) else np.zeros(_CHANNELS)
+    cast = find_cast(color)
     is_dark, is_overexposed = brightness < _MIN_BRIGHTNESS, clipped > _MAX_CLIPPED
-    hints = _hints(brightness if is_dark else None, clipped if is_overexposed else None, cast, colour)
+    hints = _hints(brightness if is_dark else None, clipped if is_overexposed else None, cast, color)
     for hint in hints:
         say(f"warning: {name}: {hint}")
     if blurred:
@@ -133,28 +133,28 @@ def quality_report(name: str, quality: FrameQuality, skin: Float[np.ndarray, "n 
         "blurred_frames": blurred,
         "face_brightness": round(brightness, 4),
         "face_clipped": round(clipped, 4),
-        "skin_colour": [round(float(level), 4) for level in colour],
+        "skin_color": [round(float(level), 4) for level in color],
         "dark": is_dark,
         "overexposed": is_overexposed,
-        "colour_cast": cast or None,
+        "color_cast": cast or None,
         "hints": hints,
     }
 
 
-def find_cast(colour: Float[np.ndarray, " 3"]) -> str:
+def find_cast(color: Float[np.ndarray, " 3"]) -> str:
     """Return the cast that skin of this colour has: green, blue, or empty for none.
 
     Skin of everybody has more red than green, and more green than blue or about as much, unless the light or the
     camera's white balance is wrong.
     """
-    red, green, blue = (float(level) for level in colour)
+    red, green, blue = (float(level) for level in color)
     strongest = max(green, blue)
-    if strongest <= _MAX_CAST * red or max(red, strongest) - min(red, green, blue) < _MIN_COLOUR * max(red, strongest):
+    if strongest <= _MAX_CAST * red or max(red, strongest) - min(red, green, blue) < _MIN_COLOR * max(red, strongest):
         return ""
     return "green" if green >= blue else "blue"
 
 
-def _hints(dark: float | None, white: float | None, cast: str, colour: Float[np.ndarray, " 3"]) -> list[str]:
+def _hints(dark: float | None, white: float | None, cast: str, color: Float[np.ndarray, " 3"]) -> list[str]:
     """Return a line with a remedy for each fault: a dark face's level, an over-exposed face's white part, a cast."""
     hints = []
     if dark is not None:
@@ -168,7 +168,7 @@ def _hints(dark: float | None, white: float | None, cast: str, colour: Float[np.
             "again with less exposure"
         )
     if cast:
-        red, green, blue = (round(255 * float(level)) for level in colour)
+        red, green, blue = (round(255 * float(level)) for level in color)
         hints.append(
             f"the skin is {cast} (red {red}, green {green}, blue {blue} of 255), and the avatar's will be; record the "
             "video again in white light with the camera's white balance set on white paper, or correct the colours in "

@@ -14,7 +14,7 @@ from mien.rotation import invert_rigid
 
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 """Change between OpenCV's axes of a camera (y down, z forward) and OpenGL's (y up, z backward)."""
-_MAX_NORMALISED = 20.0
+_MAX_NORMALIZED = 20.0
 """Largest number of K below which it cannot be in pixels. In picture widths, it is three degrees of view."""
 _OTHER_SIZE = 0.15
 """Relative distance of a principal point from the middle at which intrinsics may be for another size of pictures."""
@@ -89,7 +89,7 @@ _POSES: tuple[tuple[_Change, str], ...] = (
 def _intrinsics(cameras: Sequence[Camera]) -> list[tuple[_Change, tuple[str, ...]]]:
     """Return the ways to read K that its numbers allow, and each also with y from below."""
     ways: list[tuple[_Change, tuple[str, ...]]] = [(_unchanged, ())]
-    if max(float(camera.K[:2].abs().max()) for camera in cameras) < _MAX_NORMALISED:
+    if max(float(camera.K[:2].abs().max()) for camera in cameras) < _MAX_NORMALIZED:
         remedy = "K is in parts of the picture, so multiply its row 1 by the width and row 2 by the height"
         ways.append((_from_parts, (remedy,)))
     else:

@@ -29,7 +29,7 @@ _THUMBNAIL = (32, 18)
 """Width and height of thumbnails in pixels, whatever the picture's shape."""
 _GRID = 3
 """Cells along each side of the grid on which a face's mean colours are computed."""
-_STORED_NAMES = {"colours": "looks"}
+_STORED_NAMES = {"colors": "looks"}
 """Names of arrays in the file, if they differ from the names of the fields."""
 _MAX_TURNED = 8
 """Most pictures that are turned each way..."""
@@ -52,7 +52,7 @@ class Survey:
     """Time since the first frame taken, in seconds."""
     boxes: Float[np.ndarray, "t f 4"]
     """Left, top, right, bottom of the faces as fractions of the picture, largest first. NaN where there are fewer."""
-    colours: Float[np.ndarray, "t f p"]
+    colors: Float[np.ndarray, "t f p"]
     """Mean colours of each face, 0..1."""
     thumbnails: UInt8[np.ndarray, "t h w 3"]
     deinterlaced: Bool[np.ndarray, " t"]
@@ -157,20 +157,20 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advan
         largest = np.argsort(-np.prod(found[:, 2:] - found[:, :2], axis=1))[:MAX_FACES]
         boxes = np.full((MAX_FACES, 4), np.nan)
         boxes[: len(largest)] = found[largest]
-        colours = np.stack([_mean_colours(image, box) for box in boxes])
+        colors = np.stack([_mean_colors(image, box) for box in boxes])
         thumbnail = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         measured = frame.combs() if len(rows) % _COMB_STRIDE == 0 else np.nan
-        rows.append((frame.number, frame.seconds, boxes, colours, thumbnail, frame.is_deinterlaced, measured))
+        rows.append((frame.number, frame.seconds, boxes, colors, thumbnail, frame.is_deinterlaced, measured))
         advance()
     if not rows:
         return None
-    numbers, timestamps, boxes, colours, thumbnails, deinterlaced, combs = (
+    numbers, timestamps, boxes, colors, thumbnails, deinterlaced, combs = (
         np.array(column) for column in zip(*rows, strict=True)
     )
-    return Survey(numbers.astype(np.int64), timestamps, boxes, colours, thumbnails, deinterlaced, combs, size)
+    return Survey(numbers.astype(np.int64), timestamps, boxes, colors, thumbnails, deinterlaced, combs, size)
 
 
-def _mean_colours(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
+def _mean_colors(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
     """Return the mean colours of a face; NaN for no face."""
     if not np.isfinite(box).all():
         return np.full(3 * _GRID**2, np.nan)

@@ -17,7 +17,7 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
-from mien.capture.colours import Colours, colours_of
+from mien.capture.colors import Colors, colors_of
 from mien.capture.display import ACCURATE, Display
 from mien.capture.fields import Deinterlace, FieldOrder, combs, deinterlace, no_combs
 from mien.capture.sound import add_sound
@@ -71,16 +71,16 @@ def probe_video(path: Path) -> VideoInfo:
             seconds = float(stream.duration * stream.time_base)
         else:
             seconds = (container.duration or 0) / av.time_base
-        colours, order = _container_tags(path, stream)
+        colors, order = _container_tags(path, stream)
         first = _first_frame(container, stream)
-        hdr = colours_of(first, colours).hdr if first is not None else ""
+        hdr = colors_of(first, colors).hdr if first is not None else ""
         has_field_pictures = first is not None and first.interlaced_frame and order.has_field_pictures
         return VideoInfo(fps, stream.frames or round(seconds * fps), hdr, has_field_pictures)
 
 
-def _container_tags(path: Path, stream: VideoStream) -> tuple[Colours, FieldOrder]:
-    colours, order = read_container_tags(path)
-    return colours, FieldOrder(stream.codec_context.name, order)
+def _container_tags(path: Path, stream: VideoStream) -> tuple[Colors, FieldOrder]:
+    colors, order = read_container_tags(path)
+    return colors, FieldOrder(stream.codec_context.name, order)
 
 
 def _first_frame(container: InputContainer, stream: VideoStream) -> av.VideoFrame | None:
@@ -140,8 +140,8 @@ def read_lazily(path: Path, longest_side: int = 0, mode: Deinterlace = "auto") -
         first: float | None = None
         latest = -interval
         aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
-        colours, order = _container_tags(path, stream)
-        display = Display(str(path), float(aspect) if aspect else 1.0, longest_side, colours)
+        colors, order = _container_tags(path, stream)
+        display = Display(str(path), float(aspect) if aspect else 1.0, longest_side, colors)
         for frame, shown, is_deinterlaced in deinterlace(_decode(path, container, stream), order, mode):
             if frame.pts is None or frame.time_base is None:
                 seconds = latest + interval

@@ -19,7 +19,7 @@ from av.container import InputContainer, OutputContainer
 from av.stream import Disposition
 from av.video.stream import VideoStream
 
-from mien.capture.colours import Colours, stated_colours
+from mien.capture.colors import Colors, stated_colors
 from mien.errors import UserError
 
 MAX_FRAME_PIXELS = 8192 * 4608
@@ -74,7 +74,7 @@ def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         yield container, stream
 
 
-def read_container_tags(path: Path) -> tuple[Colours, int]:
+def read_container_tags(path: Path) -> tuple[Colors, int]:
     """Return the colours of a video and the order of its fields (FFmpeg's code) as its container states them.
 
     FFmpeg replaces them by what the first pictures say as soon as it may decode them, so it may not here.
@@ -84,7 +84,7 @@ def read_container_tags(path: Path) -> tuple[Colours, int]:
     """
     with _open_container(path, "video", {"codec_whitelist": "none"}) as container:
         context = _moving_pictures(path, container).codec_context
-        return stated_colours(context), context.field_order
+        return stated_colors(context), context.field_order
 
 
 @contextmanager

@@ -45,7 +45,7 @@ class PictureOptions:
                 f"--size {self.size}: give a number" if is_square else f"--width {wide} --height {high}: give numbers"
             )
             raise UserError(f"{given} from {_MIN_SIDE} to {MAX_SIDE}")
-        self.colour()
+        self.color()
         return plan_output(out, frames, self.background == "transparent")
 
     def shape(self) -> tuple[int, int]:
@@ -53,7 +53,7 @@ class PictureOptions:
         wide, high = (self.size if given is None else given for given in (self.width, self.height))
         return wide, high
 
-    def colour(self) -> tuple[float, float, float]:
+    def color(self) -> tuple[float, float, float]:
         """The background's colour. It is black for transparent pictures.
 
         Raises:

@@ -152,11 +152,11 @@ class Command:
     def _camera(self, run_dir: Path, subject: "mien.face.FaceParams") -> "mien.camera.Camera":
         """The run's first camera, moved by --yaw, --pitch and --zoom."""
         from mien.commands.stages.pictures import view
-        from mien.render.camera_paths import aside
+        from mien.render.camera_paths import turned_camera
         from mien.training import run_camera
 
-        camera, centre = view(self.picture, run_camera(run_dir), self.zoom), subject.head_translation[0]
-        return aside(camera, centre, math.radians(self.yaw), math.radians(self.pitch))
+        camera, center = view(self.picture, run_camera(run_dir), self.zoom), subject.head_translation[0]
+        return turned_camera(camera, center, math.radians(self.yaw), math.radians(self.pitch))
 
     def _draw_sheet(
         self,
@@ -261,12 +261,12 @@ class Command:
             return cameras[:1]
         return cameras if timesteps is None else [cameras[i * len(cameras) // timesteps] for i in range(timesteps)]
 
-    def _path(self, camera: "mien.camera.Camera", centre: "torch.Tensor", frames: int) -> "list[mien.camera.Camera]":
+    def _path(self, camera: "mien.camera.Camera", center: "torch.Tensor", frames: int) -> "list[mien.camera.Camera]":
         from mien.render.camera_paths import sway, turntable
 
         span, tilt = math.radians(self.span), math.radians(self.tilt)
         if self.path == "still" or self._is_still():
             return [camera] * frames
         if self.path == "turntable":
-            return turntable(camera, centre, frames, span)
-        return sway(camera, centre, frames, span, tilt, crossing=self.path == "sway")
+            return turntable(camera, center, frames, span)
+        return sway(camera, center, frames, span, tilt, crossing=self.path == "sway")

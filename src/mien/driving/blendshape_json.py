@@ -32,7 +32,7 @@ from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
 _NO_EXPRESSION = "_neutral"
 _DEFAULT_FPS = 30.0
-_CENTIMETRE = 0.01
+_CENTIMETER = 0.01
 _MAX_TIME = 1e15
 """Largest time in a file. In milliseconds it is thirty thousand years, so the zero of any clock is accepted."""
 _SHORTEST, _LONGEST = 1 / 500, 3.0
@@ -114,7 +114,7 @@ def _place_heads(rows: Float[np.ndarray, "t 58"], matrices: list[np.ndarray | No
                 "correct or delete it"
             )
         rows[index, 52:55] = axis_angle_from_matrix(rotation)
-        rows[index, 55:] = _CENTIMETRE * upright[:3, 3]
+        rows[index, 55:] = _CENTIMETER * upright[:3, 3]
     return (f"{path}: its facial transformation matrices are transposed, and are read so",) if transposed else ()
 
 

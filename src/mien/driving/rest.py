@@ -1,11 +1,11 @@
 """The face at rest of a person who may never rest: the calmest frames, unless they are far from the model's neutral.
 
 A tracker always sees a little in a face at rest, such as raised brows, and this belongs to the person. A grin, an open
-mouth, or a gaze aside that lasts for the whole clip does not: it is motion and must reach the avatar.
+mouth, or a gaze to the side that lasts for the whole clip does not: it is motion and must reach the avatar.
 
 The limits come from the spread of calm frames (`docs/log.md`): in nine tracked real sequences, coefficients are up to
-0.22, gazes up to 11 and heads up to 18 degrees aside; in ten synthetic ones, 0.28 (0.36 in a clip of eight frames), 12
-and 26 degrees. So what is within a limit stays as it is. Beyond it, the face at rest goes back to the
+0.22, gazes up to 11 and heads up to 18 degrees to the side; in ten synthetic ones, 0.28 (0.36 in a clip of eight
+frames), 12 and 26 degrees. So what is within a limit stays as it is. Beyond it, the face at rest goes back to the
 model's neutral, and is there at the second limit: what the avatar does grows without a jump.
 """
 
@@ -77,7 +77,7 @@ def rest_of(calm: FaceParams, model: FaceModel, ahead: Float[Tensor, "3 3"] | No
     away = axis_angle_from_matrix(ahead.T @ matrix_from_axis_angle(turn))
     head = float(kept_share(away.norm(dim=-1), HEAD))
     if head < 1:
-        moved.append(f"the head {_degrees(away[0].norm())} degrees aside")
+        moved.append(f"the head {_degrees(away[0].norm())} degrees to the side")
         turn = axis_angle_from_matrix(ahead @ matrix_from_axis_angle(head * away))
     for index, name in enumerate(model.free_joint_names):
         if "eye" not in name.lower():
@@ -91,7 +91,7 @@ def rest_of(calm: FaceParams, model: FaceModel, ahead: Float[Tensor, "3 3"] | No
         angle = _gaze(joints[:, eyes], ahead.T @ matrix_from_axis_angle(calm.head_rotation))
         gaze = float(kept_share(angle, GAZE))
         if gaze < 1:
-            moved.append(f"the gaze {_degrees(angle)} degrees aside")
+            moved.append(f"the gaze {_degrees(angle)} degrees to the side")
         # Eyes that made up for a turn of the head do so no less than the head moves.
         if min(gaze, head) < 1:
             joints[:, eyes] *= min(gaze, head)

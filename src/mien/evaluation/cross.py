@@ -18,7 +18,7 @@ from mien.capture.video import write_video
 from mien.driving import drive, rest_before
 from mien.errors import UserError
 from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion, measure_motion, transfer_figures
-from mien.evaluation.videos import labelled_row, match_sizes
+from mien.evaluation.videos import labeled_row, match_sizes
 from mien.face import FaceParams, most_frontal_camera
 from mien.face.checks import check_face_params
 from mien.pictures import to_uint8
@@ -167,7 +167,7 @@ def measure(driven: Driven, name: str) -> dict[str, Any]:
 def _write_video(path: Path, driven: Driven, max_count: int) -> Path:
     timesteps = range(min(max_count, driven.driver.timesteps))
     pictures = (
-        labelled_row({f"driver: {t}": driven.driver_picture(t), "avatar": driven.picture(t)})
+        labeled_row({f"driver: {t}": driven.driver_picture(t), "avatar": driven.picture(t)})
         for t in track_progress(timesteps, f"video {path.stem}", len(timesteps))
     )
     write_video(path, match_sizes(pictures), driven.driver.fps, crf=24)

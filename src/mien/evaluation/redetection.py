@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
-from mien.rotation import align_centred
+from mien.rotation import align_centered
 from mien.tracking.landmarks import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
 MEASURED_BY = "MediaPipe face mesh, 478 points in 3D, each picture by itself"
@@ -85,7 +85,7 @@ def similarity(
 ) -> tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]:
     """Rotation, scale and shift with target ~ scale * rotation @ source + shift, by least squares (Umeyama 1991)."""
     source_mean, target_mean = source.mean(0), target.mean(0)
-    rotation, scale = align_centred(source - source_mean, target - target_mean)
+    rotation, scale = align_centered(source - source_mean, target - target_mean)
     return rotation, scale, target_mean - scale * rotation @ source_mean
 
 

@@ -222,7 +222,7 @@ def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> list[Pi
 
 @torch.no_grad()
 def confidence(avatar: Avatar, coverage: Coverage) -> Filmed:
-    """The neutral head coloured by how well training pictures show it, from the front, from aside and from behind."""
+    """The neutral head coloured by how well training pictures show it: from the front, the side and behind."""
     neutral = avatar.face_model.head_vertices(avatar.subject)[0].cpu().float()
     model = avatar.face_model.to(neutral)
     pictures = []

@@ -45,7 +45,7 @@ def write_comparison_video(path: Path, experiment: Experiment, evaluation: Evalu
             f"rendering: {scores['psnr']:.1f} dB, head {scores['head_psnr']:.1f}": to_uint8(image),
             "error": error_heat(image, truth),
         }
-        return labelled_row(panels)
+        return labeled_row(panels)
 
     first = experiment.sequences[frames[0].sequence].capture
     drawn = (picture(frame) for frame in track_progress(frames, f"video {path.stem}", len(frames)))
@@ -62,7 +62,7 @@ def choose_video_frames(frames: Sequence[Frame], max_count: int) -> list[Frame]:
     return [frame for group in groups.values() for frame in group[:each]]
 
 
-def labelled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "h w 3"]:
+def labeled_row(panels: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "h w 3"]:
     """Pictures in a row, shrunk, each below a bar with its name."""
     named = []
     for name, panel in panels.items():

@@ -291,6 +291,6 @@ def _add_splats(writer: GlbWriter, content: dict[str, Any], avatar: PortableAvat
     content["nodes"].append({"name": "gaussians", "mesh": 1})
 
 
-def _linear(colours: np.ndarray) -> np.ndarray:
+def _linear(colors: np.ndarray) -> np.ndarray:
     """Linear light of colours in sRGB, both 0..1."""
-    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

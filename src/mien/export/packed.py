@@ -63,7 +63,7 @@ _CODES = {
     "avatar.baked.attributes.log_scales": _Code(8, "columns"),
     "avatar.baked.attributes.opacity_logits": _Code(8, "columns"),
     "avatar.baked.attributes.sh": _Code(8, "columns"),
-    "avatar.baked.changes.colour": _Code(8, "columns", signed=True),
+    "avatar.baked.changes.color": _Code(8, "columns", signed=True),
     "avatar.baked.changes.opacity_logits": _Code(8, "columns", signed=True),
     "avatar.baked.changes.means": _Code(8, "columns", signed=True),
     "avatar.baked.changes.features.neutral": _Code(8, "columns"),
@@ -131,7 +131,7 @@ def _prepared(avatar: PortableAvatar) -> PortableAvatar:
     )
     changes = baked.changes
     if changes is not None:
-        parts = {name: getattr(changes, name) for name in ("colour", "opacity_logits", "means")}
+        parts = {name: getattr(changes, name) for name in ("color", "opacity_logits", "means")}
         changes = replace(changes, **{name: part[order] for name, part in parts.items() if part is not None})
         if (features := changes.features) is not None:
             rows = {name: getattr(features, name)[order] for name in ("neutral", "basis", "own")}

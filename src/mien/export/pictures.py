@@ -69,8 +69,8 @@ def to_rgba(over_black: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray,
     for top in range(0, len(alpha), _ROWS):
         band = slice(top, top + _ROWS)
         opacity = alpha[band, :, None]
-        colours = np.divide(over_black[band], opacity, out=np.zeros_like(over_black[band]), where=opacity > 1e-6)
-        picture[band, :, :3] = np.clip(colours, 0, 1) * 255 + 0.5
+        colors = np.divide(over_black[band], opacity, out=np.zeros_like(over_black[band]), where=opacity > 1e-6)
+        picture[band, :, :3] = np.clip(colors, 0, 1) * 255 + 0.5
         picture[band, :, 3] = np.clip(alpha[band], 0, 1) * 255 + 0.5
     return picture
 
@@ -101,7 +101,7 @@ def _encode_webm(path: Path, pictures: Iterator[np.ndarray], shape: tuple[int, .
         reformatter = VideoReformatter()
         for picture in pictures:
             assert picture.shape == shape, f"frames of {shape}, then one of {picture.shape}"
-            full = _spread_colours(picture) if channels == 4 else picture
+            full = _spread_colors(picture) if channels == 4 else picture
             even = np.pad(full, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             frame = reformatter.reformat(
                 av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgba" if channels == 4 else "rgb24"),
@@ -113,7 +113,7 @@ def _encode_webm(path: Path, pictures: Iterator[np.ndarray], shape: tuple[int, .
         container.mux(stream.encode())
 
 
-def _spread_colours(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
+def _spread_colors(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
     """The picture with the colours at its outline continued outwards, where alpha is low and hides them.
 
     Video keeps colour at half the resolution and blurs it. Without this, black would bleed into outlines.

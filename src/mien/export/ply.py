@@ -265,6 +265,6 @@ def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) 
     columns_read = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh.flatten(1))
     bad = [not tensor.isfinite().all() for tensor in columns_read]
     if any(bad):
-        name = ("position", "rotation", "scale", "opacity", "colour")[bad.index(True)]
+        name = ("position", "rotation", "scale", "opacity", "color")[bad.index(True)]
         raise UserError(f"{path}: the {name} of some Gaussians is NaN or infinite; export it again, or clean it up")
     return gaussians

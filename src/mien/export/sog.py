@@ -66,14 +66,14 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
     low, high = (limit(logged, axis=0) if len(logged) else np.zeros(3) for limit in (np.min, np.max))
     steps = np.round((logged - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.uint16)
     scale_codes, scale_book = _coded(np.log(np.maximum(scales, _MIN_SCALE)))
-    colour_codes, colour_book = _coded(sh[:, 0])
+    color_codes, color_book = _coded(sh[:, 0])
     alpha = np.clip(np.round(opacities * 255), 0, 255).astype(np.uint8)
     pictures = {
         "means_l.webp": _picture((steps & 255).astype(np.uint8), width),
         "means_u.webp": _picture((steps >> 8).astype(np.uint8), width),
         "scales.webp": _picture(scale_codes, width),
         "quats.webp": _picture(_packed_quats(unit_quats(quats)), width),
-        "sh0.webp": _picture(np.concatenate([colour_codes, alpha[:, None]], axis=1), width),
+        "sh0.webp": _picture(np.concatenate([color_codes, alpha[:, None]], axis=1), width),
     }
     meta: dict[str, Any] = {
         "version": _VERSION,
@@ -82,7 +82,7 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_book, "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": colour_book, "files": ["sh0.webp"]},
+        "sh0": {"codebook": color_book, "files": ["sh0.webp"]},
     }
     if sh.shape[1] > 1:
         meta["shN"] = _add_palette(pictures, sh[:, 1:], width)

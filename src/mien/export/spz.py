@@ -24,7 +24,7 @@ _MAX_FRACTION = 16
 """Most bits of a position behind the point: steps of 15 micrometres."""
 _FIXED_BITS = 23
 """Bits of a position without its sign."""
-_COLOUR_SCALE = 0.15
+_COLOR_SCALE = 0.15
 _LOG_SCALE_OFFSET, _LOG_SCALE_STEPS = 10, 16
 _SH_STEPS = 128
 _QUAT_STEPS = 511
@@ -55,7 +55,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
     columns = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3],
         _bytes(opacities * 255),
-        _bytes((sh[:, 0] * _COLOUR_SCALE + 0.5) * 255),
+        _bytes((sh[:, 0] * _COLOR_SCALE + 0.5) * 255),
         _bytes((np.log(np.maximum(scales, 1e-30)) + _LOG_SCALE_OFFSET) * _LOG_SCALE_STEPS),
         _packed_quats(unit_quats(quats)),
         _bytes(sh[:, 1:] * _SH_STEPS + _SH_STEPS),
@@ -85,10 +85,10 @@ def read_spz(path: Path) -> Gaussians:
     except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path}: cannot be read as .spz ({reason}); {_REMEDY}") from None
-    places, opacities, colours, scales, quats, higher = columns
+    places, opacities, colors, scales, quats, higher = columns
     wide = np.concatenate([np.zeros((count, 3, 1), np.uint8), places], axis=2)
     means = (wide.reshape(count, 12).view("<i4") >> 8) / 2**fraction
-    first = (colours.astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE
+    first = (colors.astype(np.float32) / 255 - 0.5) / _COLOR_SCALE
     higher = higher.astype(np.float32)
     higher -= _SH_STEPS  # in place: these are most of the numbers
     higher /= _SH_STEPS

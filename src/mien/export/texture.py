@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mien import runtime
 from mien.camera import Camera, camera_from_fov
-from mien.render.camera_paths import aside
+from mien.render.camera_paths import turned_camera
 from mien.render.mesh import interpolate, rasterize_mesh, vertex_normals
 from mien.runtime.posing import SH_C0
 from mien.training.footage import sample_picture
@@ -78,26 +78,26 @@ def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[
     flat = torch.cat([upwards, torch.ones(len(upwards), 1)], 1)
     layout = rasterize_mesh(flat, surface.uv_faces, Camera(K, torch.eye(4), size, size))
     covered = layout.face_index >= 0
-    colours = _LITTLE * _nearest_colours(surface, shots[0])[layout.face_index[covered].long()]
-    weights = torch.full((len(colours), 1), _LITTLE)
+    colors = _LITTLE * _nearest_colors(surface, shots[0])[layout.face_index[covered].long()]
+    weights = torch.full((len(colors), 1), _LITTLE)
     for shot in shots:
         points = interpolate(layout, shot.vertices, surface.faces)[covered]
         normals = interpolate(layout, vertex_normals(shot.vertices, surface.faces), surface.faces)[covered]
         for camera in _cameras(shot):
             image, weight = _seen(points, normals, surface, shot, camera)
-            colours += shot.weight * weight * image
+            colors += shot.weight * weight * image
             weights += shot.weight * weight
     texture = torch.zeros(size, size, 3)
-    texture[covered] = (colours / weights).clamp(0, 1)
+    texture[covered] = (colors / weights).clamp(0, 1)
     return _continued(texture, covered).numpy()
 
 
 def _cameras(shot: Shot) -> list[Camera]:
-    centre = (shot.vertices.amin(0) + shot.vertices.amax(0)) / 2
+    center = (shot.vertices.amin(0) + shot.vertices.amax(0)) / 2
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (centre + torch.tensor([0.0, 0.0, _DISTANCE]))
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (center + torch.tensor([0.0, 0.0, _DISTANCE]))
     front = camera_from_fov(_FIELD, _SIZE, _SIZE, viewmat)
-    return [aside(front, centre, math.radians(yaw), math.radians(pitch)) for yaw, pitch in shot.views]
+    return [turned_camera(front, center, math.radians(yaw), math.radians(pitch)) for yaw, pitch in shot.views]
 
 
 def _seen(
@@ -129,16 +129,16 @@ def _seen(
     return picture[:, :3] / opacity.clamp_min(_LEAST_ALPHA)[:, None], weight[:, None]
 
 
-def _nearest_colours(surface: Surface, shot: Shot) -> Float[Tensor, "f 3"]:
+def _nearest_colors(surface: Surface, shot: Shot) -> Float[Tensor, "f 3"]:
     """For each triangle, the mean colour of the Gaussians nearest to its middle, weighted by their opacities."""
     gaussians, middles = shot.gaussians, shot.vertices[surface.faces].mean(1)
     means, opacities = torch.from_numpy(gaussians.means), torch.from_numpy(gaussians.opacities)
-    colours = (0.5 + SH_C0 * torch.from_numpy(gaussians.sh[:, 0])).clamp(0, 1)
+    colors = (0.5 + SH_C0 * torch.from_numpy(gaussians.sh[:, 0])).clamp(0, 1)
     found = []
     for part in middles.split(_CHUNK):
         near = torch.cdist(part, means).topk(min(_NEAREST, len(means)), largest=False).indices
         weight = opacities[near].clamp_min(1e-6)[..., None]
-        found.append((weight * colours[near]).sum(1) / weight.sum(1))
+        found.append((weight * colors[near]).sum(1) / weight.sum(1))
     return torch.cat(found)
 
 

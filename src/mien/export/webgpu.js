@@ -33,30 +33,30 @@ let last=cross(first,normal);let middle=(a+b+c)/3;
 for(var row=0u;row<3;row++){frames[3*f+row]=vec4f(k*first[row],k*normal[row],k*last[row],middle[row]);}
 }`,O=`${N}
 @group(0)@binding(1)var<storage,read>restMeans:array<vec4f>;
-@group(0)@binding(2)var<storage,read>restColours:array<vec4f>;
+@group(0)@binding(2)var<storage,read>restColors:array<vec4f>;
 @group(0)@binding(3)var<storage,read>basis:array<vec4f>;
 @group(0)@binding(4)var<storage,read_write>means:array<vec4f>;
-@group(0)@binding(5)var<storage,read_write>colours:array<vec4f>;
+@group(0)@binding(5)var<storage,read_write>colors:array<vec4f>;
 
 @compute @workgroup_size(${g})
 fn main(@builtin(global_invocation_id)id:vec3u){
 let i=id.x;
 if(i>=pose.count){return;}
 var mean=restMeans[i];
-var colour=restColours[i];
+var color=restColors[i];
 for(var k=0u;k<pose.columns;k++){
 let a=activation(k);let first=basis[2*(i*pose.columns+k)];
 mean+=a*vec4f(first.xyz,0);
-colour+=a*vec4f(basis[2*(i*pose.columns+k)+1].xyz,first.w);
+color+=a*vec4f(basis[2*(i*pose.columns+k)+1].xyz,first.w);
 }
 means[i]=mean;
-colours[i]=colour;
+colors[i]=color;
 }`;function I(n,e,r){return`${N}
 @group(0)@binding(1)var<storage,read>neutral:array<vec2u>;
 @group(0)@binding(2)var<storage,read>basis:array<vec2u>;
 @group(0)@binding(3)var<storage,read>own:array<vec2u>;
 @group(0)@binding(4)var<storage,read>weights:array<vec4f>;
-@group(0)@binding(5)var<storage,read_write>colours:array<vec4f>;
+@group(0)@binding(5)var<storage,read_write>colors:array<vec4f>;
 fn four(halves:vec2u)->vec4f{return vec4f(unpack2x16float(halves.x),unpack2x16float(halves.y));}
 
 @compute @workgroup_size(${g})
@@ -78,7 +78,7 @@ var x=four(own[i*${r/4}+(h>>2)])[h&3];
 for(var t=0u;t<${n};t++){x+=dot(weights[w+t],f[t]);}
 sum+=weights[w+${n}]*select(x,${.01}*x,x<0);
 }
-colours[i]+=sum;
+colors[i]+=sum;
 }`}var P=`
 struct View{
 head:array<vec4f,3>,
@@ -90,14 +90,14 @@ background:vec4f,
 struct Splat{
 place:vec4f,
 shape:vec4f,
-colour:vec4f,
+color:vec4f,
 }`,$="near:NUMBER,far:NUMBER,vertices:u32,visible:NUMBER,firstVertex:u32,firstInstance:u32",V=`${P}${D}
 struct State{${$.replace(/NUMBER/g,"atomic<u32>")}}
 @group(0)@binding(0)var<uniform>view:View;
 @group(0)@binding(1)var<storage,read>frames:array<vec4f>;
 @group(0)@binding(2)var<storage,read>means:array<vec4f>;
 @group(0)@binding(3)var<storage,read>shapes:array<vec4f>;
-@group(0)@binding(4)var<storage,read>colours:array<vec4f>;
+@group(0)@binding(4)var<storage,read>colors:array<vec4f>;
 @group(0)@binding(5)var<storage,read>sh:array<vec4f>;
 @group(0)@binding(6)var<storage,read_write>splats:array<Splat>;
 @group(0)@binding(7)var<storage,read_write>keys:array<u32>;
@@ -141,7 +141,7 @@ return c;
 
 
 fn project(i:u32)->u32{
-let colour=colours[i];
+let color=colors[i];
 let mean=means[i];
 let f=3*u32(mean.w);
 let a=frames[f];let b=frames[f+1];let c=frames[f+2];
@@ -149,7 +149,7 @@ let local=vec4f(mean.xyz,1);
 let head=vec4f(dot(a,local),dot(b,local),dot(c,local),1);
 let v=view.head;
 let p=vec3f(dot(v[0],head),dot(v[1],head),dot(v[2],head));
-let log2Opacity=-log2(1.+exp(min(-colour.a,80.)));
+let log2Opacity=-log2(1.+exp(min(-color.a,80.)));
 if(p.z<=NEAR||log2Opacity<LOG2_ALPHA_MIN){return UNSEEN;}
 let tangent=p.xy/p.z;
 let margin=FOV_MARGIN*.5*view.size/view.focal;
@@ -169,7 +169,7 @@ if(!(xx<1e30&&yy<1e30&&determinant<1e30)){return UNSEEN;}
 let reach=sqrt(max((log2Opacity-LOG2_ALPHA_MIN)*1.3862944,0.))+.1;
 let box=reach*sqrt(vec2f(xx,yy));
 if(any(centre+box<vec2f(0))||any(centre-box>view.size)){return UNSEEN;}
-var rgb=0.5+0.2820948*colour.rgb;
+var rgb=0.5+0.2820948*color.rgb;
 if(view.shRest>0){
 let eye=-(v[0].w*v[0].xyz+v[1].w*v[1].xyz+v[2].w*v[2].xyz);
 let d=normalize(head.xyz-eye);let t=view.directions;
@@ -285,14 +285,14 @@ struct Corner{
 @builtin(position)position:vec4f,
 @location(0)@interpolate(flat)place:vec4f,
 @location(1)@interpolate(flat)roots:vec2f,
-@location(2)@interpolate(flat)colour:vec3f,
+@location(2)@interpolate(flat)color:vec3f,
 }
 
 @vertex fn corner(@builtin(vertex_index)vertex:u32,@builtin(instance_index)instance:u32)->Corner{
 let s=splats[order[instance]];
-let at=s.colour.a*(vec2f(f32(vertex&1),f32(vertex>>1))*2.-1.)*s.shape.zw;
+let at=s.color.a*(vec2f(f32(vertex&1),f32(vertex>>1))*2.-1.)*s.shape.zw;
 let pixel=s.place.xy+vec2f(s.place.z*at.y+at.x,at.y);
-return Corner(vec4f(2.*pixel.x/view.size.x-1.,1.-2.*pixel.y/view.size.y,0,1),s.place,s.shape.xy,s.colour.rgb);
+return Corner(vec4f(2.*pixel.x/view.size.x-1.,1.-2.*pixel.y/view.size.y,0,1),s.place,s.shape.xy,s.color.rgb);
 }
 
 @fragment fn blend(c:Corner)->@location(0)vec4f{
@@ -301,7 +301,7 @@ let r=c.roots*vec2f(d.x-c.place.z*d.y,d.y);
 let power=c.place.w-dot(r,r);
 if(power<-7.9943533){discard;}
 let alpha=min(exp2(power),0.999);
-return vec4f(c.colour*alpha,alpha);
+return vec4f(c.color*alpha,alpha);
 }`,H=`${P}
 @group(0)@binding(0)var<uniform>view:View;
 @group(0)@binding(1)var picture:texture_2d<f32>;
@@ -314,4 +314,4 @@ return vec4f(vec2f(f32(vertex&1),f32(vertex>>1))*4.-1.,0,1);
 var c=textureLoad(picture,vec2i(at.xy),0);
 c+=(1.-c.a)*view.background;
 return vec4f(clamp(c.rgb,vec3f(0),vec3f(c.a)),c.a);
-}`;var j=8,_=class{constructor(e,r,t,a,o){this.memory=e;let{rig:s,faces:i,changes:u}=r,c=r.face_index.length,l=i.length/3;this.points=e.storage(s.template.length),this.told=new Float32Array(j+A),this.pose=e.uniform(this.told.length);let d=new Uint32Array(this.told.buffer);if(d[0]=c,d[1]=l,this.frames=this.step(z,l,[this.pose,this.points,e.storage(i),t.frames]),!u)return;if(u.directions.length/u.rest.length>A)throw new E(`has more than ${A} activations`);let{basis:h,columns:p}=oe(u,c);d[2]=p;let m=[a,o].map(y=>e.storage(y));this.changes.push(this.step(O,c,[this.pose,...m,e.storage(h),t.means,t.colours])),u.features&&this.addNetwork(u.features,c,t.colours)}memory;points;pose;frames;changes=[];told;run(e){let{device:r}=this.memory;this.memory.write(this.points,e.points);let t=r.createCommandEncoder(),a=t.beginComputePass(),o=[this.frames];e.changed&&(this.told.set(e.activations,j),o.push(...this.changes)),this.memory.write(this.pose,this.told);for(let{pipeline:s,group:i,threads:u}of o)w(a,s,i,Math.ceil(u/g));a.end(),r.queue.submit([t.finish()])}addNetwork(e,r,t){let{memory:a}=this,{width:o,rank:s,hidden:i}=C(e,r),{weights:u,biases:c}=e,l=Math.ceil(o/4),d=4*Math.ceil(i/4),h=u[0].length/i,p=new Float32Array(4*(l+1)*d);for(let f=0;f<i;++f){let v=4*(l+1)*f;p.set(u[0].subarray(f*h,f*h+o),v);for(let T=0;T<4;++T)p[v+4*l+T]=u[1][T*i+f]}this.told.set(c[1],4);let m=(f,v)=>a.storage(ne(se(f,v))),y=m(M(e,r,o),i),x=[m(e.neutral,o),m(e.basis,o),y,a.storage(p)];this.changes.push(this.step(I(l,s,d),r,[this.pose,...x,t]))}step(e,r,t){let{device:a}=this.memory,o=a.createComputePipeline({layout:"auto",compute:{module:a.createShaderModule({code:e})}});return{pipeline:o,group:this.memory.group(o.getBindGroupLayout(0),t),threads:r}}};function oe({means:n,opacity_logits:e,colour:r},t){let a=[{part:n,width:3,at:0},{part:e,width:1,at:3},{part:r,width:3,at:4}],o=(u,c)=>(u?.length??0)/c/Math.max(t,1),s=Math.max(...a.map(({part:u,width:c})=>o(u,c))),i=new Float32Array(8*t*s);for(let{part:u,width:c,at:l}of a){let d=o(u,c);for(let h=0,p=0;h<t;++h)for(let m=0;m<c;++m)for(let y=0;y<d;++y)i[8*(h*s+y)+l+m]=u[p++]}return{basis:i,columns:s}}function se(n,e){let r=4*Math.ceil(e/4),t=n.length/e;if(r===e)return n;let a=new Float32Array(t*r);for(let o=0;o<t;++o)a.set(n.subarray(o*e,(o+1)*e),o*r);return a}function ne(n){if(typeof Float16Array>"u")throw new E("needs half floats, which this browser's WebGPU lacks");return new Uint32Array(new Float16Array(n).buffer)}var R=class{layout;digits;constructor(e){let r=["uniform",...Array(3).fill("read-only-storage"),...Array(3).fill("storage")];this.layout=e.createBindGroupLayout({entries:r.map((o,s)=>({binding:s,visibility:GPUShaderStage.COMPUTE,buffer:{type:o}}))});let t=e.createPipelineLayout({bindGroupLayouts:[this.layout]}),a=e.createShaderModule({code:X});this.digits=[1,0].map(o=>{let s=i=>e.createComputePipeline({layout:t,compute:{module:a,entryPoint:i,constants:{FIRST:o}}});return{count:s("count"),scan:s("scan"),scatter:s("scatter")}})}},U=class{constructor(e,r,t,a,o){this.pipelines=e;this.count=t;let[s,i,u,c]=Array.from({length:4},()=>r.storage(t)),l=r.storage(256*Math.ceil(t/b)),d=[[s,i,u,c],[u,c,s,i]];this.groups=d.map(h=>r.group(e.layout,[a,o,...h,l])),[this.keys,this.order]=[s,i]}pipelines;count;keys;order;groups;run(e){let r=Math.ceil(this.count/b);this.pipelines.digits.forEach(({count:t,scan:a,scatter:o},s)=>{let i=this.groups[s];w(e,t,i,r),w(e,a,i,1),w(e,o,i,r)})}};function G(n,e){for(let r=0,t=0;r<n.length;r+=3,t+=4)e[t]=n[r],e[t+1]=n[r+1],e[t+2]=n[r+2]}var K="rgba16float",W=36,Y=Uint32Array.of(4294967295,0,4,0,0,0),ie=8,B=class{constructor(e,r){this.device=e;this.format=r;let t=s=>e.createShaderModule({code:s});this.project=e.createComputePipeline({layout:"auto",compute:{module:t(V)}}),this.sort=new R(e);let a={srcFactor:"one",dstFactor:"one-minus-src-alpha"},o=(s,i,u)=>{let c=t(s);return e.createRenderPipeline({layout:"auto",vertex:{module:c},fragment:{module:c,targets:[i]},primitive:{topology:u}})};this.draw=o(q,{format:K,blend:{color:a,alpha:a}},"triangle-strip"),this.screen=o(H,{format:r},"triangle-list")}device;format;project;sort;draw;screen},F=class{constructor(e,r,t,a){this.pipelines=e;this.context=r;this.poser=a;let{device:o}=e,{baked:s}=t,{attributes:i,faces:u,face_index:c}=s,l=this.memory=new k(o),d=this.count=c.length;this.shRest=i.sh.length/3/Math.max(d,1)-1,[this.means,this.colours,this.shapeValues]=[4,4,8].map(f=>new Float32Array(f*d)),c.forEach((f,v)=>this.means[4*v+3]=f),G(s.means,this.means);for(let f=0;f<d;++f){let v=3*f*(1+this.shRest);this.colours.set([...i.sh.subarray(v,v+3),i.opacity_logits[f]],4*f)}let h=new Float32Array(4*d*this.shRest);for(let f=0;f<d*this.shRest;++f){let v=3*(f+Math.floor(f/this.shRest)+1);h.set(i.sh.subarray(v,v+3),4*f)}let p=this.posed={frames:l.storage(4*u.length),means:l.storage(this.means),colours:l.storage(this.colours)};this.shapes=l.storage(8*d),this.view=l.uniform(W),this.state=l.indirect(Y),this.sorter=new U(e.sort,l,d,this.view,this.state);let m=l.storage(12*d),y=this.sorter,x=[p.frames,p.means,this.shapes,p.colours,l.storage(h)];this.project=l.group(e.project.getBindGroupLayout(0),[this.view,...x,m,y.keys,this.state]),this.splats=l.group(e.draw.getBindGroupLayout(0),[this.view,m,y.order]),this.uploadShapes(i.quats,i.log_scales.map(Math.exp)),this.gpuPoser=s.skinned?null:new _(l,s,p,this.means,this.colours),r.configure({device:o,format:e.format,alphaMode:"premultiplied"})}pipelines;context;poser;memory;posed;shapes;view;state;gpuPoser;sorter;means;colours;shapeValues;project;splats;count;shRest;picture=null;screen=null;upload(){this.gpuPoser?this.gpuPoser.run(this.poser):this.uploadPosed(this.poser,this.poser.skinned)}draw(e,r,t){let{pipelines:a,count:o}=this,{device:s}=a,[i,u,c,l]=t,d=r.directions,h=new Float32Array(W);h.set(r.head),h.set([d[0],d[1],d[2],0,d[3],d[4],d[5],0,d[6],d[7],d[8]],12),h.set([...r.focal,...r.centre,r.width,r.height],24),new Uint32Array(h.buffer).set([o,this.shRest],30),h.set([i*l,u*l,c*l,l],32),this.memory.write(this.view,h),this.memory.write(this.state,Y);let p=s.createCommandEncoder(),m=p.beginComputePass();w(m,a.project,this.project,Math.ceil(o/g)),this.sorter.run(m),m.end();let y=this.pictureOf(r.width,r.height);this.render(p,y.createView(),a.draw,this.splats,x=>x.drawIndirect(this.state,ie)),this.render(p,this.context.getCurrentTexture().createView(),a.screen,this.screen,x=>x.draw(3)),s.queue.submit([p.finish()])}dispose(){this.picture?.destroy(),this.memory.free()}render(e,r,t,a,o){let s=e.beginRenderPass({colorAttachments:[{view:r,loadOp:"clear",storeOp:"store"}]});s.setPipeline(t),s.setBindGroup(0,a),o(s),s.end()}pictureOf(e,r){let{pipelines:t}=this,{device:a}=t;if(this.picture?.width===e&&this.picture.height===r)return this.picture;this.picture?.destroy();let{RENDER_ATTACHMENT:o,TEXTURE_BINDING:s}=GPUTextureUsage,i=this.picture=a.createTexture({size:[e,r],format:K,usage:o|s});return this.screen=a.createBindGroup({layout:t.screen.getBindGroupLayout(0),entries:[{binding:0,resource:{buffer:this.view}},{binding:1,resource:i.createView()}]}),i}uploadPosed(e,r){let{memory:t,posed:a,means:o,colours:s}=this;G(e.means,o),G(e.colours,s),e.opacityLogits.forEach((i,u)=>s[4*u+3]=i),t.write(a.frames,e.frames),t.write(a.means,o),t.write(a.colours,s),this.uploadShapes(r.quats,r.scales)}uploadShapes(e,r){let{shapeValues:t}=this;for(let a=0;a<this.count;++a){for(let o=0;o<4;++o)t[8*a+o]=e[4*a+o];for(let o=0;o<3;++o)t[8*a+4+o]=r[3*a+o]}this.memory.write(this.shapes,t)}};async function ue(n="auto"){if(n!=="webgl2")try{let e=await ce(n),r=e.lost;e.pushErrorScope("validation");let t=new B(e,navigator.gpu.getPreferredCanvasFormat()),a=await e.popErrorScope();if(a)throw new Error(a.message);return(...o)=>new L(t,r,...o)}catch(e){J(e.message);return}}var J=n=>console.warn(`mien: ${n}; WebGL2 draws instead`);async function ce(n){if(!navigator.gpu)throw new Error("this browser has no WebGPU, or the page has no secure address");let e=await navigator.gpu.requestAdapter({powerPreference:"high-performance"});if(!e)throw new Error("WebGPU has no adapter here");if(n==="auto"&&e.info.isFallbackAdapter)throw new Error("WebGPU has an adapter in software only");let{maxStorageBufferBindingSize:r,maxBufferSize:t}=e.limits;return e.requestDevice({requiredLimits:{maxStorageBufferBindingSize:r,maxBufferSize:t}})}var L=class{hidden=new OffscreenCanvas(1,1);screen;drawer;disposed=!1;constructor(e,r,t,a,o,s,i){this.screen=t.getContext("2d");let u=c=>{J(c),o.binds=!0,o.activations.fill(NaN);let l=this.hidden=new OffscreenCanvas(1,1);return l.addEventListener("webglcontextlost",d=>d.preventDefault()),l.addEventListener("webglcontextrestored",()=>{this.drawer=new i(l,a,o),s()}),new i(l,a,o)};o.binds=!1;try{this.drawer=new F(e,this.hidden.getContext("webgpu"),a,o)}catch(c){this.drawer=u(`this avatar ${c.message}`);return}r.then(({message:c})=>{this.disposed||(this.drawer=u(`the WebGPU device is lost (${c.trim()||"no reason is given"})`),s())}).catch(c=>console.error(`mien: ${c.message}`))}upload(){this.drawer.upload()}draw(e,r,t){let{hidden:a,screen:o}=this,{width:s,height:i}=r;(a.width!==s||a.height!==i)&&([a.width,a.height]=[s,i]),this.drawer.draw(e,r,t),o.globalCompositeOperation="copy",o.drawImage(a,0,0)}dispose(){this.disposed=!0,this.drawer.dispose()}};return ae(le);})();
+}`;var j=8,_=class{constructor(e,r,t,a,o){this.memory=e;let{rig:s,faces:i,changes:u}=r,c=r.face_index.length,l=i.length/3;this.points=e.storage(s.template.length),this.told=new Float32Array(j+A),this.pose=e.uniform(this.told.length);let d=new Uint32Array(this.told.buffer);if(d[0]=c,d[1]=l,this.frames=this.step(z,l,[this.pose,this.points,e.storage(i),t.frames]),!u)return;if(u.directions.length/u.rest.length>A)throw new E(`has more than ${A} activations`);let{basis:h,columns:p}=oe(u,c);d[2]=p;let m=[a,o].map(y=>e.storage(y));this.changes.push(this.step(O,c,[this.pose,...m,e.storage(h),t.means,t.colors])),u.features&&this.addNetwork(u.features,c,t.colors)}memory;points;pose;frames;changes=[];told;run(e){let{device:r}=this.memory;this.memory.write(this.points,e.points);let t=r.createCommandEncoder(),a=t.beginComputePass(),o=[this.frames];e.changed&&(this.told.set(e.activations,j),o.push(...this.changes)),this.memory.write(this.pose,this.told);for(let{pipeline:s,group:i,threads:u}of o)w(a,s,i,Math.ceil(u/g));a.end(),r.queue.submit([t.finish()])}addNetwork(e,r,t){let{memory:a}=this,{width:o,rank:s,hidden:i}=C(e,r),{weights:u,biases:c}=e,l=Math.ceil(o/4),d=4*Math.ceil(i/4),h=u[0].length/i,p=new Float32Array(4*(l+1)*d);for(let f=0;f<i;++f){let v=4*(l+1)*f;p.set(u[0].subarray(f*h,f*h+o),v);for(let T=0;T<4;++T)p[v+4*l+T]=u[1][T*i+f]}this.told.set(c[1],4);let m=(f,v)=>a.storage(ne(se(f,v))),y=m(M(e,r,o),i),x=[m(e.neutral,o),m(e.basis,o),y,a.storage(p)];this.changes.push(this.step(I(l,s,d),r,[this.pose,...x,t]))}step(e,r,t){let{device:a}=this.memory,o=a.createComputePipeline({layout:"auto",compute:{module:a.createShaderModule({code:e})}});return{pipeline:o,group:this.memory.group(o.getBindGroupLayout(0),t),threads:r}}};function oe({means:n,opacity_logits:e,color:r},t){let a=[{part:n,width:3,at:0},{part:e,width:1,at:3},{part:r,width:3,at:4}],o=(u,c)=>(u?.length??0)/c/Math.max(t,1),s=Math.max(...a.map(({part:u,width:c})=>o(u,c))),i=new Float32Array(8*t*s);for(let{part:u,width:c,at:l}of a){let d=o(u,c);for(let h=0,p=0;h<t;++h)for(let m=0;m<c;++m)for(let y=0;y<d;++y)i[8*(h*s+y)+l+m]=u[p++]}return{basis:i,columns:s}}function se(n,e){let r=4*Math.ceil(e/4),t=n.length/e;if(r===e)return n;let a=new Float32Array(t*r);for(let o=0;o<t;++o)a.set(n.subarray(o*e,(o+1)*e),o*r);return a}function ne(n){if(typeof Float16Array>"u")throw new E("needs half floats, which this browser's WebGPU lacks");return new Uint32Array(new Float16Array(n).buffer)}var R=class{layout;digits;constructor(e){let r=["uniform",...Array(3).fill("read-only-storage"),...Array(3).fill("storage")];this.layout=e.createBindGroupLayout({entries:r.map((o,s)=>({binding:s,visibility:GPUShaderStage.COMPUTE,buffer:{type:o}}))});let t=e.createPipelineLayout({bindGroupLayouts:[this.layout]}),a=e.createShaderModule({code:X});this.digits=[1,0].map(o=>{let s=i=>e.createComputePipeline({layout:t,compute:{module:a,entryPoint:i,constants:{FIRST:o}}});return{count:s("count"),scan:s("scan"),scatter:s("scatter")}})}},U=class{constructor(e,r,t,a,o){this.pipelines=e;this.count=t;let[s,i,u,c]=Array.from({length:4},()=>r.storage(t)),l=r.storage(256*Math.ceil(t/b)),d=[[s,i,u,c],[u,c,s,i]];this.groups=d.map(h=>r.group(e.layout,[a,o,...h,l])),[this.keys,this.order]=[s,i]}pipelines;count;keys;order;groups;run(e){let r=Math.ceil(this.count/b);this.pipelines.digits.forEach(({count:t,scan:a,scatter:o},s)=>{let i=this.groups[s];w(e,t,i,r),w(e,a,i,1),w(e,o,i,r)})}};function G(n,e){for(let r=0,t=0;r<n.length;r+=3,t+=4)e[t]=n[r],e[t+1]=n[r+1],e[t+2]=n[r+2]}var K="rgba16float",W=36,Y=Uint32Array.of(4294967295,0,4,0,0,0),ie=8,B=class{constructor(e,r){this.device=e;this.format=r;let t=s=>e.createShaderModule({code:s});this.project=e.createComputePipeline({layout:"auto",compute:{module:t(V)}}),this.sort=new R(e);let a={srcFactor:"one",dstFactor:"one-minus-src-alpha"},o=(s,i,u)=>{let c=t(s);return e.createRenderPipeline({layout:"auto",vertex:{module:c},fragment:{module:c,targets:[i]},primitive:{topology:u}})};this.draw=o(q,{format:K,blend:{color:a,alpha:a}},"triangle-strip"),this.screen=o(H,{format:r},"triangle-list")}device;format;project;sort;draw;screen},F=class{constructor(e,r,t,a){this.pipelines=e;this.context=r;this.poser=a;let{device:o}=e,{baked:s}=t,{attributes:i,faces:u,face_index:c}=s,l=this.memory=new k(o),d=this.count=c.length;this.shRest=i.sh.length/3/Math.max(d,1)-1,[this.means,this.colors,this.shapeValues]=[4,4,8].map(f=>new Float32Array(f*d)),c.forEach((f,v)=>this.means[4*v+3]=f),G(s.means,this.means);for(let f=0;f<d;++f){let v=3*f*(1+this.shRest);this.colors.set([...i.sh.subarray(v,v+3),i.opacity_logits[f]],4*f)}let h=new Float32Array(4*d*this.shRest);for(let f=0;f<d*this.shRest;++f){let v=3*(f+Math.floor(f/this.shRest)+1);h.set(i.sh.subarray(v,v+3),4*f)}let p=this.posed={frames:l.storage(4*u.length),means:l.storage(this.means),colors:l.storage(this.colors)};this.shapes=l.storage(8*d),this.view=l.uniform(W),this.state=l.indirect(Y),this.sorter=new U(e.sort,l,d,this.view,this.state);let m=l.storage(12*d),y=this.sorter,x=[p.frames,p.means,this.shapes,p.colors,l.storage(h)];this.project=l.group(e.project.getBindGroupLayout(0),[this.view,...x,m,y.keys,this.state]),this.splats=l.group(e.draw.getBindGroupLayout(0),[this.view,m,y.order]),this.uploadShapes(i.quats,i.log_scales.map(Math.exp)),this.gpuPoser=s.skinned?null:new _(l,s,p,this.means,this.colors),r.configure({device:o,format:e.format,alphaMode:"premultiplied"})}pipelines;context;poser;memory;posed;shapes;view;state;gpuPoser;sorter;means;colors;shapeValues;project;splats;count;shRest;picture=null;screen=null;upload(){this.gpuPoser?this.gpuPoser.run(this.poser):this.uploadPosed(this.poser,this.poser.skinned)}draw(e,r,t){let{pipelines:a,count:o}=this,{device:s}=a,[i,u,c,l]=t,d=r.directions,h=new Float32Array(W);h.set(r.head),h.set([d[0],d[1],d[2],0,d[3],d[4],d[5],0,d[6],d[7],d[8]],12),h.set([...r.focal,...r.centre,r.width,r.height],24),new Uint32Array(h.buffer).set([o,this.shRest],30),h.set([i*l,u*l,c*l,l],32),this.memory.write(this.view,h),this.memory.write(this.state,Y);let p=s.createCommandEncoder(),m=p.beginComputePass();w(m,a.project,this.project,Math.ceil(o/g)),this.sorter.run(m),m.end();let y=this.pictureOf(r.width,r.height);this.render(p,y.createView(),a.draw,this.splats,x=>x.drawIndirect(this.state,ie)),this.render(p,this.context.getCurrentTexture().createView(),a.screen,this.screen,x=>x.draw(3)),s.queue.submit([p.finish()])}dispose(){this.picture?.destroy(),this.memory.free()}render(e,r,t,a,o){let s=e.beginRenderPass({colorAttachments:[{view:r,loadOp:"clear",storeOp:"store"}]});s.setPipeline(t),s.setBindGroup(0,a),o(s),s.end()}pictureOf(e,r){let{pipelines:t}=this,{device:a}=t;if(this.picture?.width===e&&this.picture.height===r)return this.picture;this.picture?.destroy();let{RENDER_ATTACHMENT:o,TEXTURE_BINDING:s}=GPUTextureUsage,i=this.picture=a.createTexture({size:[e,r],format:K,usage:o|s});return this.screen=a.createBindGroup({layout:t.screen.getBindGroupLayout(0),entries:[{binding:0,resource:{buffer:this.view}},{binding:1,resource:i.createView()}]}),i}uploadPosed(e,r){let{memory:t,posed:a,means:o,colors:s}=this;G(e.means,o),G(e.colors,s),e.opacityLogits.forEach((i,u)=>s[4*u+3]=i),t.write(a.frames,e.frames),t.write(a.means,o),t.write(a.colors,s),this.uploadShapes(r.quats,r.scales)}uploadShapes(e,r){let{shapeValues:t}=this;for(let a=0;a<this.count;++a){for(let o=0;o<4;++o)t[8*a+o]=e[4*a+o];for(let o=0;o<3;++o)t[8*a+4+o]=r[3*a+o]}this.memory.write(this.shapes,t)}};async function ue(n="auto"){if(n!=="webgl2")try{let e=await ce(n),r=e.lost;e.pushErrorScope("validation");let t=new B(e,navigator.gpu.getPreferredCanvasFormat()),a=await e.popErrorScope();if(a)throw new Error(a.message);return(...o)=>new L(t,r,...o)}catch(e){J(e.message);return}}var J=n=>console.warn(`mien: ${n}; WebGL2 draws instead`);async function ce(n){if(!navigator.gpu)throw new Error("this browser has no WebGPU, or the page has no secure address");let e=await navigator.gpu.requestAdapter({powerPreference:"high-performance"});if(!e)throw new Error("WebGPU has no adapter here");if(n==="auto"&&e.info.isFallbackAdapter)throw new Error("WebGPU has an adapter in software only");let{maxStorageBufferBindingSize:r,maxBufferSize:t}=e.limits;return e.requestDevice({requiredLimits:{maxStorageBufferBindingSize:r,maxBufferSize:t}})}var L=class{hidden=new OffscreenCanvas(1,1);screen;drawer;disposed=!1;constructor(e,r,t,a,o,s,i){this.screen=t.getContext("2d");let u=c=>{J(c),o.binds=!0,o.activations.fill(NaN);let l=this.hidden=new OffscreenCanvas(1,1);return l.addEventListener("webglcontextlost",d=>d.preventDefault()),l.addEventListener("webglcontextrestored",()=>{this.drawer=new i(l,a,o),s()}),new i(l,a,o)};o.binds=!1;try{this.drawer=new F(e,this.hidden.getContext("webgpu"),a,o)}catch(c){this.drawer=u(`this avatar ${c.message}`);return}r.then(({message:c})=>{this.disposed||(this.drawer=u(`the WebGPU device is lost (${c.trim()||"no reason is given"})`),s())}).catch(c=>console.error(`mien: ${c.message}`))}upload(){this.drawer.upload()}draw(e,r,t){let{hidden:a,screen:o}=this,{width:s,height:i}=r;(a.width!==s||a.height!==i)&&([a.width,a.height]=[s,i]),this.drawer.draw(e,r,t),o.globalCompositeOperation="copy",o.drawImage(a,0,0)}dispose(){this.disposed=!0,this.drawer.dispose()}};return ae(le);})();

@@ -287,12 +287,12 @@ def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 def _lowest_loop(border: Int[np.ndarray, "b 2"], height: Float[np.ndarray, " v"]) -> Int[np.ndarray, " n"]:
     """Return the vertices, in order, of the open border that holds the lowest vertex."""
-    neighbours: dict[int, list[int]] = {}
+    neighbors: dict[int, list[int]] = {}
     for first, second in border.tolist():
-        neighbours.setdefault(first, []).append(second)
-        neighbours.setdefault(second, []).append(first)
-    start = min(neighbours, key=lambda vertex: height[vertex])
-    loop = [start, min(neighbours[start])]
-    while (following := next(v for v in neighbours[loop[-1]] if v != loop[-2])) != start:
+        neighbors.setdefault(first, []).append(second)
+        neighbors.setdefault(second, []).append(first)
+    start = min(neighbors, key=lambda vertex: height[vertex])
+    loop = [start, min(neighbors[start])]
+    while (following := next(v for v in neighbors[loop[-1]] if v != loop[-2])) != start:
         loop.append(following)
     return np.array(loop)

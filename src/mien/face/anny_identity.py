@@ -83,13 +83,13 @@ def principal_components(
     for _ in range(2):
         aligned = _align(aligned, reference, rigid_weights)
         reference = aligned.mean(0)
-    centred = (aligned - reference).reshape(len(aligned), -1)
+    centered = (aligned - reference).reshape(len(aligned), -1)
     scale = np.repeat(np.sqrt(weights / weights.sum()), 3)
-    weighted = centred * scale
+    weighted = centered * scale
     variances, vectors = np.linalg.eigh(weighted @ weighted.T / len(weighted))
     order = np.argsort(variances)[::-1][:COMPONENTS]
     # The scaled eigenvector holds the projections onto a component: unit variance is vector * sqrt(s).
-    components = vectors[:, order].T @ centred / np.sqrt(len(centred))
+    components = vectors[:, order].T @ centered / np.sqrt(len(centered))
     components = components * np.sign(components[np.arange(COMPONENTS), np.abs(components).argmax(1)])[:, None]
     return IdentityBasis(
         mean=reference,
@@ -147,9 +147,9 @@ def _align(
 ) -> Float[np.ndarray, "s v 3"]:
     """Align everyone rigidly with the reference (weighted Procrustes without scale)."""
     share = weights / weights.sum()
-    centre = np.einsum("v,svc->sc", share, people)
+    center = np.einsum("v,svc->sc", share, people)
     target = share @ reference
-    moved = people - centre[:, None]
+    moved = people - center[:, None]
     covariance = moved.transpose(0, 2, 1) @ (share[:, None] * (reference - target))
     u, _, vt = np.linalg.svd(covariance)
     sign = np.sign(np.linalg.det(u @ vt))

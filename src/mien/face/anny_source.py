@@ -18,7 +18,7 @@ from mien.errors import UserError
 
 RECIPE = 5
 """Recipe version. Raise it whenever baking gives a different result: names of cached files contain it."""
-METRES_PER_UNIT = 0.1
+METERS_PER_UNIT = 0.1
 """MakeHuman's meshes are in decimetres. Their axes are those of mien's head frame."""
 
 HEAD_CONTROLS = ("cheek", "chin", "ears", "eyebrows", "eyes", "forehead", "head", "mouth", "neck", "nose")
@@ -95,7 +95,7 @@ def read_base_mesh(data: Path) -> BaseMesh:
                 corners = [[int(number) - 1 for number in corner.split("/")] for corner in values]
                 quads.setdefault(group, []).append(corners)
     return BaseMesh(
-        vertices=np.array(vertices, np.float64) * METRES_PER_UNIT,
+        vertices=np.array(vertices, np.float64) * METERS_PER_UNIT,
         uv=np.array(uv, np.float64),
         groups={name: np.array(members, np.int64) for name, members in quads.items()},
     )
@@ -108,7 +108,7 @@ def read_target(path: Path, vertices: int) -> Float[np.ndarray, "v 3"]:
     # Some targets are empty.
     values = np.array(rows, np.float64).reshape(-1, 4)
     deltas = np.zeros((vertices, 3))
-    deltas[values[:, 0].astype(np.int64)] = values[:, 1:] * METRES_PER_UNIT
+    deltas[values[:, 0].astype(np.int64)] = values[:, 1:] * METERS_PER_UNIT
     return deltas
 
 

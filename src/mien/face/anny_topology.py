@@ -202,10 +202,10 @@ def _pack_texture(
         packed[chosen] = _fit(source[chosen], box)
     for side in ("left_eye", "right_eye"):
         ball = parts == side
-        centre = positions[np.unique(faces[ball])].mean(0)
-        ahead = positions[faces].mean(1)[:, 2] > centre[2]
+        center = positions[np.unique(faces[ball])].mean(0)
+        ahead = positions[faces].mean(1)[:, 2] > center[2]
         for name, triangles in ((f"{side}_front", ball & ahead), (f"{side}_back", ball & ~ahead)):
-            rays = (positions[faces[triangles]] - centre).reshape(-1, 3)
+            rays = (positions[faces[triangles]] - center).reshape(-1, 3)
             packed[uv_faces[triangles].ravel()] = _fit(_unroll(rays, ahead=name.endswith("front")), _BOXES[name])
     return packed
 

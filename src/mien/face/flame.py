@@ -108,8 +108,8 @@ def read_flame(path: Path) -> FlameFile:
 
 def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> FaceModel:
     """Convert a file in FLAME's schema to a face model without landmarks; `shareable` as in `FaceModel`."""
-    eyes, centres = _eyeballs(flame)
-    origin = _origin(centres)
+    eyes, centers = _eyeballs(flame)
+    origin = _origin(centers)
     correctives = flame.correctives.reshape(4, 3, 3, -1, 3).copy()
     correctives[0] = correctives[0].swapaxes(0, 1)  # for the inverse of the neck's rotation
     if flame.uv is None or flame.uv_faces is None:
@@ -124,7 +124,7 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
         uv=_rounded(uv),
         uv_faces=torch.from_numpy(uv_faces),
         region_names=REGIONS,
-        face_regions=torch.from_numpy(_regions(flame, eyes, centres)),
+        face_regions=torch.from_numpy(_regions(flame, eyes, centers)),
         identity_basis=_tensor(flame.identity),
         expression_basis=_tensor(flame.expression),
         expression_names=tuple(f"expression_{index:03d}" for index in range(e)),
@@ -200,11 +200,11 @@ def _rounded(values: np.ndarray) -> torch.Tensor:
     return _tensor(np.round(values / _QUANTUM) * _QUANTUM + 0.0)
 
 
-def _regions(flame: FlameFile, eyes: list[np.ndarray], centres: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, " f"]:
+def _regions(flame: FlameFile, eyes: list[np.ndarray], centers: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, " f"]:
     regions = np.zeros(len(flame.faces), np.int64)
     regions[(flame.weights[:, 0] > 0.5)[flame.faces].all(1)] = REGIONS.index("neck")
-    for ball, centre in zip(eyes, centres, strict=True):
-        rays = flame.template - centre
+    for ball, center in zip(eyes, centers, strict=True):
+        rays = flame.template - center
         ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < _IRIS_RADIUS)
         triangles = ball[flame.faces].all(1)
         regions[triangles] = REGIONS.index("eyes")
@@ -331,6 +331,6 @@ def _eyeballs(flame: FlameFile) -> tuple[list[np.ndarray], Float[np.ndarray, "2 
     return eyes, np.stack([flame.template[eye].mean(0) for eye in eyes])
 
 
-def _origin(centres: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, " 3"]:
+def _origin(centers: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, " 3"]:
     """The head frame's origin in FLAME's coordinates, in metres: behind the midpoint of the eyeballs' centres."""
-    return centres.mean(0) - np.array([0.0, 0.0, EYE_BACK])
+    return centers.mean(0) - np.array([0.0, 0.0, EYE_BACK])

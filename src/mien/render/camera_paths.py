@@ -35,43 +35,43 @@ _OTHER_MODELS = re.compile(
 
 def turntable(
     camera: Camera,
-    centre: Float[Tensor, " 3"],
+    center: Float[Tensor, " 3"],
     frames: int,
     span: float = 2 * math.pi,
     up: tuple[float, float, float] = _WORLD_UP,
 ) -> list[Camera]:
-    """Cameras that circle `centre` once at the distance, height and focal length of `camera`, which is the first.
+    """Cameras that circle `center` once at the distance, height and focal length of `camera`, which is the first.
 
     If `span` is below a full turn, the camera swings instead: to span / 2 on the subject's left, back through the
     middle to the right, and home. It slows down at the ends. Either path loops.
 
     Args:
         camera: The start of the path. The centre keeps its place in the picture.
-        centre: The point to circle, in world space, in metres (the head's: `FaceParams.head_translation`).
+        center: The point to circle, in world space, in metres (the head's: `FaceParams.head_translation`).
         frames: Number of cameras.
         span: Angle in radians, 2 pi for a full turn.
         up: Axis of the turn in world space.
     """
     phases = [2 * math.pi * index / frames for index in range(frames)]
     full = span >= 2 * math.pi
-    return [orbit(camera, centre, phase if full else 0.5 * span * math.sin(phase), up) for phase in phases]
+    return [orbit(camera, center, phase if full else 0.5 * span * math.sin(phase), up) for phase in phases]
 
 
-def aside(camera: Camera, centre: Float[Tensor, " 3"], yaw: float, pitch: float) -> Camera:
-    """`camera` moved around `centre`: first up by `pitch`, then to the subject's left by `yaw`, both in radians."""
+def turned_camera(camera: Camera, center: Float[Tensor, " 3"], yaw: float, pitch: float) -> Camera:
+    """`camera` moved around `center`: first up by `pitch`, then to the subject's left by `yaw`, both in radians."""
     sideways = invert_rigid(camera.viewmat)[:3, 0]
-    raised = orbit(camera, centre, -pitch, tuple(sideways.tolist())) if pitch else camera
-    return orbit(raised, centre, yaw) if yaw else raised
+    raised = orbit(camera, center, -pitch, tuple(sideways.tolist())) if pitch else camera
+    return orbit(raised, center, yaw) if yaw else raised
 
 
 def sway(
-    camera: Camera, centre: Float[Tensor, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
+    camera: Camera, center: Float[Tensor, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
 ) -> list[Camera]:
     """Cameras on a horizontal figure eight around the position of `camera`, or on an oval without `crossing`.
 
     Args:
         camera: The middle of the path. The centre keeps its place in the picture.
-        centre: The point to look at, in world space, in metres.
+        center: The point to look at, in world space, in metres.
         frames: Number of cameras. The path loops.
         span: Angle from the far left to the far right, in radians.
         tilt: Angle from the highest to the lowest point, in radians.
@@ -80,7 +80,7 @@ def sway(
     views = []
     for phase in (2 * math.pi * index / frames for index in range(frames)):
         raised = 0.5 * tilt * (math.sin(2 * phase) if crossing else math.cos(phase))
-        views.append(aside(camera, centre, 0.5 * span * math.sin(phase), raised))
+        views.append(turned_camera(camera, center, 0.5 * span * math.sin(phase), raised))
     return views
 
 
@@ -182,12 +182,12 @@ def _whole(size: Any) -> Any:
 
 
 def orbit(
-    camera: Camera, centre: Float[Tensor, " 3"], angle: float, up: tuple[float, float, float] = _WORLD_UP
+    camera: Camera, center: Float[Tensor, " 3"], angle: float, up: tuple[float, float, float] = _WORLD_UP
 ) -> Camera:
-    """`camera` moved around `centre` by `angle` radians, counter-clockwise seen from above."""
+    """`camera` moved around `center` by `angle` radians, counter-clockwise seen from above."""
     axis = torch.nn.functional.normalize(camera.viewmat.new_tensor(up), dim=0)
     turn = matrix_from_axis_angle(axis * angle)
-    centre = centre.to(camera.viewmat)
+    center = center.to(camera.viewmat)
     # p -> turn (p - centre) + centre moves the camera; the world moves the other way.
-    carry = rigid_transform(turn, centre - turn @ centre)
+    carry = rigid_transform(turn, center - turn @ center)
     return replace(camera, viewmat=camera.viewmat @ invert_rigid(carry))

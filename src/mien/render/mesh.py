@@ -47,7 +47,7 @@ class Headlight:
     """Light that reaches every surface. The lamp adds the rest up to 1."""
 
 
-GREY = (0.75, 0.75, 0.75)
+GRAY = (0.75, 0.75, 0.75)
 """Default colour of a surface."""
 
 
@@ -207,7 +207,7 @@ def _albedo(
     fragments: MeshFragments, faces: Int[Tensor, "f 3"], colors: Tensor | Texture | None
 ) -> Float[Tensor, "h w 3"]:
     if colors is None:
-        return torch.tensor(GREY).expand(*fragments.depth.shape, 3)
+        return torch.tensor(GRAY).expand(*fragments.depth.shape, 3)
     if isinstance(colors, Texture):
         return sample_texture(colors.image, interpolate(fragments, colors.uv, faces))
     return interpolate(fragments, colors, faces)

@@ -113,12 +113,12 @@ def rasterize_each(views: Sequence[View], backgrounds: Sequence[Float[Tensor, " 
 
 def _depths(views: Sequence[View], pictures: Sequence[Rendering], render_views: RenderViews) -> list[Tensor]:
     """The expected depth of each view: depths blended like colours, divided by the sum of their weights."""
-    coloured = []
+    colored = []
     for gaussians, camera in views:
         depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-        coloured.append((replace(gaussians, sh=sh_from_rgb(depths[:, None, None].expand(-1, 1, 3))), camera))
+        colored.append((replace(gaussians, sh=sh_from_rgb(depths[:, None, None].expand(-1, 1, 3))), camera))
     black, offsets = views[0][0].means.new_zeros(3), [torch.zeros_like(picture.means2d_offset) for picture in pictures]
-    blended = [picture.image[..., 0] for picture in render_views(coloured, [black] * len(views), offsets)]
+    blended = [picture.image[..., 0] for picture in render_views(colored, [black] * len(views), offsets)]
     return [
         torch.where(picture.alpha > 0, sums / picture.alpha.clamp_min(1e-6), 0)
         for sums, picture in zip(blended, pictures, strict=True)

@@ -40,9 +40,9 @@ def render_reference(
 
 def _overlapping(splats: Splats, order: Tensor, xs: Tensor, ys: Tensor) -> Tensor:
     """Indices, front to back, of the splats that can reach the pixels of a tile."""
-    centre, extent = splats.means2d.detach()[order], splats.extents[order]
+    center, extent = splats.means2d.detach()[order], splats.extents[order]
     first, last = torch.stack([xs[0], ys[0]]), torch.stack([xs[-1], ys[-1]])
-    return order[((centre + extent >= first) & (centre - extent <= last)).all(-1)]
+    return order[((center + extent >= first) & (center - extent <= last)).all(-1)]
 
 
 def _blend(

@@ -121,7 +121,7 @@ def render(
     pose = gaussians.T_world_local
     viewmat = camera.viewmat if pose is None else compose_rigid(camera.viewmat, pose)
     # The core takes arrays as they lie in memory; the caller's may be transposed, or of another type.
-    means, quats, scales, opacities, sh, colour, view, K = (
+    means, quats, scales, opacities, sh, color, view, K = (
         np.ascontiguousarray(array, np.float32)
         for array in (
             gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, background, viewmat,
@@ -129,7 +129,7 @@ def render(
         )
     )  # fmt: skip
     arrays = _native.GaussianArrays(means, quats, scales, opacities, sh)
-    task = _native.RasterizeView(arrays, colour, view, K, image, alpha, radii)
+    task = _native.RasterizeView(arrays, color, view, K, image, alpha, radii)
     if _native.rasterize_views([task], differentiable=False) == [None]:
         raise ValueError("render: the Gaussians, the camera or the background hold NaN or infinity")
     return image, alpha

@@ -126,7 +126,7 @@ class ExpressionChanges:
     directions: Float32[np.ndarray, "i r"]
     reach: Float32[np.ndarray, " 1"]
     """Length of the activations up to which training saw expressions."""
-    colour: Float32[np.ndarray, "n 3 _"] | None = None
+    color: Float32[np.ndarray, "n 3 _"] | None = None
     """[n, 3, r], or [n, 3, c]: changes of the first SH coefficient per unit of each activation."""
     opacity_logits: Float32[np.ndarray, "n _"] | None = None
     means: Float32[np.ndarray, "n 3 _"] | None = None
@@ -167,7 +167,7 @@ class BlendSkinned:
     scale_gain: float = 1.0
     """With `sigmoid`: scale = gain * sigmoid(raw) + offset, in metres."""
     scale_offset: float = 0.0
-    colour_activation: Literal["sh", "sigmoid"] = "sh"
+    color_activation: Literal["sh", "sigmoid"] = "sh"
     """With `sigmoid`: the only SH coefficient is the logit of the colour."""
     bases: LinearBases | None = None
     network: AttributeNetwork | None = None

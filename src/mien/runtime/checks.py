@@ -133,7 +133,7 @@ def _baked_faults(baked: BakedAvatar) -> Iterator[str]:
     if isinstance(baked, BlendSkinned):
         if max(abs(baked.scale_gain), abs(baked.scale_offset)) > MAX_NUMBER:
             yield f"its scales reach {baked.scale_gain:g} metres"
-        if baked.colour_activation == "sigmoid" and attributes.sh.shape[1] != 1:
+        if baked.color_activation == "sigmoid" and attributes.sh.shape[1] != 1:
             yield "its colours are sigmoids, but have several SH coefficients"
         yield from _still_faults(baked, n)
     if isinstance(baked, Static) and len(baked.means) != n:
@@ -175,12 +175,12 @@ def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator
     r = changes.directions.shape[1]
     # Features are blended by another operation, which takes any number of activations.
     c = r if changes.basis_columns is None else changes.basis_columns
-    limited = any(part is not None for part in (changes.colour, changes.opacity_logits, changes.means))
+    limited = any(part is not None for part in (changes.color, changes.opacity_logits, changes.means))
     if r < 1 or not 1 <= c <= r or (limited and c > MAX_ACTIVATIONS):
         yield f"its changes with the expression have {c} of {r} activations, not 1 to {MAX_ACTIVATIONS}"
         return
     shapes = {"rest": (inputs,), "directions": (inputs, r), "reach": (1,)}
-    shapes |= {"colour": (n, 3, c), "opacity_logits": (n, c), "means": (n, 3, c)}
+    shapes |= {"color": (n, 3, c), "opacity_logits": (n, c), "means": (n, 3, c)}
     for name, shape in shapes.items():
         part = getattr(changes, name)
         if part is not None and part.shape != shape:

@@ -82,20 +82,20 @@ def pose(baked: BakedAvatar, face: Face) -> Gaussians:
 
 
 def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
-    shaped, centres = shaped_and_posed(baked.rig, face)
+    shaped, centers = shaped_and_posed(baked.rig, face)
     if baked.still_weights is not None and baked.still_pose is not None:
         still = np.linalg.inv(face.T_world_head.astype(np.float64)) @ baked.still_pose
         transform = np.ascontiguousarray(still[:3], np.float32)
-        _native.add_bone(shaped, _contiguous_row(baked.still_weights), transform, centres)
+        _native.add_bone(shaped, _contiguous_row(baked.still_weights), transform, centers)
     if _has_native_activations(baked):
-        return _with_native_activations(baked, centres, face)
-    raw = _raw_values(baked.attributes, baked.bases, baked.network, centres - baked.rig.template, face)
+        return _with_native_activations(baked, centers, face)
+    raw = _raw_values(baked.attributes, baked.bases, baked.network, centers - baked.rig.template, face)
     if baked.scale_activation == "sigmoid":
         scales = baked.scale_gain * sigmoid(raw["log_scales"]) + baked.scale_offset
     else:
         scales = np.exp(raw["log_scales"])
-    sh = (sigmoid(raw["sh"]) - 0.5) / SH_C0 if baked.colour_activation == "sigmoid" else raw["sh"]
-    return _contiguous(centres, raw["quats"], scales, sigmoid(raw["opacity_logits"]), sh, face.T_world_head)
+    sh = (sigmoid(raw["sh"]) - 0.5) / SH_C0 if baked.color_activation == "sigmoid" else raw["sh"]
+    return _contiguous(centers, raw["quats"], scales, sigmoid(raw["opacity_logits"]), sh, face.T_world_head)
 
 
 def _has_native_activations(baked: BlendSkinned) -> bool:
@@ -106,16 +106,16 @@ def _has_native_activations(baked: BlendSkinned) -> bool:
         and _has_native_layers(network)
         and network.outputs == _POINT_OUTPUTS
         and baked.bases is None
-        and (baked.scale_activation, baked.colour_activation) == ("sigmoid", "sigmoid")
+        and (baked.scale_activation, baked.color_activation) == ("sigmoid", "sigmoid")
         and baked.attributes.sh.shape[1] == 1
     )
 
 
-def _with_native_activations(baked: BlendSkinned, centres: Float32[np.ndarray, "n 3"], face: Face) -> Gaussians:
+def _with_native_activations(baked: BlendSkinned, centers: Float32[np.ndarray, "n 3"], face: Face) -> Gaussians:
     """The Gaussians of such an avatar, with the bits that numpy gives."""
     assert baked.network is not None
-    changes = _run_layers(baked.network, centres - baked.rig.template)
-    raw, n = baked.attributes, len(centres)
+    changes = _run_layers(baked.network, centers - baked.rig.template)
+    raw, n = baked.attributes, len(centers)
     own = (raw.log_scales, raw.quats, raw.opacity_logits, raw.sh[:, 0])
     out = tuple(np.empty(shape, np.float32) for shape in ((n, 3), (n, 4), (n,), (n, 1, 3)))
     _native.activate_points(
@@ -125,7 +125,7 @@ def _with_native_activations(baked: BlendSkinned, centres: Float32[np.ndarray, "
         _native.ActivatedPoints(*out),
     )
     scales, quats, opacities, sh = out
-    return Gaussians(np.ascontiguousarray(centres), quats, scales, opacities, sh, face.T_world_head)
+    return Gaussians(np.ascontiguousarray(centers), quats, scales, opacities, sh, face.T_world_head)
 
 
 def rig_points(rig: Rig, face: Face, in_world: bool = False) -> Float32[np.ndarray, "m 3"]:
@@ -170,8 +170,8 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
         changes = expression_changes(baked.changes, face)
         local_means = local_means + changes.get("means", np.float32(0))
         opacity_logits = opacity_logits + changes.get("opacity_logits", np.float32(0))
-        if "colour" in changes:
-            sh = np.concatenate([sh[:, :1] + changes["colour"][:, None], sh[:, 1:]], axis=1)
+        if "color" in changes:
+            sh = np.concatenate([sh[:, :1] + changes["color"][:, None], sh[:, 1:]], axis=1)
     in_head = baked.sh_frame == "head"
     vertices = rig_points(baked.rig, face, in_world=not in_head)
     n = len(raw.quats)
@@ -193,14 +193,14 @@ def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.n
     """Return the changes of the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None changes nothing."""
     activations = _along(face, changes.rest, changes.directions, changes.reach)
     added = {}
-    for name in ("colour", "opacity_logits", "means"):
+    for name in ("color", "opacity_logits", "means"):
         basis = getattr(changes, name)
         if basis is not None:
             added[name] = np.empty(basis.shape[:-1], np.float32)
             _native.expression_change(np.ascontiguousarray(basis), activations[: changes.basis_columns], added[name])
     if changes.features is not None:
-        colour, opacity_logits = feature_changes(changes.features, activations)
-        added["colour"] = added.get("colour", np.float32(0)) + colour
+        color, opacity_logits = feature_changes(changes.features, activations)
+        added["color"] = added.get("color", np.float32(0)) + color
         added["opacity_logits"] = added.get("opacity_logits", np.float32(0)) + opacity_logits
     return added
 
@@ -225,10 +225,10 @@ def feature_changes(
     layers = zip(features.weights, features.biases, strict=True)
     arrays = [features.neutral, features.own, *(array for layer in layers for array in layer)]
     network = _native.FeatureNetwork(*(np.ascontiguousarray(array) for array in arrays))
-    colour, opacity_logits = (np.empty((len(features.neutral), *shape), np.float32) for shape in ((3,), ()))
+    color, opacity_logits = (np.empty((len(features.neutral), *shape), np.float32) for shape in ((3,), ()))
     bases = [_native.FeatureBases(np.ascontiguousarray(features.basis), activations, False)]
-    _native.feature_network(network, bases, None, colour, opacity_logits)
-    return colour, opacity_logits
+    _native.feature_network(network, bases, None, color, opacity_logits)
+    return color, opacity_logits
 
 
 def _raw_values(

@@ -71,8 +71,8 @@ def fit_neck_cut(parts: NeckParts, vertices: Float[Tensor, "v 3"], up: Float[Ten
         up: A direction on the head's side of the plane.
     """
     points, ring = (vertices[indices].double().numpy() for indices in (parts.base, parts.middle))
-    centre = points.mean(0)
-    normal = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
+    center = points.mean(0)
+    normal = np.linalg.eigh((points - center).T @ (points - center))[1][:, 0]
     normal = normal if normal @ up.double().numpy() > 0 else -normal
     offsets = ring - ring.mean(0)
     flat = offsets - np.outer(offsets @ normal, normal)
@@ -80,7 +80,7 @@ def fit_neck_cut(parts: NeckParts, vertices: Float[Tensor, "v 3"], up: Float[Ten
     axes = np.stack([first, np.cross(normal, first), normal])
     radii = np.maximum(np.abs(offsets @ axes[:2].T).max(0), 1e-3)
     middle = ring.mean(0)
-    return NeckCut(middle - (1 - _RAISED) * normal * ((middle - centre) @ normal), axes, radii)
+    return NeckCut(middle - (1 - _RAISED) * normal * ((middle - center) @ normal), axes, radii)
 
 
 def above_neck_cut(cut: NeckCut, camera: Camera) -> Float[np.ndarray, "h w"]:

@@ -53,9 +53,9 @@ def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camer
     for start in range(0, len(face), _CHUNK):
         part = face[start : start + _CHUNK]
         vertices = face_model(part)[:, bottom]
-        centre = vertices.mean(1)
-        above = centre + part.T_world_head[:, :3, :3] @ up
-        seen = [[camera.project(points)[0] for points in (vertices, centre, above)] for camera in cameras]
+        center = vertices.mean(1)
+        above = center + part.T_world_head[:, :3, :3] @ up
+        seen = [[camera.project(points)[0] for points in (vertices, center, above)] for camera in cameras]
         lines.append(torch.stack([_line(*projected) for projected in seen], dim=1))
     return torch.cat(lines)
 
@@ -64,22 +64,22 @@ def _line(
     points: Float[Tensor, "b n 2"], inside: Float[Tensor, "b 2"], above: Float[Tensor, "b 2"]
 ) -> Float[Tensor, "b 3"]:
     """Total least squares lines (a, b, d), with a x + b y + d positive on the side of `above`."""
-    centre = points.mean(1)
-    centred = points - centre[:, None]
-    normal = torch.linalg.eigh(centred.mT @ centred).eigenvectors[..., 0]
+    center = points.mean(1)
+    centered = points - center[:, None]
+    normal = torch.linalg.eigh(centered.mT @ centered).eigenvectors[..., 0]
     upwards = ((above - inside) * normal).sum(-1, keepdim=True)
     normal = torch.where(upwards < 0, -normal, normal)
-    return torch.cat([normal, -(normal * centre).sum(-1, keepdim=True)], dim=1)
+    return torch.cat([normal, -(normal * center).sum(-1, keepdim=True)], dim=1)
 
 
 def _connected(edges: list[list[int]]) -> list[list[int]]:
     """The vertices of each connected component."""
-    neighbours: dict[int, list[int]] = defaultdict(list)
+    neighbors: dict[int, list[int]] = defaultdict(list)
     for first, second in edges:
-        neighbours[first].append(second)
-        neighbours[second].append(first)
+        neighbors[first].append(second)
+        neighbors[second].append(first)
     components, seen = [], set()
-    for start in neighbours:
+    for start in neighbors:
         if start in seen:
             continue
         component, pending = [], [start]
@@ -87,7 +87,7 @@ def _connected(edges: list[list[int]]) -> list[list[int]]:
         while pending:
             vertex = pending.pop()
             component.append(vertex)
-            fresh = [other for other in neighbours[vertex] if other not in seen]
+            fresh = [other for other in neighbors[vertex] if other not in seen]
             seen.update(fresh)
             pending += fresh
         components.append(component)

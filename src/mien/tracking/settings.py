@@ -139,7 +139,7 @@ class PaperSettings:
     """Standard deviation of the difference between neighbouring texels."""
     light_sigma: Annotated[float, POSITIVE] = 0.3
     """Standard deviation of the light's spherical harmonics from an even light."""
-    grey_sigma: Annotated[float, POSITIVE] = 0.05
+    gray_sigma: Annotated[float, POSITIVE] = 0.05
     """Standard deviation of the light's colour channels from their mean."""
     focal_sigma: Annotated[float, POSITIVE] = 0.03
     """Standard deviation of the logarithm of an unknown focal length from that of the fit to landmarks."""

@@ -43,7 +43,7 @@ class TrainingData:
     """One entry per sequence."""
     extent: float = MIN_EXTENT
     """Extent of the training cameras, in metres."""
-    telling: tuple[Frame, ...] = ()
+    representative: tuple[Frame, ...] = ()
     """A few frames that show the head from all the sides that were filmed."""
     ahead: TargetQueue | None = None
     """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mien.avatar import FaceTuning, Moments, ParameterGroup
 from mien.face import FaceParams
-from mien.rotation import align_centred, axis_angle_from_matrix, matrix_from_axis_angle
+from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
 
 _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
 _STILL = 0.02
@@ -188,7 +188,7 @@ def turns_from_mean(tracked: FaceParams) -> Float[Tensor, "t 3"]:
     """Return the rotation vectors of head poses from their mean, in radians, in float64 on the CPU."""
     rotations = tracked.T_world_head[:, :3, :3].double().cpu()
     # The rotation that is nearest to the mean matrix aligns the axes with its columns.
-    mean, _ = align_centred(np.eye(3), rotations.mean(0).T.numpy())
+    mean, _ = align_centered(np.eye(3), rotations.mean(0).T.numpy())
     return axis_angle_from_matrix(torch.from_numpy(mean).mT @ rotations)
 
 

@@ -49,7 +49,7 @@ class Step:
     """How far the run was before the step."""
     camera: Callable[[Frame], Camera]
     """Returns the camera of a frame, at training resolution."""
-    telling: tuple[Frame, ...]
+    representative: tuple[Frame, ...]
     """A few frames that show the head from all the sides that were filmed."""
     changed: bool = False
     """Whether density control has changed the Gaussians in this step."""

@@ -29,10 +29,10 @@ class TrainSettings:
     background: Literal["white", "random", "auto"] = "white"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white. Auto: random where sides
-    are filled (`--training.unseen`), where white ears would show from aside, else white."""
+    are filled (`--training.unseen`), where white ears would show from the side, else white."""
     edges: Literal["filmed", "cleaned", "auto"] = "filmed"
     """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
-    avatar learns the background in them and shows it as slivers on hair and neck, from aside and over other
+    avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
     backgrounds. Cleaned: the colours of the person alone, as estimated from what is solid nearby. Auto: cleaned where
     sides are filled (`--training.unseen`), else filmed. Pictures are scored as they were filmed in either case, which
     costs a cleaned avatar some tenths of a decibel."""
@@ -47,23 +47,23 @@ class TrainSettings:
     """Learning rate of these changes, per step. It ends at a tenth."""
     unseen: Literal["trained", "filled", "auto"] = "trained"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
-    broken from aside. Filled: they are a closed surface in completed colours from the first step on, and so is what no
-    picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes; and
-    alpha is compared with the matte (weight 0.2 or more). Auto: filled if one camera filmed, trained if there are
+    broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
+    no picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes;
+    and alpha is compared with the matte (weight 0.2 or more). Auto: filled if one camera filmed, trained if there are
     several. Methods that bind no Gaussians to triangles train all sides in either case."""
     side_weight: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Weight of the views from aside and of raised expressions, in which filled heads are compared with the completed
-    mesh."""
+    """Weight of the views from the side and of raised expressions, in which filled heads are compared with the
+    completed mesh."""
     hair_rate: Annotated[float, Range(0, 0.01)] = 6e-4
     """Largest distance in metres by which the surface of the hair of a filled head rises or sinks in one correction,
     where that lowers the loss. There is one after every 8 steps from 3 to 60 % of the run, and they get smaller. 0
     keeps the hair at the height that was measured on mattes or guessed from it."""
-    inside: Literal["free", "covered", "furnished"] = "free"
+    inside: Literal["free", "covered", "filled"] = "free"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
     each step, so that lids and lips become opaque. Furnished: also, a mouth that is hardly ever seen gets a surface in
-    dark colours at half of the run, which can show as dark spots on cheeks from aside. Methods that bind no Gaussians
-    to triangles have no such Gaussians."""
+    dark colours at half of the run, which can show as dark spots on cheeks from the side. Methods that bind no
+    Gaussians to triangles have no such Gaussians."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0

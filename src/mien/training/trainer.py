@@ -16,9 +16,9 @@ from mien import _native
 from mien.avatar import (
     Avatar,
     FaceTuning,
-    Lessons,
     MethodConfig,
     Posed,
+    Pretraining,
     Progress,
     load_avatar,
     measure_filmed,
@@ -52,8 +52,8 @@ from mien.training.footage import (
     density_random,
     expression_rarity,
     measure_coverage,
+    representative_frames,
     resolved,
-    telling_frames,
     training_frames,
     vertex_colors,
 )
@@ -66,7 +66,7 @@ from mien.training.settings import TrainSettings
 _STEADY_EVERY = 25
 """Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
 
-_TELLING = 12
+_REPRESENTATIVE = 12
 """Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
@@ -127,8 +127,8 @@ def train(
             for sequence in sequences
         ]
         faces = [sequence.tracking.face for sequence in sequences]
-        telling = telling_frames(faces, sequences, frames, _TELLING, _TELLING)
-        data = TrainingData(order, tuple(targets), extent, tuple(telling))
+        representative = representative_frames(faces, sequences, frames, _REPRESENTATIVE, _REPRESENTATIVE)
+        data = TrainingData(order, tuple(targets), extent, tuple(representative))
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
         write_results(run_dir, state, state.covered or measure_coverage(face_model, sequences, faces, frames))
     return state.avatar
@@ -151,9 +151,9 @@ def _train_to_the_end(
         targets_ahead(data.order, data.targets, settings) as ahead,
     ):
         data = replace(data, ahead=ahead)
-        lessons = state.avatar.extras.lessons
-        if state.step == 0 and lessons is not None:
-            _teach(lessons, state, settings, progress, stop)
+        pretraining = state.avatar.extras.pretraining
+        if state.step == 0 and pretraining is not None:
+            _pretrain(pretraining, state, settings, progress, stop)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 before = state.step
@@ -171,11 +171,16 @@ def _train_to_the_end(
         _check_finite(run_dir, state)
 
 
-def _teach(lessons: Lessons, state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put) -> None:
-    """Give the avatar its lessons. A run that stops here starts again, as nothing was trained."""
-    with torch.random.fork_rng(devices=[]), progress("lessons in the face's motion", lessons.count, 0) as advance:
+def _pretrain(
+    pretraining: Pretraining, state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put
+) -> None:
+    """Run the steps before the first picture. A run that stops here starts again, as nothing was trained."""
+    with (
+        torch.random.fork_rng(devices=[]),
+        progress("pre-training on the face's motion", pretraining.count, 0) as advance,
+    ):
         torch.manual_seed(settings.seed)
-        for _ in lessons.teach(state.track.params()):
+        for _ in pretraining.run(state.track.params()):
             advance()
             stop.follow()
 
@@ -238,7 +243,7 @@ def start(
     avatar.filmed = measure_filmed(trained, avatar.subject, eyes)
     surface = avatar.surface()
     if surface is not None and surface.wants_first_colors:
-        surface.paint(vertex_colors(face_model, sequences, faces, frames))
+        surface.set_first_colors(vertex_colors(face_model, sequences, faces, frames))
     given = Preparation(
         avatar, face_model, sequences, faces, frames, settings, torch.zeros(()) if like is None else like
     )
@@ -273,7 +278,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     avatar, parts = state.avatar, state.parts
     batch = next_batch(state, data, settings)
     progress = Progress(state.step, settings.steps, data.order.at(state.step)[1], data.extent, len(batch))
-    now = Step(avatar, state.track, state.density, settings, tuple(batch), progress, data.camera, data.telling)
+    now = Step(avatar, state.track, state.density, settings, tuple(batch), progress, data.camera, data.representative)
     for part in parts:
         part.before_step(now)
     whole, posed, renderings = draw(state, data, batch, progress)

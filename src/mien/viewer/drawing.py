@@ -22,7 +22,7 @@ BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5), "black": (0.0,
 _LINE = np.array([40, 90, 220], np.float32)
 _LINE_SHARE = 0.6
 """Colour of the wireframe, and its share in a pixel that it covers."""
-_MADE_UP, _SEEN = (0.93, 0.45, 0.30), (0.25, 0.55, 0.80)
+_FILLED_IN, _SEEN = (0.93, 0.45, 0.30), (0.25, 0.55, 0.80)
 """Colours of the mesh where nothing was filmed, and where everything was: those of the report."""
 _CORNER, _MARGIN = 0.25, 0.02
 """Height of the camera's picture in a corner, and its distance from the edges, as shares of the picture's height."""
@@ -95,8 +95,8 @@ def draw(
     if look.surface == "avatar":
         picture = to_rgb(runtime.render(gaussians, camera, background)[0])
     else:
-        colours = _confidence_colours(mesh) if look.surface == "confidence" and mesh.seen is not None else None
-        image = render_mesh(vertices, faces, seen_by, colours, light=Headlight(), background=background)[0]
+        colors = _confidence_colors(mesh) if look.surface == "confidence" and mesh.seen is not None else None
+        image = render_mesh(vertices, faces, seen_by, colors, light=Headlight(), background=background)[0]
         picture = to_rgb(image.numpy())
     if look.wireframe:
         index = rasterize_mesh(vertices, faces, seen_by).face_index.numpy()
@@ -104,11 +104,11 @@ def draw(
     return picture
 
 
-def _confidence_colours(mesh: Mesh) -> torch.Tensor:
+def _confidence_colors(mesh: Mesh) -> torch.Tensor:
     """Colours of the triangles' corners, [f, 3, 3]."""
     assert mesh.seen is not None
     seen = torch.from_numpy(mesh.seen)[:, None]
-    mixed = torch.lerp(torch.tensor(_MADE_UP), torch.tensor(_SEEN), seen)
+    mixed = torch.lerp(torch.tensor(_FILLED_IN), torch.tensor(_SEEN), seen)
     return mixed[:, None].expand(-1, 3, -1).contiguous()
 
 
@@ -129,8 +129,8 @@ def beside(
     height, width = shown.shape[:2]
     scale = min(width / filmed.shape[1], height / filmed.shape[0])
     size = (max(1, round(filmed.shape[1] * scale)), max(1, round(filmed.shape[0] * scale)))
-    colour = [round(255 * part) for part in BACKGROUNDS[background]]
-    left = np.full((height, width, 3), colour, np.uint8)
+    color = [round(255 * part) for part in BACKGROUNDS[background]]
+    left = np.full((height, width, 3), color, np.uint8)
     top, start = (height - size[1]) // 2, (width - size[0]) // 2
     fitted = cv2.resize(filmed, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
     left[top : top + size[1], start : start + size[0]] = fitted

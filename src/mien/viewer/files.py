@@ -30,14 +30,14 @@ def screenshot(session: Session, view: View) -> bytes:
 
 
 def video(
-    session: Session, view: View, centre: Float[np.ndarray, " 3"], go_on: Callable[[], bool] = lambda: True
+    session: Session, view: View, center: Float[np.ndarray, " 3"], go_on: Callable[[], bool] = lambda: True
 ) -> bytes:
     """The content of an .mp4: the whole motion of the session, or a turntable of its face, from a view.
 
     Args:
         session: The session.
         view: The view.
-        centre: Point that a turntable goes around, in world space, in metres.
+        center: Point that a turntable goes around, in world space, in metres.
         go_on: Is asked before each frame.
 
     Raises:
@@ -50,7 +50,7 @@ def video(
             if not go_on():
                 raise Stopped
             if clip is None:
-                turned = around(view, centre, 2 * math.pi * index / TURNTABLE_FRAMES)
+                turned = around(view, center, 2 * math.pi * index / TURNTABLE_FRAMES)
                 yield session.picture(turned)
             else:
                 yield session.picture(view, timestep=index)
@@ -61,11 +61,11 @@ def video(
         return path.read_bytes()
 
 
-def around(view: View, centre: Float[np.ndarray, " 3"], angle: float) -> View:
+def around(view: View, center: Float[np.ndarray, " 3"], angle: float) -> View:
     """The view from a camera that went around a point, about its own vertical axis, by an angle in radians."""
     up = view.viewmat[1, :3].astype(np.float64)
     turn = matrix_from_axis_angle((angle * up)[None])[0]
     moved = view.viewmat.astype(np.float64).copy()
-    moved[:3, 3] += moved[:3, :3] @ (centre - turn @ centre)
+    moved[:3, 3] += moved[:3, :3] @ (center - turn @ center)
     moved[:3, :3] = moved[:3, :3] @ turn
     return replace(view, viewmat=moved)

@@ -14,7 +14,7 @@ from mien.viewer.drawing import BACKGROUNDS, Surface, View
 from mien.viewer.faces import grouped, matches, presets_for, readable
 from mien.viewer.files import Stopped, screenshot, video
 from mien.viewer.following import CameraSwitch
-from mien.viewer.session import Session, centre_of
+from mien.viewer.session import Session, center_of
 from mien.viewer.work import Worker
 
 MAX_ANGLE = 0.5
@@ -323,7 +323,7 @@ class Panel:
             return
         note = client.add_notification("Video", "It is being written ...", loading=True, with_close_button=False)
         try:
-            content = video(self._session, self._view_of(client.camera), centre_of(self._session.avatar), go_on)
+            content = video(self._session, self._view_of(client.camera), center_of(self._session.avatar), go_on)
             client.send_file_download(f"{self._title}.mp4", content, save_immediately=True)
         except Stopped:
             pass
@@ -353,7 +353,7 @@ def filmed_from(session: Session) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     viewmat = session.avatar.camera.viewmat.astype(np.float64)
     position = -viewmat[:3, :3].T @ viewmat[:3, 3]
     ahead, up = viewmat[2, :3], -viewmat[1, :3]
-    distance = max(float((centre_of(session.avatar) - position) @ ahead), 0.05)
+    distance = max(float((center_of(session.avatar) - position) @ ahead), 0.05)
     return position, position + distance * ahead, up
 
 

@@ -28,7 +28,7 @@ from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
 from mien.viewer.messages import MOST_BYTES, Gate
 from mien.viewer.panel import Panel, filmed_from
-from mien.viewer.session import Session, centre_of
+from mien.viewer.session import Session, center_of
 
 _MOVING_QUALITY, _STILL_QUALITY = 75, 92
 """JPEG qualities of pictures of half size and of full size, 1 to 100."""
@@ -130,7 +130,7 @@ class Serving:
         camera = session.avatar.camera
         server.scene.set_up_direction(up)
         server.initial_camera.position = position
-        server.initial_camera.look_at = centre_of(session.avatar)
+        server.initial_camera.look_at = center_of(session.avatar)
         server.initial_camera.up = up
         server.initial_camera.fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
         self.loop = DrawingLoop(session.picture, session.advance, failed=self._failed)

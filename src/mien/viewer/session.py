@@ -312,7 +312,7 @@ def _check_look(changes: Mapping[str, Any]) -> None:
         raise UserError(f"height {changes['height']}: give 1 to {MAX_SIDE} pixels")
 
 
-def centre_of(avatar: runtime.Avatar) -> Float32[np.ndarray, " 3"]:
+def center_of(avatar: runtime.Avatar) -> Float32[np.ndarray, " 3"]:
     """The middle of the avatar at rest in world space, in metres: of the box that holds nearly all of its Gaussians."""
     posed = avatar.pose()
     box = np.quantile(posed.means, _IN_BOX, axis=0)

@@ -27,9 +27,9 @@ from mien.gaussians import stack_timesteps
 from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
-_FEATURES = ("feature_colour", "feature_opacity")
+_FEATURES = ("feature_color", "feature_opacity")
 """Names of the changes by features."""
-_BASES = ("colour_basis", "opacity_basis", "offset_basis")
+_BASES = ("color_basis", "opacity_basis", "offset_basis")
 """Names of the bases of changes with the expression."""
 
 
@@ -81,12 +81,12 @@ class GaussianAvatars(Avatar):
         changes = {name: expression_change(self.store[name], first) for name in self._basis_shapes()}
         local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
         if self.appearance is not None:
-            changes["feature_colour"], changes["feature_opacity"] = self.appearance(self.store, activations)
+            changes["feature_color"], changes["feature_opacity"] = self.appearance(self.store, activations)
         if "offset_basis" in changes:
             local["means"] = local["means"] + changes["offset_basis"]
         for name in (name for name in ("opacity_basis", "feature_opacity") if name in changes):
             local["opacity_logits"] = local["opacity_logits"] + changes[name]
-        for name in (name for name in ("colour_basis", "feature_colour") if name in changes):
+        for name in (name for name in ("color_basis", "feature_color") if name in changes):
             sh = torch.cat([sh[:, :1] + changes[name][:, None], sh[:, 1:]], dim=1)
         return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
 
@@ -112,7 +112,7 @@ class GaussianAvatars(Avatar):
 
     def _basis_rates(self) -> dict[str, Rate]:
         config = self.config
-        rates = (config.expression_colour_rate, config.expression_opacity_rate, config.expression_offset_rate)
+        rates = (config.expression_color_rate, config.expression_opacity_rate, config.expression_offset_rate)
         return dict(zip(_BASES, rates, strict=True))
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
@@ -144,9 +144,9 @@ class GaussianAvatars(Avatar):
             config.log_scales_rate,
             config.quats_rate,
         )
-        rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.colour_rate
+        rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.color_rate
         if config.sh_degree > 0:
-            rates["sh_rest"] = Rate(config.colour_rate.start / 20)
+            rates["sh_rest"] = Rate(config.color_rate.start / 20)
         rates |= {name: self._basis_rates()[name] for name in self._basis_shapes()}
         extent = {"means": config.means_times_extent}
         groups = [

@@ -13,7 +13,7 @@ class SurfaceLimits:
     """Limits that keep Gaussians flat on the mesh, where one camera cannot see how deep they lie.
 
     Lengths are those of the neutral head. Without limits, skin that was trained from the front falls to shards when it
-    is seen from aside.
+    is seen from the side.
     """
 
     enabled: bool = False
@@ -66,13 +66,13 @@ class GaussianAvatarsConfig(MethodConfig):
     """Learning rate of the rotations (quaternions), per step."""
     opacity_rate: Rate = Rate(0.05)
     """Learning rate of the opacities (logits), per step."""
-    colour_rate: Rate = Rate(2.5e-3)
+    color_rate: Rate = Rate(2.5e-3)
     """Learning rate of the constant colour coefficients, per step. Coefficients of higher degrees have a constant rate:
     a twentieth of the start of this rate."""
     expression_rank: Annotated[int, Range(0, 8)] = 0
     """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say: wrinkles, or
     shoulders that stay while the head turns. 0 is the paper's method, without such changes."""
-    expression_colour_rate: Rate = Rate(1e-3)
+    expression_color_rate: Rate = Rate(1e-3)
     """Learning rate of the changes of colour with the expression, in colour coefficients per unit of an activation and
     step. If its start is 0, colours do not change."""
     expression_opacity_rate: Rate = Rate(0.01)
@@ -163,7 +163,7 @@ def _draft() -> GaussianAvatarsConfig:
     return GaussianAvatarsConfig(
         photometric=Photometric(alpha_weight=_ALPHA_WEIGHT),
         expression_rank=_RANK,
-        expression_colour_rate=Rate(0.0),
+        expression_color_rate=Rate(0.0),
         expression_opacity_rate=Rate(0.0),
         face_tuning=FaceTuning(keep_mean_pose=True, keep_turns=True),
     )

@@ -48,7 +48,7 @@ class GaussianSurface(BoundSurface):
         return self._config.first_colors == "pictures"
 
     @torch.no_grad()
-    def paint(self, colors: Float[Tensor, "v 3"]) -> None:
+    def set_first_colors(self, colors: Float[Tensor, "v 3"]) -> None:
         """Give every Gaussian the mean colour of its triangle's three vertices."""
         corners = self._avatar.face_model.faces[self._store["face_index"]].long()
         own = colors.to(self._store["sh_constant"])[corners].mean(1)
@@ -69,7 +69,7 @@ class GaussianSurface(BoundSurface):
 
         Strands of hair are added where the prior says so.
         """
-        closed = prior.made_up if prior.closed is None else prior.closed
+        closed = prior.filled_in if prior.closed is None else prior.closed
         if prior.colors is None or closed is None:
             return
         store, bound = self._store, self._store["face_index"]
@@ -101,13 +101,13 @@ class GaussianSurface(BoundSurface):
     @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
         """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
-        if self._config.surface.enabled or prior.made_up is not None:
+        if self._config.surface.enabled or prior.filled_in is not None:
             hair = prior.hair if prior.hanging is None else torch.maximum(prior.hair, prior.hanging)
-            keep_on_surface(self._store, self._config.surface, self.sizes, hair, prior.looseness)
+            keep_on_surface(self._store, self._config.surface, self.sizes, hair, prior.widening)
         if prior.colors is not None and prior.doubt is not None:
             bound, own = self._store["face_index"], self._store["sh_constant"].detach()[:, 0]
             # What is made up has the colours that it was given, strand by strand.
-            doubt = prior.doubt if prior.made_up is None else prior.doubt.masked_fill(prior.made_up, 0)
+            doubt = prior.doubt if prior.filled_in is None else prior.doubt.masked_fill(prior.filled_in, 0)
             pull = _PULL * doubt[bound, None]
             own += pull * (sh_from_rgb(prior.colors)[bound] - own)
 
@@ -147,7 +147,7 @@ class GaussianSurface(BoundSurface):
         return self._known.to(self._store["means"])  # the avatar may have moved since
 
     @torch.no_grad()
-    def furnish(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
+    def fill_interior(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
         """Replace the first Gaussian of each chosen triangle that is open by a flat one of the triangle's shape."""
         store, bound = self._store, self._store["face_index"].long()
         opacities = store["opacity_logits"].sigmoid()

@@ -16,7 +16,7 @@ def keep_on_surface(
     limits: SurfaceLimits,
     sizes: Float[Tensor, " f"],
     hair: Float[Tensor, " f"],
-    looseness: Float[Tensor, " f"] | None = None,
+    widening: Float[Tensor, " f"] | None = None,
 ) -> None:
     """Bring Gaussians that are beyond the limits back to them, in place.
 
@@ -25,13 +25,13 @@ def keep_on_surface(
         limits: The limits.
         sizes: Sizes of the triangles, in metres per triangle unit.
         hair: Height of hair above each triangle, in metres; 0 where there is none.
-        looseness: Factors on the depth, the thickness and the tilt. None means 1.
+        widening: Factors on the depth, the thickness and the tilt. None means 1.
     """
     bound = store["face_index"]
     means, quats, log_scales = (store[name].detach() for name in ("means", "quats", "log_scales"))
     # The second axis of a triangle's frame is its normal.
-    loose = torch.ones_like(sizes) if looseness is None else looseness
-    depth, thickness = limits.depth * loose, limits.thickness * loose
+    widen = torch.ones_like(sizes) if widening is None else widening
+    depth, thickness = limits.depth * widen, limits.thickness * widen
     lowest, highest = -depth / sizes, (depth + limits.hair_share * hair) / sizes
     thickest = ((thickness + limits.hair_thickness * hair) / sizes).log()
     widest = ((limits.width + limits.hair_width * hair) / sizes).log()
@@ -44,7 +44,7 @@ def keep_on_surface(
     log_scales[:, 2] = torch.maximum(along, across - math.log(limits.ratio))
     quats /= torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
     # The sine of half the angle between the thin axis and the normal is the length of the second and the fourth number.
-    most = (0.5 * math.radians(limits.tilt) * loose).clamp(max=0.5 * math.pi).sin()[bound]
+    most = (0.5 * math.radians(limits.tilt) * widen).clamp(max=0.5 * math.pi).sin()[bound]
     beyond = (quats[:, 1].square() + quats[:, 3].square() > most * most).nonzero()[:, 0]
     leaning, most = quats[beyond], most[beyond]
     tilted, level = torch.hypot(leaning[:, 1], leaning[:, 3]), torch.hypot(leaning[:, 0], leaning[:, 2])

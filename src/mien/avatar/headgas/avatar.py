@@ -56,7 +56,7 @@ from mien.rotation import multiply_quaternions
 from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
 
 _CHUNK = 512
-_COLOUR_RATE = 2.5e-3
+_COLOR_RATE = 2.5e-3
 """Learning rate of the colours in 3D Gaussian Splatting."""
 
 
@@ -81,13 +81,13 @@ class HeadGas(Avatar):
         trained = {
             "means": means,
             "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-            "log_scales": neighbour_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
+            "log_scales": neighbor_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
         }
         if parts.blends:
             # The bases start at zero, as in the paper.
             trained["bases"] = means.new_zeros(n, directions.shape[1], width)
             trained["neutral_features"] = means.new_zeros(n, width)
-        if not parts.paints:
+        if not parts.recolors:
             trained["sh"] = means.new_zeros(n, self._coefficients, 3)
             trained["opacity_logits"] = start_logit().to(means).repeat(n)
         spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
@@ -115,7 +115,7 @@ class HeadGas(Avatar):
             return Posed(pose_baked(baked, face), {})
         inputs = (expression_inputs(face) - self.rest) @ self.directions
         changes = list(self._changes(inputs, progress))
-        sh = _stacked([one.colours for one in changes]).unflatten(-1, (self._coefficients, 3))
+        sh = _stacked([one.colors for one in changes]).unflatten(-1, (self._coefficients, 3))
         opacities = sigmoid(_stacked([one.opacity_logits for one in changes]))
         means, quats, aux = store["means"], store["quats"], {}
         moved = [one.moved for one in changes if one.moved is not None]
@@ -141,7 +141,7 @@ class HeadGas(Avatar):
         parts = self._parts
         if parts.blends:
             rates["neutral_features"] = config.features_rate
-        if not parts.paints:
+        if not parts.recolors:
             rates |= {"sh": config.features_rate, "opacity_logits": Rate(OPACITY_RATE)}
         extent = {"means": config.means_times_extent}
         groups = [
@@ -251,7 +251,7 @@ class HeadGas(Avatar):
             yield found if isinstance(found, Changes) else self._unpainted(found, progress)
 
     def _unpainted(self, moved: Float[Tensor, "n 7"], progress: Progress) -> Changes:
-        shares = self._colour_shares(progress).to(moved)
+        shares = self._color_shares(progress).to(moved)
         return Changes((shares * self.store["sh"]).flatten(1), self.store["opacity_logits"], moved)
 
     def _layers(self, progress: Progress = TRAINED) -> Layers:
@@ -262,13 +262,13 @@ class HeadGas(Avatar):
 
     def _output_shares(self, progress: Progress = TRAINED) -> Float[Tensor, " o"]:
         """Factors of the outputs, which are 1 but for colours; without a network, opacities have one of their own."""
-        colours, moved, opacity = output_widths(self._parts, 3 * self._coefficients)
-        shares = self._colour_shares(progress).flatten()[:colours]
+        colors, moved, opacity = output_widths(self._parts, 3 * self._coefficients)
+        shares = self._color_shares(progress).flatten()[:colors]
         # Explicit colours and opacities are in one tensor, but opacities learn at their own rate.
-        faster = 1.0 if self._parts.layers else OPACITY_RATE / _COLOUR_RATE
+        faster = 1.0 if self._parts.layers else OPACITY_RATE / _COLOR_RATE
         return torch.cat([shares, torch.ones(moved), torch.full((opacity,), faster)])
 
-    def _colour_shares(self, progress: Progress) -> Float[Tensor, "s 3"]:
+    def _color_shares(self, progress: Progress) -> Float[Tensor, "s 3"]:
         """Factors of the colours' coefficients: of higher degrees, a share, and 0 before they begin."""
         config = self.config
         shares = torch.ones(self._coefficients, 3)
@@ -313,7 +313,7 @@ def spread_out(points: Float[Tensor, "t k"], count: int) -> Float[Tensor, "c k"]
     return points[chosen]
 
 
-def neighbour_distances(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def neighbor_distances(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Mean distance to the three nearest other points, the initial scale in 3D Gaussian Splatting."""
     nearest = [
         torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(4, largest=False).values[:, 1:]

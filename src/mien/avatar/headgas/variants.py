@@ -32,7 +32,7 @@ class Parts:
     """Linear layers of the network. 0 means that there is none, and that the bases are colours and opacities."""
     blends: bool
     """Whether Gaussians have bases that the expression weights. If not, the network takes the expression itself."""
-    paints: bool
+    recolors: bool
     """Whether colours and opacities depend on the expression. If not, each Gaussian has its own."""
     moves: bool
     """Whether positions and rotations depend on the expression."""
@@ -43,34 +43,34 @@ class Parts:
 _AVERAGE = "its average of colours is not linear in the expression"
 _MOVES = "its network moves Gaussians"
 VARIANTS: dict[Variant, Parts] = {
-    "full": Parts(2, blends=True, paints=True, moves=False),
-    "no_mlp": Parts(0, blends=True, paints=True, moves=False, unbaked=_AVERAGE),
-    "delta": Parts(2, blends=True, paints=False, moves=True, unbaked=_MOVES),
-    "change_all": Parts(2, blends=True, paints=True, moves=True, unbaked=_MOVES),
-    "no_blending": Parts(5, blends=False, paints=True, moves=False),
+    "full": Parts(2, blends=True, recolors=True, moves=False),
+    "no_mlp": Parts(0, blends=True, recolors=True, moves=False, unbaked=_AVERAGE),
+    "delta": Parts(2, blends=True, recolors=False, moves=True, unbaked=_MOVES),
+    "change_all": Parts(2, blends=True, recolors=True, moves=True, unbaked=_MOVES),
+    "no_blending": Parts(5, blends=False, recolors=True, moves=False),
 }
 
 
 class Changes(NamedTuple):
     """What a variant gives for one timestep."""
 
-    colours: Float[Tensor, "n c"]
+    colors: Float[Tensor, "n c"]
     """Spherical harmonics, all coefficients of all channels."""
     opacity_logits: Float[Tensor, " n"]
     moved: Float[Tensor, "n 7"] | None = None
     """Columns as in `MOVED`, if the variant moves Gaussians."""
 
 
-def output_widths(parts: Parts, colours: int) -> tuple[int, int, int]:
+def output_widths(parts: Parts, colors: int) -> tuple[int, int, int]:
     """Columns of a variant's outputs, in their order: colours, what moves Gaussians, opacity."""
-    return (colours if parts.paints else 0), (MOVED if parts.moves else 0), (1 if parts.paints else 0)
+    return (colors if parts.recolors else 0), (MOVED if parts.moves else 0), (1 if parts.recolors else 0)
 
 
-def new_network(parts: Parts, inputs: int, hidden: int, colours: int) -> nn.Sequential:
+def new_network(parts: Parts, inputs: int, hidden: int, colors: int) -> nn.Sequential:
     """A variant's network. At first it moves nothing, and paints faint Gaussians in about grey."""
     if parts.layers == 0:
         return nn.Sequential()
-    first, moved, opacity = output_widths(parts, colours)
+    first, moved, opacity = output_widths(parts, colors)
     sizes = [inputs, *[hidden] * (parts.layers - 1), first + moved + opacity]
     layers = [layer for i, o in pairwise(sizes) for layer in (nn.Linear(i, o), nn.LeakyReLU(SLOPE))]
     network = nn.Sequential(*layers[:-1])
@@ -79,7 +79,7 @@ def new_network(parts: Parts, inputs: int, hidden: int, colours: int) -> nn.Sequ
     with torch.no_grad():
         last.bias.zero_()
         last.weight[first : first + moved] = 0
-        if parts.paints:
+        if parts.recolors:
             last.bias[-1] = start_logit()
     return network
 
@@ -93,7 +93,7 @@ def split_outputs(
     parts: Parts, others: Float[Tensor, "n p"], last: Float[Tensor, " n"]
 ) -> Changes | Float[Tensor, "n 7"]:
     """All outputs of a network but the last, and the last, as changes; only what moves Gaussians if it paints none."""
-    if not parts.paints:
+    if not parts.recolors:
         return torch.cat([others, last[:, None]], dim=-1)
     if not parts.moves:
         return Changes(others, last)

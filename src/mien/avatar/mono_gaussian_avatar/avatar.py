@@ -12,8 +12,8 @@ the motion within the head frame, so that a turn of the head alone changes none 
 of the run, which spans epochs `first_epoch` to `epochs` of the paper; the optimiser's moments survive rounds.
 
 Options beyond the paper, which the presets `draft` and `standard` use: points start on the face model (`start`), the
-deformation network learns the face model's motion before the first picture (`lessons`), and each point adds attributes
-of its own to those that the network gives to its position (`own_rate`).
+deformation network learns the face model's motion before the first picture (`pretraining`), and each point adds
+attributes of its own to those that the network gives to its position (`own_rate`).
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.avatar.avatar import Avatar, Extras, Lessons, ParameterGroup, Posed, network_group, store_group
+from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, Pretraining, network_group, store_group
 from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
@@ -51,9 +51,9 @@ from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
 
 CANONICAL_JAW = 0.4
 """Angle by which the jaw is open in the canonical face, in radians."""
-_LESSON_POINTS, _LESSON_FRAMES, _LESSON_RATE = 1024, 4, 3e-3
-"""Points and frames of a lesson in the face model's motion, and the learning rate of the first lesson."""
-_LESSON_WEIGHT = 10.0
+_PRETRAINING_POINTS, _PRETRAINING_FRAMES, _PRETRAINING_RATE = 1024, 4, 3e-3
+"""Points and frames of a step of pre-training on the face model's motion, and the first step's learning rate."""
+_PRETRAINING_WEIGHT = 10.0
 """Weight of the distance between points and their places on the moved mesh, beside the losses that keep the networks
 near the face model."""
 
@@ -64,8 +64,10 @@ class MonoGaussianAvatar(Avatar):
     config: MonoGaussianAvatarConfig
 
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
-        lessons = Lessons(config.lessons, self._teach) if config.lessons > 0 else None
-        super().__init__(config, face_model, face, Extras(frames_per_step=self._frames_per_step, lessons=lessons))
+        pretraining = Pretraining(config.pretraining, self._pretrain) if config.pretraining > 0 else None
+        super().__init__(
+            config, face_model, face, Extras(frames_per_step=self._frames_per_step, pretraining=pretraining)
+        )
         like = face_model.template
         e, k = face.expression.shape[1], len(face_model.joint_names)
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
@@ -156,23 +158,23 @@ class MonoGaussianAvatar(Avatar):
             losses["pose_correctives"] = 10 * _mean_square(10 * (found.pose - correctives))
         return losses
 
-    def _teach(self, face: FaceParams) -> Iterator[None]:
+    def _pretrain(self, face: FaceParams) -> Iterator[None]:
         """Teach the deformation network the face model's motion in training frames.
 
         The published network starts without any motion, and needs some hundred thousand steps to find it.
         """
-        optimizer = torch.optim.Adam(self.deformation.parameters(), lr=_LESSON_RATE)
+        optimizer = torch.optim.Adam(self.deformation.parameters(), lr=_PRETRAINING_RATE)
         canonical, faces = self._at_rest().vertices, self.face_model.faces
-        for lesson in range(self.config.lessons):
-            optimizer.param_groups[0]["lr"] = _LESSON_RATE * 0.1 ** (lesson / self.config.lessons)
-            frames = face[torch.randint(len(face), (_LESSON_FRAMES,))].detach()
-            corners, weights = random_places(canonical, faces, _LESSON_POINTS)
+        for step in range(self.config.pretraining):
+            optimizer.param_groups[0]["lr"] = _PRETRAINING_RATE * 0.1 ** (step / self.config.pretraining)
+            frames = face[torch.randint(len(face), (_PRETRAINING_FRAMES,))].detach()
+            corners, weights = random_places(canonical, faces, _PRETRAINING_POINTS)
             means = at_places(canonical, corners, weights)
             target = at_places(self.face_model.head_vertices(frames), corners, weights)
             found, _ = self._deformed_from(means, frames)
             distance = (found - target).norm(dim=-1).mean() / LENGTH_UNIT
             optimizer.zero_grad()
-            torch.autograd.backward([_LESSON_WEIGHT * distance, *self._face_losses(means).values()])
+            torch.autograd.backward([_PRETRAINING_WEIGHT * distance, *self._face_losses(means).values()])
             optimizer.step()
             yield
 
@@ -253,7 +255,7 @@ class MonoGaussianAvatar(Avatar):
             scale_activation="sigmoid",
             scale_gain=self.config.scale_gain,
             scale_offset=self._schedule().rendering_radius(1.0),
-            colour_activation="sigmoid",
+            color_activation="sigmoid",
             network=network,
             still_weights=as_array(found.weights[:, -1]),
             still_pose=as_array(face.T_world_head[0]),

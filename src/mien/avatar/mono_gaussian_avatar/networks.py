@@ -61,7 +61,7 @@ class AttributeNet(nn.Module):
         # Last, so that the norms are those of the weights above.
         self.trunk = nn.ModuleList(weight_norm(layer) for layer in plain)
         self.heads = nn.ModuleList(nn.Linear(width, width) for _ in ATTRIBUTE_WIDTHS)
-        self.colour = nn.Linear(width, width)
+        self.color = nn.Linear(width, width)
         self.outputs = nn.ModuleList(nn.Linear(width, size) for size in ATTRIBUTE_WIDTHS)
         with torch.no_grad():
             _as_linear(self.outputs[1]).bias.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
@@ -77,7 +77,7 @@ class AttributeNet(nn.Module):
                 layers.append(Layer(weight, bias, "softplus"))
         hidden = [_as_linear(head) for head in self.heads]
         *others, last = [(_as_linear(output).weight, _as_linear(output).bias) for output in self.outputs]
-        joined = (last[0] @ self.colour.weight, last[0] @ self.colour.bias + last[1])
+        joined = (last[0] @ self.color.weight, last[0] @ self.color.bias + last[1])
         return [*layers, _beside(hidden, "softplus"), _block_diagonal([*others, joined])]
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 11"]:

@@ -41,7 +41,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     frames, but at least one."""
     start: Literal["sphere", "face"] = "sphere"
     """Where points start: on a sphere around the head (paper), or on the surface of the face model."""
-    lessons: Annotated[int, Range(0, 1_000_000)] = 0
+    pretraining: Annotated[int, Range(0, 1_000_000)] = 0
     """Number of steps before the first picture, in which the deformation network learns the motion of the face model
     (paper: none)."""
     points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 400
@@ -142,7 +142,7 @@ def _standard() -> MonoGaussianAvatarConfig:
         ),
         frames_per_step=2,
         start="face",
-        lessons=1_000,
+        pretraining=1_000,
         points=10_000,
         max_points=30_000,
         first_epoch=60,

@@ -100,8 +100,8 @@ def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> tuple[Floa
     The reach is the length of the activations that `SEEN_SHARE` of the timesteps do not exceed.
     """
     exact = offsets.detach().double().cpu()
-    centred = exact - exact.mean(0)
-    strengths, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
+    centered = exact - exact.mean(0)
+    strengths, vectors = torch.linalg.eigh(centered.T @ centered / len(centered))
     count = min(rank, len(strengths))
     deviations, vectors = strengths.flip(0)[:count].clamp_min(0).sqrt(), vectors.flip(1)[:, :count]
     largest = vectors.gather(0, vectors.abs().argmax(0, keepdim=True))

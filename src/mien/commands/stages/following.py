@@ -164,7 +164,7 @@ class _Recorder:
 
     def _picture(self, face: runtime.Face, seen: Seen) -> UInt8[np.ndarray, "h w 3"]:
         gaussians = runtime.pose(self._session.avatar.portable.baked, face)
-        shown = to_rgb(runtime.render(gaussians, self._camera, self._options.picture.colour())[0])
+        shown = to_rgb(runtime.render(gaussians, self._camera, self._options.picture.color())[0])
         if self._options.alone:
             return shown
         height, width = seen.picture.shape[:2]

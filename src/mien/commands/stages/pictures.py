@@ -25,7 +25,7 @@ def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
 @torch.no_grad()
 def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
     """The picture as RGB over the background, or as RGBA with straight colours."""
-    background = torch.tensor(options.colour()).to(gaussians.means)
+    background = torch.tensor(options.color()).to(gaussians.means)
     with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
         rendering = rasterize(gaussians, camera, background)
     image, alpha = (tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha))

@@ -77,14 +77,14 @@ def filmed_tiles(model: FaceModel, face: FaceParams, camera: Camera, filmed: Fil
     return tiles
 
 
-def turntable_tiles(face: FaceParams, camera: Camera, centre: Float[Tensor, " 3"], degrees: float) -> list[Tile]:
+def turntable_tiles(face: FaceParams, camera: Camera, center: Float[Tensor, " 3"], degrees: float) -> list[Tile]:
     """The face from `TURNTABLE_TILES` sides, from the person's right to the left, `degrees` apart from end to end.
 
     A full turn does not show its first side again.
     """
     gaps = TURNTABLE_TILES if abs(degrees) >= 360 else TURNTABLE_TILES - 1
     angles = [degrees * (index / gaps - 0.5) for index in range(TURNTABLE_TILES)]
-    return [Tile(f"{angle:+.0f} degrees", face, orbit(camera, centre, math.radians(angle))) for angle in angles]
+    return [Tile(f"{angle:+.0f} degrees", face, orbit(camera, center, math.radians(angle))) for angle in angles]
 
 
 def draw_sheet(

@@ -105,13 +105,13 @@ class LandmarkFit:
             width: Width of the picture in pixels.
             height: Height of the picture in pixels.
         """
-        centred, focal = landmarks - (0.5 * width, 0.5 * height), _FOCAL * max(width, height)
+        centered, focal = landmarks - (0.5 * width, 0.5 * height), _FOCAL * max(width, height)
         if self._last is None:
-            start = self._facing(centred, focal)
-            start = self._descend(start, centred, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
-            self._last = self._descend(start, centred, focal, self._weights, _WIDE_OUTLIER, _FIRST_STEPS)
+            start = self._facing(centered, focal)
+            start = self._descend(start, centered, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
+            self._last = self._descend(start, centered, focal, self._weights, _WIDE_OUTLIER, _FIRST_STEPS)
         else:
-            self._last = self._descend(self._last, centred, focal, self._weights, _OUTLIER, _TRUE_STEPS)
+            self._last = self._descend(self._last, centered, focal, self._weights, _OUTLIER, _TRUE_STEPS)
         return self._last
 
     def learn_rest(self, seen: list[Float[np.ndarray, "l 2"]], width: int, height: int, as_it_is: bool = False) -> None:
@@ -128,13 +128,13 @@ class LandmarkFit:
         for _ in range(2):
             offsets = []
             for landmarks in seen:
-                centred = landmarks - size
-                start = replace(self._facing(centred, focal), coefficients=self._held)
-                pose = self._descend(start, centred, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
+                centered = landmarks - size
+                start = replace(self._facing(centered, focal), coefficients=self._held)
+                pose = self._descend(start, centered, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
                 points = self._points(pose)
                 turned = points @ pose.rotation.T + pose.translation
                 depth = -turned[:, 2]
-                across = (centred - self._project(turned, focal)) * depth[:, None] / focal
+                across = (centered - self._project(turned, focal)) * depth[:, None] / focal
                 offsets.append((np.pad(across, ((0, 0), (0, 1))) @ _OPENCV) @ pose.rotation)
             self._bias = self._bias + np.median(offsets, axis=0)
         self.forget()
@@ -154,9 +154,9 @@ class LandmarkFit:
 
     def rest_pose(self, landmarks: Float[np.ndarray, "l 2"], width: int, height: int) -> Fitted:
         """The head pose alone in a frame in which the person is at rest."""
-        centred, focal = landmarks - (0.5 * width, 0.5 * height), _FOCAL * max(width, height)
-        start = replace(self._facing(centred, focal), coefficients=self._held)
-        return self._descend(start, centred, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
+        centered, focal = landmarks - (0.5 * width, 0.5 * height), _FOCAL * max(width, height)
+        start = replace(self._facing(centered, focal), coefficients=self._held)
+        return self._descend(start, centered, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
 
     def pixels(
         self,
@@ -188,10 +188,10 @@ class LandmarkFit:
     def _project(turned: Float[np.ndarray, "l 3"], focal: float) -> Float[np.ndarray, "l 2"]:
         return focal * turned[:, :2] * (1.0, -1.0) / -turned[:, 2:]
 
-    def _facing(self, centred: Float[np.ndarray, "l 2"], focal: float) -> Fitted:
+    def _facing(self, centered: Float[np.ndarray, "l 2"], focal: float) -> Fitted:
         """A head that faces the camera, with the size and the place of the landmarks."""
         points = self._rest + self._bias
-        middle, spread = centred.mean(0), np.linalg.norm(centred - centred.mean(0), axis=1).mean()
+        middle, spread = centered.mean(0), np.linalg.norm(centered - centered.mean(0), axis=1).mean()
         size = np.linalg.norm((points - points.mean(0))[:, :2], axis=1).mean()
         depth = float(np.clip(focal * size / max(spread, 1e-6), _NEAR, _FAR))
         place = np.array([middle[0] * depth / focal, -middle[1] * depth / focal, -depth])
@@ -200,7 +200,7 @@ class LandmarkFit:
     def _descend(
         self,
         start: Fitted,
-        centred: Float[np.ndarray, "l 2"],
+        centered: Float[np.ndarray, "l 2"],
         focal: float,
         weights: Float[np.ndarray, " l"],
         outlier: float,
@@ -209,7 +209,7 @@ class LandmarkFit:
     ) -> Fitted:
         """Gauss-Newton steps from a start. Coefficients at a bound that a step would push beyond it take no part."""
         at, rows = start, slice(None) if weights.all() else np.flatnonzero(weights)
-        pixels, share = centred[rows], weights[rows]
+        pixels, share = centered[rows], weights[rows]
         for _ in range(steps):
             points = self._points(at)[rows]
             turned = points @ at.rotation.T

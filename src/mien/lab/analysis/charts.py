@@ -5,7 +5,7 @@ from pathlib import Path
 from mien.files import write_atomically
 from mien.lab.analysis.result import Chart
 
-_COLOURS = {"main": "#2563c9", "second": "#c2571a", "quiet": "#8c8b84"}
+_COLORS = {"main": "#2563c9", "second": "#c2571a", "quiet": "#8c8b84"}
 _INK, _GRID = "#6a6963", "#ecebe6"
 
 
@@ -17,12 +17,12 @@ def write_chart(path: Path, chart: Chart) -> None:
     figure = Figure(figsize=(7.4, 7.4 * axes.height / axes.width), layout="constrained")
     plot = figure.subplots()
     for one in chart.series:
-        (line,) = plot.plot(one.x, one.y, label=one.label, color=_COLOURS[one.style])
+        (line,) = plot.plot(one.x, one.y, label=one.label, color=_COLORS[one.style])
         line.set_linewidth(1.0 if one.style == "quiet" else 2.0)
         if one.points:
             line.set(linestyle="none", marker="o", markersize=3)
     for left, right in axes.shaded:
-        plot.axvspan(left, right, color=_COLOURS["main"], alpha=0.1, linewidth=0)
+        plot.axvspan(left, right, color=_COLORS["main"], alpha=0.1, linewidth=0)
     if axes.from_zero:
         plot.set_ylim(bottom=0)
     plot.set_title(chart.title, fontsize=11, loc="left")

@@ -73,7 +73,7 @@ def draw_mesh(model: FaceModel, face: FaceParams, camera: Camera) -> UInt8[np.nd
     return to_uint8(render_mesh(model(face)[0], model.faces, camera, light=Headlight(), supersample=2)[0])
 
 
-def labelled(image: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "_ w 3"]:
+def labeled(image: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "_ w 3"]:
     """The picture below a white strip with a text, which is cut where it is too long."""
     strip = np.full((_STRIP, image.shape[1], 3), WHITE, np.uint8)
     cv2.putText(strip, text, (3, _STRIP - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (60, 60, 60), 1, cv2.LINE_AA)

@@ -45,7 +45,7 @@ class MethodRow:
     protocols: dict[str, Any]
     """Protocols as in metrics.json, without the figures of single frames."""
     unseen_views: dict[str, Any] = field(default_factory=dict)
-    """Figures by angle (`mien.lab.benchmarking.unseen_views`). Empty if the capture has no pictures from aside."""
+    """Figures by angle (`mien.lab.benchmarking.unseen_views`). Empty if the capture has no pictures from the side."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the row as a json object."""

@@ -18,7 +18,7 @@ from mien.lab.benchmarking.following import (
     turn_following,
 )
 from mien.lab.synthetic import Truth
-from mien.rotation import align_centred, axis_angle_from_matrix, matrix_from_axis_angle
+from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import Tracking, residual_report
 
 _MIN_FACING = 0.2
@@ -103,7 +103,7 @@ def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray,
     """Return the mean distance after the best rotation, shift and, unless `rigid`, scale of `points` (Umeyama 1991)."""
     a, b = points.astype(np.float64), target.astype(np.float64)
     a, b = a - a.mean(0), b - b.mean(0)
-    rotation, scale = align_centred(a, b)
+    rotation, scale = align_centered(a, b)
     return float(np.linalg.norm((1.0 if rigid else scale) * a @ rotation.T - b, axis=-1).mean())
 
 
@@ -160,7 +160,7 @@ class QualityRow:
     seconds: dict[str, float]
     """Seconds of each stage when it last ran."""
     unseen_views: dict[str, Any] = field(default_factory=dict)
-    """Figures by angle (`mien.lab.benchmarking.unseen_views`). Empty if the capture has no pictures from aside."""
+    """Figures by angle (`mien.lab.benchmarking.unseen_views`). Empty if the capture has no pictures from the side."""
     unseen_views_by_truth: dict[str, Any] = field(default_factory=dict)
     """The same for a run that was trained and posed by the true tracking, which leaves what the avatar itself costs."""
 
@@ -204,7 +204,8 @@ def markdown_table(rows: list[QualityRow]) -> str:
 def unseen_lines(name: str, views: dict[str, Any]) -> list[str]:
     """Return a table of the head crop by angle in markdown, line by line."""
     lines = [
-        f"| {name}: degrees aside | avatar: PSNR / SSIM / ST-LPIPS of the head crop | mesh in completed colours |",
+        f"| {name}: degrees to the side | avatar: PSNR / SSIM / ST-LPIPS of the head crop "
+        "| mesh in completed colours |",
         "|---|---|---|",
     ]
     for angle, row in views.items():

@@ -64,7 +64,7 @@ _Job = tuple[_View, dict[str, Tensor], Tensor, Box]
 
 
 def angle_names() -> list[str]:
-    """The name of each camera's row, the front camera's first, such as `15` for both cameras 15 degrees aside."""
+    """The name of each camera's row, the front camera's first, such as `15` for both cameras 15 degrees to the side."""
     names = ["front"]
     for azimuth, elevation in SIDES.values():
         upright = "above" if elevation > 0 else "below"

@@ -38,13 +38,13 @@ def build_glasses(anatomy: Anatomy) -> Glasses:
     tubes, lenses = [], []
     for x in pupils[:, 0]:
         side = float(np.sign(x))
-        centre = np.array([x * 1.04, middle[1] - 0.003, front])
+        center = np.array([x * 1.04, middle[1] - 0.003, front])
         turn = np.linspace(0, 2 * np.pi, 56, endpoint=False)
         shape = np.stack([_power(np.cos(turn), 0.62) * half_width, _power(np.sin(turn), 0.62) * half_height], -1)
         shape[:, 0] += 0.003 * side * np.abs(np.sin(turn))  # leaves room for the nose
         # The rims wrap around the face and lean forward at the top.
-        depth = -0.25 * (centre[0] + shape[:, 0]) ** 2 / 0.06 + 0.12 * shape[:, 1]
-        rim = np.stack([centre[0] + shape[:, 0], centre[1] + shape[:, 1], front + depth + 0.004], -1)
+        depth = -0.25 * (center[0] + shape[:, 0]) ** 2 / 0.06 + 0.12 * shape[:, 1]
+        rim = np.stack([center[0] + shape[:, 0], center[1] + shape[:, 1], front + depth + 0.004], -1)
         tubes.append(_tube(rim, 0.00165, closed=True))
         lenses.append(_lens(rim, side))
         tubes.append(_tube(_temple(anatomy, rim, side), 0.0016, closed=False))
@@ -69,9 +69,9 @@ def _temple(anatomy: Anatomy, rim: np.ndarray, side: float) -> Float[np.ndarray,
     z = np.linspace(outer[2], z_ear - 0.012, 20)
     share = np.linspace(0, 1, 20)
     y = outer[1] + (y_ear - outer[1]) * share - 0.022 * smoothstep(0.85, 1.0, share)
-    skull = np.stack([np.full(20, 0.07 * side), y, z], -1) - anatomy.skull_centre
+    skull = np.stack([np.full(20, 0.07 * side), y, z], -1) - anatomy.skull_center
     around = unit(skull)
-    x_skin = np.abs(anatomy.skull_centre[0] + around[:, 0] * anatomy.skull_radius(around))
+    x_skin = np.abs(anatomy.skull_center[0] + around[:, 0] * anatomy.skull_radius(around))
     x = np.maximum(x_skin + 0.0025, np.abs(outer[0]) * (1 - share) + 0.06 * share)
     x[0] = np.abs(outer[0])
     x = np.lib.stride_tricks.sliding_window_view(np.pad(x, 2, mode="edge"), 5).mean(-1)
@@ -92,9 +92,9 @@ def _tube(path: Float[np.ndarray, "p 3"], radius: float, *, closed: bool, sides:
 
 
 def _lens(rim: Float[np.ndarray, "p 3"], side: float) -> RigidMesh:
-    centre = rim.mean(0) + np.array([0, 0, 0.002])
-    vertices = np.concatenate([centre[None], rim])
-    bulge = (rim - centre) * np.array([8.0, 8.0, 0])
+    center = rim.mean(0) + np.array([0, 0, 0.002])
+    vertices = np.concatenate([center[None], rim])
+    bulge = (rim - center) * np.array([8.0, 8.0, 0])
     normals = unit(np.concatenate([[[0.0, 0.0, 1.0]], bulge + np.array([0.25 * side, 0, 1.0])]))
     ring = np.arange(len(rim))
     faces = np.stack([np.zeros_like(ring), ring + 1, (ring + 1) % len(rim) + 1], -1)

@@ -63,7 +63,7 @@ class Anatomy:
         return resample(corners, points)
 
     @cached_property
-    def skull_centre(self) -> Float[np.ndarray, " 3"]:
+    def skull_center(self) -> Float[np.ndarray, " 3"]:
         """Approximate centre of the skull. Hair grows away from it."""
         top = self.vertices[:, 1].max()
         forehead = self.landmarks[FOREHEAD_TOP]
@@ -76,7 +76,7 @@ class Anatomy:
         faces = self.faces[self.skin & ~self.region("ears")]
         random = np.random.default_rng(0)
         weights = random.dirichlet((1, 1, 1), (len(faces), 24)).astype(np.float32)
-        points = exact.product(weights, self.vertices[faces]).reshape(-1, 3) - self.skull_centre
+        points = exact.product(weights, self.vertices[faces]).reshape(-1, 3) - self.skull_center
         radius = exact.length(points)
         row, column = _cells(points / radius[:, None])
         radii = np.zeros((_ELEVATIONS, _AZIMUTHS), np.float32)
@@ -90,7 +90,7 @@ class Anatomy:
         return smooth[:, _AZIMUTHS : 2 * _AZIMUTHS]
 
     def skull_radius(self, directions: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
-        """Return the smoothed distance of the skin, without ears, from `skull_centre` in unit directions."""
+        """Return the smoothed distance of the skin, without ears, from `skull_center` in unit directions."""
         row, column = _cells(directions)
         wrapped = np.concatenate([self._radii, self._radii[:, :1]], axis=1)
         row = np.clip(row - 0.5, 0, _ELEVATIONS - 1.001)
@@ -103,7 +103,7 @@ class Anatomy:
 
     def hair_share(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Return 1 inside the hairline and 0 outside, with a ramp of 4 mm between."""
-        around = np.degrees(np.abs(np.arctan2(points[:, 0], points[:, 2] - self.skull_centre[2])))
+        around = np.degrees(np.abs(np.arctan2(points[:, 0], points[:, 2] - self.skull_center[2])))
         eye = self.landmarks[[33, 263], 1].mean()
         nose, mouth, top = (self.landmarks[i, 1] for i in (NOSE_BASE, MOUTH_TOP, FOREHEAD_TOP))
         line = {
@@ -145,12 +145,12 @@ class FrontView:
     """An orthographic view of the face from the front, to paint on and to sample at points of the skin by (x, y)."""
 
     def __init__(
-        self, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"], texels_per_metre: float = 5000.0
+        self, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"], texels_per_meter: float = 5000.0
     ) -> None:
         self._origin = low.astype(np.float32)
-        self._scale = texels_per_metre
+        self._scale = texels_per_meter
         width, height = (float(extent) for extent in high - low)
-        self.shape = (round(height * texels_per_metre), round(width * texels_per_metre))
+        self.shape = (round(height * texels_per_meter), round(width * texels_per_meter))
 
     def pixels(self, points: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n 2"]:
         """Return columns and rows of points; rows go up."""

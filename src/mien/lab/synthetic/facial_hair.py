@@ -69,9 +69,9 @@ def grow_beard(anatomy: Anatomy, color: Float[np.ndarray, " 3"], length: float, 
     bend = curl[:, None] * np.sin(2 * np.pi * t * random.uniform(0.8, 1.6, (_BEARD_COUNT, 1, 1)))
     offsets = reach[:, None, None] * t * slant + bend * t - 0.0006 * normals[:, None]
     tint = np.exp(0.22 * random.normal(size=(_BEARD_COUNT, 1)) + 0.15 * noise(roots, 0.01)[:, None])
-    grey = random.uniform(size=(_BEARD_COUNT, 1)) < 0.05
+    gray = random.uniform(size=(_BEARD_COUNT, 1)) < 0.05
     shade = (0.45 + 0.55 * np.linspace(0, 1, _BEARD_STEPS)) * tint
-    colors = np.where(grey[..., None], 0.25, color) * shade[..., None]
+    colors = np.where(gray[..., None], 0.25, color) * shade[..., None]
     return RootedStrands(
         faces=faces,
         barycentric=barycentric,
@@ -187,13 +187,13 @@ def _front_points(
     """Return the skin triangle and the barycentric coordinates nearest to each point, by the triangles' planes."""
     candidates = np.flatnonzero(anatomy.skin)
     corners = anatomy.vertices[anatomy.faces[candidates]]
-    centres = corners.mean(1)
-    squares = exact.dot(centres, centres)
+    centers = corners.mean(1)
+    squares = exact.dot(centers, centers)
     faces = np.empty(len(points), np.int64)
     weights = np.empty((len(points), 3), np.float32)
     for start in range(0, len(points), 512):
         part = points[start : start + 512]
-        away = squares - 2 * exact.product(part, centres.T)
+        away = squares - 2 * exact.product(part, centers.T)
         near = np.argpartition(away, 12, axis=1)[:, :12]
         barycentric = _barycentric(part[:, None], corners[near])
         clamped = np.clip(barycentric, 0, 1)
@@ -218,22 +218,22 @@ def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def grow_lashes(
     landmarks: Float[np.ndarray, "l 3"],
-    eye_centres: Float[np.ndarray, "2 3"],
+    eye_centers: Float[np.ndarray, "2 3"],
     eye_radius: float,
     steps: int = 4,
 ) -> Strands:
     """Grow lashes along the posed rims of the lids, outwards from the eyeball. Upper ones curl up."""
     points, outwards, widths = [], [], []
     on_lid = eye_radius + 0.0012
-    for side, centre in zip(places.SIDES, eye_centres, strict=True):
+    for side, center in zip(places.SIDES, eye_centers, strict=True):
         for rims, longest, curl, count in (
             (places.UPPER_LIDS, 0.0058, 0.62, 44),
             (places.LOWER_LIDS, 0.0030, -0.5, 24),
         ):
             roots = resample(landmarks[list(rims[side])], count + 6)[3:-3]
-            radial = unit(roots - centre)
+            radial = unit(roots - center)
             # If landmarks lie on the inner fold of a lid, lashes still start on its outside.
-            roots = centre + np.maximum(exact.length(roots - centre)[:, None], on_lid) * radial
+            roots = center + np.maximum(exact.length(roots - center)[:, None], on_lid) * radial
             aside = np.linspace(0.6, -0.25, count)[:, None] * np.array([1.0 if side == "left" else -1.0, 0, 0])
             vary = 1 + 0.25 * np.sin(np.arange(count) * 12.9898) * np.cos(np.arange(count) * 4.1)
             upward = np.array([0.0, 1.0, 0.0]) - radial[:, 1:2] * radial

@@ -62,14 +62,14 @@ def grow_short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int,
     random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
     roots = _scalp_points(anatomy, count, random)
     part = random.choice([-1.0, 1.0]) * 0.028
-    centre = anatomy.skull_centre
-    direction = unit(roots - centre)
+    center = anatomy.skull_center
+    direction = unit(roots - center)
     top = smoothstep(0.45, 0.8, direction[:, 1])  # 1 on top of the head, 0 at its sides
     low = smoothstep(0.05, -0.25, direction[:, 1])
     reach = (0.024 - 0.012 * low + 0.055 * top) * random.uniform(0.75, 1.15, count) * (1 + 0.25 * noise(roots, 0.03))
     stray = random.uniform(size=count) < 0.025
     layer = random.uniform(0.12, 1.0, count) + np.where(stray, random.uniform(0, 0.5, count), 0)
-    parting = 1 - 0.75 * np.exp(-(((roots[:, 0] - part) / 0.006) ** 2)) * (roots[:, 2] > centre[2] - 0.04)
+    parting = 1 - 0.75 * np.exp(-(((roots[:, 0] - part) / 0.006) ** 2)) * (roots[:, 2] > center[2] - 0.04)
     height = (0.008 - 0.004 * low + 0.017 * top) * layer * parting * (1 + 0.3 * noise(roots, 0.025))
     wobble = random.normal(0, 1, (count, 3)) * np.where(stray, 0.28, 0.09)[:, None]
     steps = 10
@@ -79,9 +79,9 @@ def grow_short_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], seed: int,
         place = step / (steps - 1)
         rise = height * (1 - np.exp(-place * reach / (0.5 * height + 1e-4))) * (1 - 0.3 * place**2)
         radius = anatomy.skull_radius(direction) + rise - 0.001 * (step == 0)
-        points[:, step] = centre + direction * radius[:, None]
+        points[:, step] = center + direction * radius[:, None]
         outwards[:, step] = direction
-        combed = _combed(points[:, step], centre, part, noise) + wobble
+        combed = _combed(points[:, step], center, part, noise) + wobble
         combed -= dot(combed, direction)[:, None] * direction
         direction = unit(direction + unit(combed) * (reach / (steps - 1) / radius)[:, None])
     taper = np.linspace(1, 0.45, steps) * random.uniform(0.75, 1.25, count)[:, None]
@@ -110,10 +110,10 @@ def _scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> 
 
 
 def _combed(
-    points: Float[np.ndarray, "n 3"], centre: np.ndarray, part: float, noise: SolidNoise
+    points: Float[np.ndarray, "n 3"], center: np.ndarray, part: float, noise: SolidNoise
 ) -> Float[np.ndarray, "n 3"]:
     """Return the combing direction in locks: away from the parting on top, down and back at the sides and behind."""
-    relative = points - centre
+    relative = points - center
     top = smoothstep(0.2, 0.85, relative[:, 1] / length(relative))
     front = smoothstep(0.0, 0.08, relative[:, 2])
     aside = np.tanh((points[:, 0] - part) / 0.006) * (0.3 + 0.7 * top)
@@ -153,21 +153,21 @@ def grow_long_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], collar: flo
     random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
     roots = _scalp_points(anatomy, _LONG_COUNT, random)
     part = random.choice([-1.0, 1.0]) * 0.018
-    centre = anatomy.skull_centre
+    center = anatomy.skull_center
     layer = random.uniform(0.08, 1.0, _LONG_COUNT)
     side = np.where(
         np.abs(roots[:, 0] - part) < 0.002, random.choice([-1.0, 1.0], _LONG_COUNT), np.sign(roots[:, 0] - part)
     )
-    path = _Path(anatomy, centre, side.astype(np.float32), layer)
+    path = _Path(anatomy, center, side.astype(np.float32), layer)
     ends = collar - 0.012 + 0.014 * noise(roots, 0.03) + random.normal(0, 0.006, _LONG_COUNT)
     length = 0.06 + 1.12 * (roots[:, 1] - ends)
     points = np.empty((_LONG_COUNT, _LONG_STEPS, 3), np.float32)
     outwards = np.empty_like(points)
-    place = path.lifted(roots - 0.001 * unit(roots - centre), 0.0)
+    place = path.lifted(roots - 0.001 * unit(roots - center), 0.0)
     wobble = random.normal(0, 0.05, (_LONG_COUNT, 3))
     for step in range(_LONG_STEPS):
         points[:, step] = place
-        outwards[:, step] = unit((place - centre) * np.array([1, 0.35, 1], np.float32))
+        outwards[:, step] = unit((place - center) * np.array([1, 0.35, 1], np.float32))
         locks = np.stack(
             [noise(roots + 0.1 * axis + 0.02 * step * np.array([0, 0.12, 0]), 0.017) for axis in range(3)], -1
         )
@@ -187,8 +187,8 @@ def grow_long_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], collar: flo
 class _Path:
     """Constrains where a strand may be, and directs where it goes next."""
 
-    def __init__(self, anatomy: Anatomy, centre: np.ndarray, side: np.ndarray, layer: np.ndarray) -> None:
-        self._anatomy, self._centre, self._side, self._layer = anatomy, centre, side, layer
+    def __init__(self, anatomy: Anatomy, center: np.ndarray, side: np.ndarray, layer: np.ndarray) -> None:
+        self._anatomy, self._center, self._side, self._layer = anatomy, center, side, layer
         ears = anatomy.vertices[np.unique(anatomy.faces[anatomy.region("ears")])]
         self._ear = np.abs(ears).mean(0) * np.array([1, 0, 0]) + ears.mean(0) * np.array([0, 1, 1])
         self._brow = float(anatomy.landmarks[[105, 334], 1].mean())
@@ -197,7 +197,7 @@ class _Path:
 
     def heading(self, points: Float[np.ndarray, "n 3"], part: float) -> Float[np.ndarray, "n 3"]:
         """Return the direction: sideways and back on top of the head, along it at its sides, then straight down."""
-        relative = points - self._centre
+        relative = points - self._center
         outward = unit(relative)
         top = smoothstep(0.25, 0.9, outward[:, 1])
         front = smoothstep(0.0, 0.08, relative[:, 2]) * smoothstep(-0.05, 0.3, outward[:, 1])
@@ -211,7 +211,7 @@ class _Path:
     def lifted(self, points: Float[np.ndarray, "n 3"], along: float) -> Float[np.ndarray, "n 3"]:
         """Return the points moved off the head by their layer's height, and off the face."""
         points = self._beside_the_face(points.astype(np.float32))
-        relative = points - self._centre
+        relative = points - self._center
         radius = exact.length(relative)
         outward = relative / radius[:, None]
         top = smoothstep(0.3, 0.85, outward[:, 1])
@@ -225,11 +225,11 @@ class _Path:
         # A strand lies on the skull. Where the skull recedes, it hangs free.
         slack = np.where(outward[:, 1] > -0.1, 0.002 + 0.25 * smoothstep(0.25, -0.1, outward[:, 1]), 1.0)
         held = np.clip(radius, least, least + slack)
-        return (self._centre + outward * (radius + upper * (held - radius))[:, None]).astype(np.float32)
+        return (self._center + outward * (radius + upper * (held - radius))[:, None]).astype(np.float32)
 
     def _beside_the_face(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Turn points about the skull's vertical axis until they leave the face free."""
-        x, z = points[:, 0] - self._centre[0], points[:, 2] - self._centre[2]
+        x, z = points[:, 0] - self._center[0], points[:, 2] - self._center[2]
         around = np.arctan2(np.abs(x), z)
         side = np.where(np.abs(x) > 0.03, np.sign(x), self._side)
         heights = [self._chin - 0.08, self._chin, self._brow - 0.03, self._brow, self._top, self._top + 0.03]
@@ -237,6 +237,6 @@ class _Path:
         around = np.maximum(around, least + 0.10 * self._layer)
         around = np.where(points[:, 1] > self._top + 0.03, np.arctan2(np.abs(x), z), around)
         distance = np.hypot(x, z)
-        moved = np.stack([self._centre[0] + side * distance * np.sin(around), points[:, 1],
-                          self._centre[2] + distance * np.cos(around)], -1)  # fmt: skip
+        moved = np.stack([self._center[0] + side * distance * np.sin(around), points[:, 1],
+                          self._center[2] + distance * np.cos(around)], -1)  # fmt: skip
         return np.where((points[:, 1] > self._top + 0.03)[:, None], points, moved).astype(np.float32)

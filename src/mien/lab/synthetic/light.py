@@ -142,12 +142,12 @@ def compute_visibility(
 def _lit_share(
     points: np.ndarray, direction: np.ndarray, occluders: tuple[np.ndarray, np.ndarray]
 ) -> Float[np.ndarray, " v"]:
-    centre = torch.from_numpy(occluders[0].mean(0))
+    center = torch.from_numpy(occluders[0].mean(0))
     radius = float(exact.length(occluders[0] - occluders[0].mean(0)).max()) * 1.02
     up = torch.tensor([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else torch.tensor([0.0, 0.0, 1.0])
     focal = 0.5 * _MAP_SIZE * _MAP_DISTANCE / radius
     K = torch.tensor([[focal, 0, _MAP_SIZE / 2], [0, focal, _MAP_SIZE / 2], [0, 0, 1]])
-    viewmat = look_at(centre + _MAP_DISTANCE * torch.from_numpy(direction), centre, up)
+    viewmat = look_at(center + _MAP_DISTANCE * torch.from_numpy(direction), center, up)
     camera = Camera(K, viewmat, _MAP_SIZE, _MAP_SIZE)
     depth_map = rasterize_mesh(torch.from_numpy(occluders[0]), torch.from_numpy(occluders[1]), camera).depth.numpy()
     pixels, depth = project(camera, points)

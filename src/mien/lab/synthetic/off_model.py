@@ -69,8 +69,8 @@ def _away_from_eyes(model: FaceModel, points: np.ndarray) -> Float[np.ndarray, "
     eyes = model.faces[model.region_mask("eyes", "irises")].unique().numpy()
     free = smoothstep(-0.13, -0.08, points[:, 1])
     for side in (-1.0, 1.0):
-        centre = points[eyes[points[eyes, 0] * side > 0]].mean(0)
-        free = free * smoothstep(_EYE_INNER, _EYE_OUTER, exact.length(points - centre))
+        center = points[eyes[points[eyes, 0] * side > 0]].mean(0)
+        free = free * smoothstep(_EYE_INNER, _EYE_OUTER, exact.length(points - center))
     return free.astype(np.float32)
 
 
@@ -109,8 +109,8 @@ def _extra_fields(points: np.ndarray, free: np.ndarray, noise: SolidNoise) -> Fl
         ((0.042, -0.045, 0.065), 0.022), ((0.02, -0.07, 0.08), 0.02),
     )  # fmt: skip
     fields = []
-    for index, (centre, radius) in enumerate(places):
-        ball = np.exp(-((points - np.array(centre)) ** 2).sum(-1) / (2 * radius * radius)) * front
+    for index, (center, radius) in enumerate(places):
+        ball = np.exp(-((points - np.array(center)) ** 2).sum(-1) / (2 * radius * radius)) * front
         direction = np.array([0.3, 0.5, 1.0]) / 1.16 + 0.6 * _field(points, noise, 0.03, 2.0 + index)
         fields.append(0.0042 * ball[:, None] * direction)
     return np.stack(fields).astype(np.float32)

@@ -134,7 +134,7 @@ def _paint_eyes(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
         local[eye.vertices] = eye.local
     values = canvas.interpolate(rows, np.concatenate([local, posed.head], -1), _model_faces(canvas))
     colors = np.zeros((len(rows), 3), np.float32)
-    for side, eye, centre in zip(SIDES, subject.eyes, posed.eye_centres, strict=True):
+    for side, eye, center in zip(SIDES, subject.eyes, posed.eye_centers, strict=True):
         mine = np.flatnonzero((values[:, 3] > 0) == (side == "left"))
         if not len(mine):
             continue
@@ -142,9 +142,9 @@ def _paint_eyes(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
         lid = posed.landmarks[list(UPPER_LIDS[side])]
         lid = lid[np.argsort(lid[:, 0])]
         under = np.interp(points[:, 0], lid[:, 0], lid[:, 1]).astype(np.float32) - points[:, 1]
-        axis = unit(posed.head[eye.front].mean(0) - centre) if len(eye.front) else np.array([0, 0, 1], np.float32)
+        axis = unit(posed.head[eye.front].mean(0) - center) if len(eye.front) else np.array([0, 0, 1], np.float32)
         colors[mine] = shading.shade_eye(
-            unit(values[mine, :3]), unit(points - centre), axis, under,
+            unit(values[mine, :3]), unit(points - center), axis, under,
             canvas.views(canvas.pixels[rows[mine]]), canvas.light,
             (eye.iris_size, subject.iris_color, subject.wet_eyes),
         )  # fmt: skip

@@ -8,7 +8,8 @@ SIDES: dict[str, tuple[float, float]] = {
        for side, sign in (("left", 1.0), ("right", -1.0))},
     "behind-180": (180.0, 0.0), "above-25": (0.0, 25.0), "below-25": (0.0, -25.0),
 }  # fmt: skip
-"""Cameras aside: azimuth towards the subject's left and elevation above the face, in degrees from the front camera."""
+"""Cameras at the side: azimuth towards the subject's left and elevation above the face, in degrees from the front
+camera."""
 
 SegmentKind = Literal["still", "speech", "expressions", "turns", "free"]
 

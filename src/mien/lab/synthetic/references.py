@@ -46,7 +46,7 @@ class ReferenceCapture:
     by_default: bool = True
     """Whether `mien bench quality` without names includes it."""
     views: SideViews | None = None
-    """True pictures from aside for the protocol `unseen_view`. None if there are none."""
+    """True pictures from the side for the protocol `unseen_view`. None if there are none."""
 
     def scenes(self) -> list[SyntheticScene]:
         """Return the sequences and the side views, not yet drawn. They share the person but not the motion."""

@@ -113,9 +113,9 @@ def _vertex_share(anatomy: Anatomy, region: str) -> Float[np.ndarray, " v"]:
     return share
 
 
-def _near(points: np.ndarray, centre: np.ndarray, radius: float) -> Float[np.ndarray, " n"]:
+def _near(points: np.ndarray, center: np.ndarray, radius: float) -> Float[np.ndarray, " n"]:
     """Return a Gaussian of the distance from the centre, 1 at the centre."""
-    away = points - centre
+    away = points - center
     return np.exp(-exact.dot(away, away) / (2 * radius * radius))
 
 

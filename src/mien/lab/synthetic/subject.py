@@ -84,7 +84,7 @@ class PosedSubject:
     """The face model's vertices."""
     normals: Float[np.ndarray, "v 3"]
     landmarks: Float[np.ndarray, "l 3"]
-    eye_centres: Float[np.ndarray, "2 3"]
+    eye_centers: Float[np.ndarray, "2 3"]
     strands: tuple[Strands, ...]
     """Hair, brows, beard and lashes, if present, in the order of the subject's `faces`."""
     T_head_shoulders: Float[np.ndarray, "4 4"]
@@ -142,14 +142,14 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
     normals = exact.vertex_normals(head, subject.anatomy.faces)
     T_world_head = head_pose(face)
     R = T_world_head[:3, :3]
-    centres = np.stack([head[eye.vertices].mean(0) for eye in subject.eyes])
+    centers = np.stack([head[eye.vertices].mean(0) for eye in subject.eyes])
     T_head_shoulders = _shoulders(subject, face, R)
     return PosedSubject(
         head=head,
         normals=normals,
         landmarks=landmarks,
-        eye_centres=centres,
-        strands=_posed_strands(subject, head, normals, landmarks, centres, T_head_shoulders),
+        eye_centers=centers,
+        strands=_posed_strands(subject, head, normals, landmarks, centers, T_head_shoulders),
         T_head_shoulders=T_head_shoulders,
         R_world_head=R,
         viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
@@ -175,7 +175,7 @@ def _posed_strands(
     head: np.ndarray,
     normals: np.ndarray,
     landmarks: np.ndarray,
-    eye_centres: np.ndarray,
+    eye_centers: np.ndarray,
     T_head_shoulders: np.ndarray,
 ) -> tuple[Strands, ...]:
     strands = []
@@ -184,7 +184,7 @@ def _posed_strands(
         strands.append(hair.posed(T_head_shoulders) if isinstance(hair, DrapedStrands) else hair)
     strands += [part.posed(subject.anatomy, head, normals) for part in subject.on_skin]
     if subject.lashes:
-        strands.append(grow_lashes(landmarks, eye_centres, subject.eyes[0].radius))
+        strands.append(grow_lashes(landmarks, eye_centers, subject.eyes[0].radius))
     return tuple(strands)
 
 
@@ -245,8 +245,8 @@ def _shoulder_points(
 ) -> Float[np.ndarray, "p 3"]:
     """Return dense points of the model's skin that a shirt has to cover: low and beside the neck."""
     faces = anatomy.faces[anatomy.skin]
-    centres = anatomy.vertices[faces].mean(1) - collar
-    beside = (centres[:, 1] < 0.02) & (centres[:, 1] > -0.06) & (np.abs(centres[:, 0]) > 1.02 * size[0])
+    centers = anatomy.vertices[faces].mean(1) - collar
+    beside = (centers[:, 1] < 0.02) & (centers[:, 1] > -0.06) & (np.abs(centers[:, 0]) > 1.02 * size[0])
     weights = np.random.default_rng(0).dirichlet((1, 1, 1), (beside.sum(), 40)).astype(np.float32)
     corners = anatomy.vertices[faces[beside]]
     return np.concatenate([exact.product(weights, corners).reshape(-1, 3), corners.reshape(-1, 3)])
@@ -261,7 +261,7 @@ def _occluders(
     if hair is not None:
         wide = Strands(hair.points[::4], 3.0 * hair.widths[::4], hair.colors[::4], hair.outwards[::4])
         # Ribbons that face the skull's centre lie flat on the skin.
-        meshes.append((wide.ribbon_vertices(anatomy.skull_centre), ribbon_faces(*wide.widths.shape)))
+        meshes.append((wide.ribbon_vertices(anatomy.skull_center), ribbon_faces(*wide.widths.shape)))
     meshes += [
         (part.vertices, part.faces) for part in ([glasses.frame] if glasses else []) + ([shirt] if shirt else [])
     ]

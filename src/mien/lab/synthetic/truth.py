@@ -17,7 +17,7 @@ from mien.tracking import Tracking, read_tracking, write_tracking
 
 FORMAT, VERSION = "mien.synthetic_truth", 1
 _JSON, _ARRAYS, _TRACKING = "truth.json", "truth.safetensors", "tracking"
-_METRE, _PIXEL = 1e-5, 1 / 16
+_METER, _PIXEL = 1e-5, 1 / 16
 """Units of the stored 16-bit numbers: 10 micrometres, a sixteenth of a pixel."""
 _MAX_STORED = np.iinfo(np.int16).max
 _REMEDY = "delete the folder and draw the capture again"
@@ -58,7 +58,7 @@ def surface_of(
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
-    return index, _unpacked(_packed(vertices, _METRE), _METRE), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
+    return index, _unpacked(_packed(vertices, _METER), _METER), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
@@ -73,7 +73,7 @@ def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
     """Add the numbers of `surface_of` to a hash."""
     index, vertices, landmarks = surface_of(scene)
     digest.update(index.astype(np.int32).tobytes())
-    digest.update(_packed(vertices, _METRE).tobytes() + _packed(landmarks, _PIXEL).tobytes())
+    digest.update(_packed(vertices, _METER).tobytes() + _packed(landmarks, _PIXEL).tobytes())
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
@@ -81,11 +81,11 @@ def write_truth(folder: Path, truth: Truth) -> None:
     write_tracking(folder / _TRACKING, truth.tracking)
     arrays = {
         "vertex_index": truth.vertex_index.astype(np.int32),
-        "vertices": _packed(truth.vertices, _METRE),
+        "vertices": _packed(truth.vertices, _METER),
         "landmarks": _packed(truth.landmarks, _PIXEL),
     }
     write_arrays(folder / _ARRAYS, arrays)
-    content = {"metre": _METRE, "pixel": _PIXEL}
+    content = {"metre": _METER, "pixel": _PIXEL}
     write_json(folder / _JSON, FORMAT, VERSION, content)
 
 

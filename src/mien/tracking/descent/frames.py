@@ -110,7 +110,7 @@ def fit_sequence(
         descent.offer(cache)
 
 
-def recentre(descent: Descent) -> None:
+def recenter(descent: Descent) -> None:
     """Remove the error that all frames inherited from the first frame.
 
     Each frame was fitted to a texture that started from the first frame with the errors of its landmarks. The median

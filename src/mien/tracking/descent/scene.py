@@ -93,7 +93,7 @@ class PaperScene:
     """Identity of the initial fit."""
     offset_share: Float[Tensor, "v 1"]
     """1 for vertices that get an offset, 0 for the others."""
-    neighbours: tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "v 1"]]
+    neighbors: tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "v 1"]]
     """First and second vertices of the pairs along edges, and 1 / number of neighbours of each vertex."""
     sequences: tuple[SequenceScene, ...]
     settings: PaperSettings
@@ -145,7 +145,7 @@ def paper_scene(
     return PaperScene(
         face_model, model.layout, model.layout.precision.float(), face_model.landmarks["mediapipe"],
         fit.subject.bias, mesh, weights,
-        fit.subject.identity.float(), _offset_share(face_model), _neighbours(face_model), tuple(sequences),
+        fit.subject.identity.float(), _offset_share(face_model), _neighbors(face_model), tuple(sequences),
         settings.paper,
     )  # fmt: skip
 
@@ -209,7 +209,7 @@ def _offset_share(face_model: FaceModel) -> Float[Tensor, "v 1"]:
     return share
 
 
-def _neighbours(face_model: FaceModel) -> tuple[Tensor, Tensor, Tensor]:
+def _neighbors(face_model: FaceModel) -> tuple[Tensor, Tensor, Tensor]:
     edges = mesh_edges(face_model.faces).vertices.long().unique(dim=0)
     first, second = torch.cat([edges, edges.flip(1)]).unbind(1)
     count = torch.zeros(len(face_model.template), 1).index_add(0, first, torch.ones(len(first), 1))

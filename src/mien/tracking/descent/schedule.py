@@ -8,7 +8,7 @@ import torch
 
 from mien.progress import progress_bar
 from mien.tracking.descent.epochs import Descent
-from mien.tracking.descent.frames import fit_appearance, fit_sequence, measure_visibility, recentre
+from mien.tracking.descent.frames import fit_appearance, fit_sequence, measure_visibility, recenter
 from mien.tracking.descent.scene import PaperScene, PaperState, first_state, paper_scene
 from mien.tracking.fitting import Course, Fit, Shot, StageCache, Watch
 from mien.tracking.landmarks import LandmarkModel
@@ -59,7 +59,7 @@ def fit_by_descent(
         for sequence in range(len(shots) if refined is None else 0):
             fit_sequence(descent, sequence, advance, cache)
         if descent.done == descent.frames:
-            measure_visibility(descent) if refined is not None else recentre(descent)
+            measure_visibility(descent) if refined is not None else recenter(descent)
             fit_appearance(descent)
         for epoch in range(settings.paper.epochs):
             descent.fit_epoch(epoch, advance, cache)

@@ -173,14 +173,14 @@ def light_term(scene: PaperScene, light: Float[Tensor, "9 3"]) -> Float[Tensor, 
     even = light.new_zeros(9, 1)
     even[0] = math.sqrt(4 * math.pi)
     tinted = light - light.mean(1, keepdim=True)
-    return ((light - even) / settings.light_sigma).square().sum() + (tinted / settings.grey_sigma).square().sum()
+    return ((light - even) / settings.light_sigma).square().sum() + (tinted / settings.gray_sigma).square().sum()
 
 
 def offset_term(scene: PaperScene, offsets: Float[Tensor, "v 3"]) -> Float[Tensor, ""]:
     """Cost that keeps vertex offsets small and smooth (uniform Laplacian). About 100 vertices count as one."""
     if scene.settings.offset_sigma == 0:
         return offsets.new_zeros(())
-    first, second, share = scene.neighbours
+    first, second, share = scene.neighbors
     mean = torch.zeros_like(offsets).index_add(0, first, offsets[second]) * share
     small = (offsets / scene.settings.offset_sigma).square().sum()
     smooth = ((offsets - mean) / scene.settings.offset_bend).square().sum()

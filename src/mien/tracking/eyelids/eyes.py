@@ -59,8 +59,8 @@ def eyes_of(model: FaceModel, layout: ParameterLayout) -> list[Eye]:
     closing = torch.stack([_closing(model, layout, pair) for pair in pairs])
     marks = model.landmark_positions(model.template, "mediapipe")
     middles = torch.stack([marks[list(lids)].mean(0) for lids in (RIGHT_EYELIDS, LEFT_EYELIDS)])
-    centres = model.template[model.faces].mean(1)
-    nearest = torch.cdist(centres, middles).argmin(1)
+    centers = model.template[model.faces].mean(1)
+    nearest = torch.cdist(centers, middles).argmin(1)
     eyes = []
     for number, lids in enumerate((RIGHT_EYELIDS, LEFT_EYELIDS)):
         found = _coefficient(model, layout, closing[number], closing[1 - number], lids)
@@ -108,12 +108,12 @@ def _eye(
     most: float,
 ) -> Eye:
     own = model.template[model.faces[ball].flatten().unique()]
-    centre = own.mean(0)
-    radius = (own - centre).norm(dim=1).max()
-    distance = (model.template - centre).norm(dim=1)
+    center = own.mean(0)
+    radius = (own - center).norm(dim=1).max()
+    distance = (model.template - center).norm(dim=1)
     lids = (distance < _LIDS_REACH * radius)[model.faces].any(1) & ~ball
     around = (distance < _AROUND_REACH * radius)[model.faces].any(1) & ~ball & ~lids
-    forward = torch.nn.functional.normalize(middle - centre, dim=0)
+    forward = torch.nn.functional.normalize(middle - center, dim=0)
     parts = [part.nonzero()[:, 0] for part in (ball, lids, around)]
     triangles = torch.cat(parts)
     vertices, faces = model.faces[triangles].unique(return_inverse=True)
@@ -123,7 +123,7 @@ def _eye(
         skin, forward,
     )  # fmt: skip
     motion = model.expression_basis[layout.expression_index[index]][vertices]
-    touching = _where_lids_touch(eye, model.template[vertices], motion, centre, radius)
+    touching = _where_lids_touch(eye, model.template[vertices], motion, center, radius)
     return replace(eye, closed=min(max(touching, float(layout.units[index])), most))
 
 
@@ -131,7 +131,7 @@ def _where_lids_touch(
     eye: Eye,
     rest: Float[Tensor, "n 3"],
     motion: Float[Tensor, "n 3"],
-    centre: Float[Tensor, " 3"],
+    center: Float[Tensor, " 3"],
     radius: Float[Tensor, ""],
 ) -> float:
     """The value of the coefficient at which the least of the eyeball is seen from far in front."""
@@ -139,7 +139,7 @@ def _where_lids_touch(
     focal = width * far / (4 * radius)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, width / 2], [0, 0, 1]])
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    viewmat[:3, 3] = torch.stack([-centre[0], centre[1], centre[2] + far])
+    viewmat[:3, 3] = torch.stack([-center[0], center[1], center[2] + far])
     camera = Camera(K, viewmat, width, width)
 
     def left(amount: float) -> int:

@@ -168,12 +168,12 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
     # The frames at both ends of a run swing too, but with only one of their neighbours.
     linked = (runs[:-1] | runs[1:])[..., None, None]
     forward = torch.where(linked, landmarks[1:] - landmarks[:-1], 0.0)
-    towards, neighbours = torch.zeros_like(landmarks), torch.zeros_like(landmarks[:, :, :1, :1])
+    towards, neighbors = torch.zeros_like(landmarks), torch.zeros_like(landmarks[:, :, :1, :1])
     towards[:-1] += forward
     towards[1:] -= forward
-    neighbours[:-1] += linked
-    neighbours[1:] += linked
-    return landmarks + towards / (2 * neighbours.clamp_min(1))
+    neighbors[:-1] += linked
+    neighbors[1:] += linked
+    return landmarks + towards / (2 * neighbors.clamp_min(1))
 
 
 def _of_runs(swings: Bool[Tensor, "t c"]) -> Bool[Tensor, "t c"]:

@@ -25,7 +25,7 @@ class CameraBatch:
         return len(self.K)
 
     @property
-    def centres(self) -> Float[Tensor, "c 3"]:
+    def centers(self) -> Float[Tensor, "c 3"]:
         """The cameras' positions in world space."""
         return -(self.viewmat[:, :3, :3].mT @ self.viewmat[:, :3, 3:])[..., 0]
 

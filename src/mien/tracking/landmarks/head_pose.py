@@ -67,11 +67,11 @@ def _facing_the_cameras(
     points: Float[Tensor, "l 3"], detected: Float[Tensor, "n l 2"], cameras: CameraBatch
 ) -> Float[Tensor, "n 6"]:
     """Head poses that look straight into each picture's camera and match the size and place of the detected points."""
-    centre = detected.mean(1)
-    spread = (detected - centre[:, None]).norm(dim=-1).mean(1)
+    center = detected.mean(1)
+    spread = (detected - center[:, None]).norm(dim=-1).mean(1)
     focal = cameras.K[:, 0, 0]
     depth = focal * (points - points.mean(0))[:, :2].norm(dim=-1).mean() / spread
-    across = (centre - cameras.K[:, :2, 2]) / focal[:, None] * depth[:, None]
+    across = (center - cameras.K[:, :2, 2]) / focal[:, None] * depth[:, None]
     in_camera = torch.cat([across, depth[:, None]], dim=1)
     R_world_camera = cameras.viewmat[:, :3, :3].mT
     in_world = (R_world_camera @ (in_camera - cameras.viewmat[:, :3, 3])[..., None])[..., 0]

@@ -166,10 +166,10 @@ def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit) -> Fit:
 def _without_similarity(
     offsets: Float[Tensor, "l 3"], positions: Float[Tensor, "l 3"], weights: Float[Tensor, " l"]
 ) -> Float[Tensor, "l 3"]:
-    centred = positions - positions.mean(0)
+    centered = positions - positions.mean(0)
     axes = torch.eye(3).to(positions)
-    motions = [axis.expand_as(centred) for axis in axes]
-    motions += [torch.linalg.cross(axis.expand_as(centred), centred) for axis in axes] + [centred]
+    motions = [axis.expand_as(centered) for axis in axes]
+    motions += [torch.linalg.cross(axis.expand_as(centered), centered) for axis in axes] + [centered]
     basis = torch.stack(motions, dim=-1)
     moving = (offsets != 0).any(1)
     root = weights.sqrt() * moving

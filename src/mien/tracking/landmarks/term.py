@@ -224,7 +224,7 @@ def trust_of(views: Views, state: Float[Tensor, "v p"], cameras: CameraBatch) ->
         cameras: The cameras, in the frame of the state.
     """
     ahead = matrix_from_axis_angle(state[:, :3])[views.row, :, 2]
-    sight = cameras.centres[views.camera] - state[views.row, 3:6]
+    sight = cameras.centers[views.camera] - state[views.row, 3:6]
     angle = ((ahead * sight).sum(-1) / sight.norm(dim=-1)).clamp(-1, 1).acos()
     trust = 1 / (1 + (angle / _SIDEWAYS) ** 4)
     best = torch.zeros_like(state[:, 0]).scatter_reduce(0, views.row, trust, "amax")

@@ -102,8 +102,8 @@ def usual_look(
     power += _FLAT * np.quantile(power.diagonal(), 0.9) + 1e-9
     alike = flat @ flat.T / np.sqrt(power * power.T)
     count = max(round(_USUAL * len(flat)), 3)
-    centre = np.sort(alike, axis=1)[:, -count].argmax()
-    members = alike[centre] >= np.sort(alike[centre])[-count]
+    center = np.sort(alike, axis=1)[:, -count].argmax()
+    members = alike[center] >= np.sort(alike[center])[-count]
     look = _mean(values[members], weights[members])
     for _ in range(_ROUNDS):
         members = _likeness(look, values, weights) >= _ALIKE

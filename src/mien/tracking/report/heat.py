@@ -21,8 +21,8 @@ def heat_map(difference: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]
 
 def dimmed(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture in dark grey, as a background."""
-    grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    return cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=_DIMMED), cv2.COLOR_GRAY2RGB)
+    gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(cv2.convertScaleAbs(gray, alpha=_DIMMED), cv2.COLOR_GRAY2RGB)
 
 
 def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:

@@ -5,7 +5,13 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep, telling_frames
+    from mien.training.footage.coverage import (
+        Coverage,
+        drawn_share,
+        measure_coverage,
+        representative_frames,
+        smoothstep,
+    )
     from mien.training.footage.filmed import (
         confidence_picture,
         filmed_words,
@@ -17,16 +23,16 @@ if TYPE_CHECKING:
         MIN_EXTENT,
         Frame,
         FrameOrder,
-        aside_random,
         background_at,
         camera_extent,
+        cover_random,
         crop_random,
         density_random,
-        disguise_random,
         evenly_spread,
         expression_rarity,
         held_out,
         resolved,
+        side_random,
         spread_frames,
         training_frames,
     )
@@ -55,14 +61,14 @@ __all__ = [
     "Sequence",
     "Target",
     "Targets",
-    "aside_random",
+    "side_random",
     "background_at",
     "camera_extent",
     "composite",
     "confidence_picture",
     "crop_random",
     "density_random",
-    "disguise_random",
+    "cover_random",
     "drawn_share",
     "driving_sequences",
     "evenly_spread",
@@ -80,7 +86,7 @@ __all__ = [
     "smoothstep",
     "split_by_name",
     "spread_frames",
-    "telling_frames",
+    "representative_frames",
     "training_frames",
     "vertex_colors",
     "with_named_split",

@@ -71,7 +71,7 @@ def measure_coverage(
     """
     count = len(face_model.faces)
     colors, weights, above = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
-    chosen = telling_frames(faces, sequences, frames)
+    chosen = representative_frames(faces, sequences, frames)
 
     neck = NeckParts.of(face_model)
 
@@ -91,7 +91,7 @@ def measure_coverage(
     return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 1))
 
 
-def telling_frames(
+def representative_frames(
     faces: Items[FaceParams],
     sequences: Items[Sequence],
     frames: Items[Frame],
@@ -153,8 +153,8 @@ def _seen_colors(
     The weight is 0 if the triangle is hidden, faces away, or is not part of the head that is scored.
     """
     camera = sequence.tracking.cameras[frame.camera]
-    centres = vertices[faces.long()].mean(1)
-    pixels, depth = camera.project(centres)
+    centers = vertices[faces.long()].mean(1)
+    pixels, depth = camera.project(centers)
     grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
     picture = torch.from_numpy(np.array(sequence.capture.images[frame[1:]])).float() / 255
     mask = torch.from_numpy(np.array(sequence.scoring[frame[1:]])).float()[..., None] / 255

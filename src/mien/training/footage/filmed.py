@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel
-from mien.render.camera_paths import aside
+from mien.render.camera_paths import turned_camera
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_tensors, write_tensors
@@ -30,7 +30,7 @@ _MOST_YAW, _MOST_PITCH = 60, 30
 """Degrees beyond which that does not hold. Fills have neither strands nor folds."""
 _STEP, _SIZE, _FIELD, _DISTANCE = 5, 128, 0.4, 1.0
 """Degrees between the views that are tried; their size in pixels, field of view in radians and distance in metres."""
-_MADE_UP = (0.93, 0.45, 0.30)
+_FILLED_IN = (0.93, 0.45, 0.30)
 _SEEN = (0.25, 0.55, 0.80)
 
 
@@ -126,10 +126,10 @@ def filmed_words(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage
 
 def view_of_head(vertices: Float[Tensor, "v 3"], yaw: int, size: int = _SIZE, pitch: int = 0) -> Camera:
     """A camera that looks at a head in the head frame from `yaw` degrees to the person's left and `pitch` above."""
-    centre = (vertices.amin(0) + vertices.amax(0)) / 2
+    center = (vertices.amin(0) + vertices.amax(0)) / 2
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (centre + torch.tensor([0.0, 0.0, _DISTANCE]))
-    return aside(camera_from_fov(_FIELD, size, size, viewmat), centre, math.radians(yaw), math.radians(pitch))
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (center + torch.tensor([0.0, 0.0, _DISTANCE]))
+    return turned_camera(camera_from_fov(_FIELD, size, size, viewmat), center, math.radians(yaw), math.radians(pitch))
 
 
 @torch.no_grad()
@@ -137,7 +137,7 @@ def confidence_picture(
     face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage: Coverage, yaw: int, size: int
 ) -> Float[Tensor, "h w 3"]:
     """The head in the colours of its confidence: blue for filmed, orange for made up, lit, over white."""
-    mixed = torch.lerp(torch.tensor(_MADE_UP), torch.tensor(_SEEN), coverage.seen[:, None])
+    mixed = torch.lerp(torch.tensor(_FILLED_IN), torch.tensor(_SEEN), coverage.seen[:, None])
     mixed = torch.lerp(torch.tensor([0.8, 0.8, 0.8]), mixed, coverage.above[:, None])
     corners = mixed[:, None].expand(-1, 3, -1).contiguous()
     camera = view_of_head(vertices, yaw, size)

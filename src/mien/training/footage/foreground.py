@@ -2,7 +2,7 @@
 
 A pixel at a soft edge, such as a strand of hair, holds some of the filmed background. When it is composited over
 another background, it keeps this share, and an avatar learns it: light slivers on the edges of hair and neck, which
-show from aside and over dark pages. The colours are estimated by blur fusion (Forte, "Approximate Fast Foreground
+show from the side and over dark pages. The colours are estimated by blur fusion (Forte, "Approximate Fast Foreground
 Colour Estimation", ICIP 2021): colours of person and background are averaged near each pixel, and the rest, by which
 the pixel's own colour differs from their mixture, is divided between both. A second pass with a small window sharpens
 the result of the first.

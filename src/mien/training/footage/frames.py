@@ -18,7 +18,7 @@ from mien.training.footage.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 
 Item = TypeVar("Item")
-_ORDER, _BACKGROUND, _DENSITY, _CROP, _DISGUISE, _ASIDE = range(6)
+_ORDER, _BACKGROUND, _DENSITY, _CROP, _COVER, _ASIDE = range(6)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
@@ -29,7 +29,7 @@ MIN_EXTENT = 0.5
 A single fixed camera has an extent of 0: centres would not move, and every Gaussian would be too large. Half a metre is
 less than the extent of a ring of cameras around a head, and more than the head.
 """
-_MAX_RARITY, _MAX_NEIGHBOUR = 2.0, 100
+_MAX_RARITY, _MAX_NEIGHBOR = 2.0, 100
 
 
 class Frame(NamedTuple):
@@ -102,8 +102,8 @@ def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
     Each camera of each sequence counts once.
     """
     seen = sorted({(frame.sequence, frame.camera) for frame in frames})
-    centres = torch.stack([sequences[index].tracking.cameras[camera].position for index, camera in seen]).double()
-    distances = (centres - centres.mean(0)).norm(dim=-1)
+    centers = torch.stack([sequences[index].tracking.cameras[camera].position for index, camera in seen]).double()
+    distances = (centers - centers.mean(0)).norm(dim=-1)
     return max(MIN_EXTENT, _EXTENT_MARGIN * float(distances.max()))
 
 
@@ -128,12 +128,12 @@ def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float
     """
     timesteps = sorted({(frame.sequence, frame.timestep) for frame in frames})
     expressions = torch.stack([sequences[s].tracking.face.expression[t] for s, t in timesteps]).double()
-    neighbour = min(max(1, round(len(timesteps) ** 0.5)), _MAX_NEIGHBOUR, len(timesteps) - 1)
+    neighbor = min(max(1, round(len(timesteps) ** 0.5)), _MAX_NEIGHBOR, len(timesteps) - 1)
     # In rows of bounded memory. Without matrix products, equal expressions are exactly 0 apart.
     rows = (
         torch.cdist(some, expressions, compute_mode="donot_use_mm_for_euclid_dist") for some in expressions.split(512)
     )
-    distances = torch.cat([row.kthvalue(neighbour + 1, dim=1).values for row in rows])
+    distances = torch.cat([row.kthvalue(neighbor + 1, dim=1).values for row in rows])
     rarity = (distances / distances.median().clamp_min(1e-9)).clamp(1 / _MAX_RARITY, _MAX_RARITY)
     index = {timestep: number for number, timestep in enumerate(timesteps)}
     return rarity[[index[frame.sequence, frame.timestep] for frame in frames]]
@@ -198,12 +198,12 @@ def crop_random(settings: TrainSettings, step: int) -> torch.Generator:
     return random_at(settings.seed, _CROP, step)
 
 
-def disguise_random(settings: TrainSettings, step: int) -> torch.Generator:
+def cover_random(settings: TrainSettings, step: int) -> torch.Generator:
     """The random numbers for the colour of a step's hidden Gaussians."""
-    return random_at(settings.seed, _DISGUISE, step)
+    return random_at(settings.seed, _COVER, step)
 
 
-def aside_random(settings: TrainSettings, step: int) -> torch.Generator:
+def side_random(settings: TrainSettings, step: int) -> torch.Generator:
     """The random numbers for a step's side view."""
     return random_at(settings.seed, _ASIDE, step)
 

@@ -205,8 +205,8 @@ class Targets:
         if boxes is None:
             left, top, width, height = cv2.boundingRect(matte)
             boxes = self._boxes[timestep, camera] = (left, top, width, height), *self._tracked(timestep, camera)
-        picture, colour = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
-        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], colour, *boxes[1:])
+        picture, color = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
+        target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], color, *boxes[1:])
         return target.pinned() if self._like.is_cuda else target
 
     def _image(self, timestep: int, camera: int, *, again: bool) -> UInt8[np.ndarray, "h w 3"]:

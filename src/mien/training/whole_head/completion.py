@@ -62,14 +62,14 @@ def complete_colors(
     shading = torch.ones_like(colors) if light is None else _shading(vertices, face_model.faces.cpu(), light)
     albedo = colors / shading
     known = seen * _trust(parts, mesh.middles, seen, colors)
-    made_up = _spread_by_part(parts, mesh, known, albedo)
+    filled_in = _spread_by_part(parts, mesh, known, albedo)
     if texture > 0:
-        made_up = made_up + texture * _noise(parts, mesh, known, albedo)
+        filled_in = filled_in + texture * _noise(parts, mesh, known, albedo)
     mirrored, share = _mirrored(face_model, mesh, seen, known, albedo)
-    made_up = torch.lerp(made_up, mirrored, share[:, None]) * shading
+    filled_in = torch.lerp(filled_in, mirrored, share[:, None]) * shading
     brightness = _brightness(parts, seen, colors)
-    made_up = torch.where(parts.interior[:, None], brightness * mouth_colors(parts, mesh.middles), made_up)
-    return torch.where(seen[:, None] >= 1, colors, torch.lerp(made_up.clamp(0, 1), colors, seen[:, None]))
+    filled_in = torch.where(parts.interior[:, None], brightness * mouth_colors(parts, mesh.middles), filled_in)
+    return torch.where(seen[:, None] >= 1, colors, torch.lerp(filled_in.clamp(0, 1), colors, seen[:, None]))
 
 
 def vertex_means(face_model: FaceModel, colors: Float[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:

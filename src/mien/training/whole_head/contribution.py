@@ -1,9 +1,9 @@
 """How much each Gaussian adds to training pictures, and what becomes of those that add nothing.
 
 Density control duplicates Gaussians with strong gradients. Soon many of them lie under others, where no picture shows
-them. They are not trained any more, count towards the limit, and show as specks in odd colours from aside. After each
-round, those that hardly add to any of a few pictures are removed. If all Gaussians of a triangle are such, one stays
-and becomes what it was in the beginning: a closed surface in the completed colour.
+them. They are not trained any more, count towards the limit, and show as specks in odd colours from the side. After
+each round, those that hardly add to any of a few pictures are removed. If all Gaussians of a triangle are such, one
+stays and becomes what it was in the beginning: a closed surface in the completed colour.
 """
 
 from collections.abc import Sequence as Items
@@ -46,7 +46,9 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
     return most
 
 
-def tidy(avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool) -> Bool[Tensor, " n"]:
+def prune_hidden(
+    avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool
+) -> Bool[Tensor, " n"]:
     """Deal with Gaussians that hardly add to any view, and return which are to be removed.
 
     One Gaussian stays on each triangle. If it is hidden, it gets the completed colour and, with `close`, also place,
@@ -61,7 +63,7 @@ def tidy(avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]]
     surface, prior = avatar.surface(), unseen.prior
     assert surface is not None
     triangles = surface.triangles()
-    kept = prior.made_up if prior.closed is None else prior.closed
+    kept = prior.filled_in if prior.closed is None else prior.closed
     assert kept is not None
     hidden = (contributions(avatar, views) < _HIDDEN) & ~kept[triangles]
     shown = torch.zeros_like(kept).index_put((triangles[~hidden],), torch.ones_like(hidden[~hidden]))

@@ -127,7 +127,7 @@ def hair_surface(avatar: Avatar, prior: SurfacePrior) -> HairSurface | None:
     mean = kernel * areas
     mean = mean / mean.sum(1, keepdim=True)
     scalp = scalp.to(prior.hair.device)
-    shown = torch.ones_like(scalp, dtype=torch.bool) if prior.made_up is None else ~prior.made_up[scalp]
+    shown = torch.ones_like(scalp, dtype=torch.bool) if prior.filled_in is None else ~prior.filled_in[scalp]
     state = {name: prior.hair.new_zeros(len(scalp)) for name in ("shift", "first", "second", "gradient")}
     state["count"] = prior.hair.new_zeros(())
     return HairSurface(scalp, kernel.to(prior.hair), mean.to(prior.hair), shown, prior, state)

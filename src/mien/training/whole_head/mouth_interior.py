@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from mien.avatar import Avatar, BoundSurface, Posed
 from mien.face.head_parts import head_parts
 from mien.gaussians import sh_from_rgb
-from mien.training.footage import Coverage, disguise_random, inside_triangles
+from mien.training.footage import Coverage, cover_random, inside_triangles
 from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
 from mien.training.whole_head.completion import complete_colors
 
@@ -35,10 +35,10 @@ class Inside:
     colors: Float[Tensor, "f 3"]
     """Colours that are plausible, 0..1: a dark mouth with light teeth."""
 
-    def furnish(self, surface: BoundSurface, step: int, steps: int) -> None:
+    def fill_interior(self, surface: BoundSurface, step: int, steps: int) -> None:
         """Close the surface where it is open, if this is a step of a run of `steps` at which this is due."""
         if step == round(_FURNISH_AT * steps):
-            surface.furnish(self.triangles, _OPAQUE, self.colors)
+            surface.fill_interior(self.triangles, _OPAQUE, self.colors)
 
     def to(self, like: Tensor) -> "Inside":
         """The same on the device of `like`, with colours of its dtype."""
@@ -46,24 +46,24 @@ class Inside:
 
 
 def prepare_inside(given: Preparation) -> TrainingPart | None:
-    """The part of a training that covers and furnishes what is inside a head, if the settings ask for it."""
+    """The part of a training that covers and fills what is inside a head, if the settings ask for it."""
     avatar, surface, settings = given.avatar, given.avatar.surface(), given.settings
     if settings.inside == "free" or surface is None:
         return None
 
     def covered(posed: Posed, one: BatchFrame) -> Posed:
-        return disguise(posed, avatar, one.target.hidden, disguise_random(settings, one.number))
+        return cover_hidden(posed, avatar, one.target.hidden, cover_random(settings, one.number))
 
     hideable = inside_triangles(given.face_model)
     if settings.inside == "covered":
         return TrainingPart("inside", hideable, posed=covered)
     inside = inside_of(avatar, given.coverage).to(given.like)
 
-    def furnish(step: Step) -> None:
+    def fill_interior(step: Step) -> None:
         for one in step.batch:
-            inside.furnish(surface, one.number, settings.steps)
+            inside.fill_interior(surface, one.number, settings.steps)
 
-    return TrainingPart("inside", hideable, posed=covered, before_step=furnish)
+    return TrainingPart("inside", hideable, posed=covered, before_step=fill_interior)
 
 
 @torch.no_grad()
@@ -78,7 +78,7 @@ def inside_of(avatar: Avatar, covered: Coverage) -> Inside:
     return Inside(interior, complete_colors(model.to(neutral), neutral, seen, covered.colors))
 
 
-def disguise(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None, random: torch.Generator) -> Posed:
+def cover_hidden(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None, random: torch.Generator) -> Posed:
     """Give hidden Gaussians one colour, drawn at random, so that they can explain nothing and have to be covered.
 
     Their opacities have no gradient: they must not fade because a skin that is still thin lets them through. Their
@@ -91,12 +91,12 @@ def disguise(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None, ra
     gaussians, own = posed.gaussians, hidden[surface.triangles()]
     color = sh_from_rgb(torch.rand(3, generator=random)).to(gaussians.sh, non_blocking=True)
     # Only on a CPU are rows found without waiting for the device.
-    disguised = _Disguised.apply if gaussians.sh.device.type == "cpu" else disguised_reference
-    sh, opacities = disguised(gaussians.sh, gaussians.opacities, own, color)
+    covered = _Covered.apply if gaussians.sh.device.type == "cpu" else covered_reference
+    sh, opacities = covered(gaussians.sh, gaussians.opacities, own, color)
     return replace(posed, gaussians=replace(gaussians, sh=sh, opacities=opacities))
 
 
-def disguised_reference(
+def covered_reference(
     sh: Float[Tensor, "n k 3"], opacities: Float[Tensor, " n"], own: Bool[Tensor, " n"], color: Float[Tensor, " 3"]
 ) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, " n"]]:
     """Coefficients of which some rows are one constant colour, and opacities that have no gradient in these rows."""
@@ -105,8 +105,8 @@ def disguised_reference(
     return torch.where(own[:, None, None], degrees * color, sh), torch.where(own, opacities.detach(), opacities)
 
 
-class _Disguised(torch.autograd.Function):
-    """`disguised_reference` in a third of its time, because it touches only the rows that change."""
+class _Covered(torch.autograd.Function):
+    """`covered_reference` in a third of its time, because it touches only the rows that change."""
 
     @staticmethod
     def forward(ctx: Any, sh: Tensor, opacities: Tensor, own: Tensor, color: Tensor) -> tuple[Tensor, Tensor]:

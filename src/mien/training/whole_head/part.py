@@ -1,4 +1,4 @@
-"""Whole heads as a part of a training: closed sides, hair that moves, and views from aside."""
+"""Whole heads as a part of a training: closed sides, hair that moves, and views from the side."""
 
 from collections.abc import Callable
 from collections.abc import Sequence as Items
@@ -9,10 +9,10 @@ from torch import Tensor
 
 from mien.avatar import Avatar, BoundSurface
 from mien.render.rendering import Rendering
-from mien.training.footage import aside_random, resolved, with_shown_angles
+from mien.training.footage import resolved, side_random, with_shown_angles
 from mien.training.parts import Preparation, Step, TrainingPart
 from mien.training.settings import TrainSettings
-from mien.training.whole_head.contribution import tidy
+from mien.training.whole_head.contribution import prune_hidden
 from mien.training.whole_head.hair_surface import EVERY, HairSurface, hair_surface
 from mien.training.whole_head.side_views import SideViews, side_views_of
 from mien.training.whole_head.unseen import Unseen, fills_sides, moved, spare_fills, unseen_of
@@ -29,7 +29,7 @@ class WholeHead:
 
     def __init__(self, avatar: Avatar, unseen: Unseen, settings: TrainSettings):
         self.unseen = unseen
-        self.aside: SideViews | None = side_views_of(avatar, unseen, settings.side_weight)
+        self.side_views: SideViews | None = side_views_of(avatar, unseen, settings.side_weight)
         self.hair: HairSurface | None = hair_surface(avatar, unseen.prior) if unseen.fills else None
         self._avatar = avatar
         self._surface: BoundSurface | None = avatar.surface()
@@ -42,7 +42,7 @@ class WholeHead:
             density=lambda control: spare_fills(self._avatar, control, self.unseen),
             weights=lambda weights: self.unseen.weights(weights),
             losses=self._losses,
-            rare_losses=() if self.aside is None else ("aside",),
+            rare_losses=() if self.side_views is None else ("side_views",),
             after_backward=self._after_backward,
             after_update=self._after_update,
             after_step=self._after_step,
@@ -56,24 +56,24 @@ class WholeHead:
             return
         prior = self.hair.prior()
         self.unseen = replace(self.unseen, prior=prior)
-        if self.aside is not None:
-            self.aside = self.aside.at_height(prior.fill_height)
+        if self.side_views is not None:
+            self.side_views = self.side_views.at_height(prior.fill_height)
 
     def _losses(self, step: Step) -> dict[str, Float[Tensor, ""]]:
         """The loss of a side view, if one of the frames is due for it: that of the first such frame."""
-        aside = self.aside
-        due = [] if aside is None else [one for one in step.batch if aside.due(one.number)]
-        if aside is None or not due:
+        side_views = self.side_views
+        due = [] if side_views is None else [one for one in step.batch if side_views.due(one.number)]
+        if side_views is None or not due:
             return {}
         one = due[0]
-        camera, random = step.camera(one.frame), aside_random(step.settings, one.number)
+        camera, random = step.camera(one.frame), side_random(step.settings, one.number)
         face = step.track.face(one.index)
-        return {"aside": aside.loss(step.avatar, face, camera, step.progress, one.number, random)}
+        return {"side_views": side_views.loss(step.avatar, face, camera, step.progress, one.number, random)}
 
     def _after_backward(self, step: Step, renderings: Items[Rendering]) -> None:
         if self.hair is not None and self._surface is not None:
             self.hair.collect(self._surface, step.progress.step / step.settings.steps)
-        self.unseen.guard(step.avatar, *renderings)
+        self.unseen.mask_gradients(step.avatar, *renderings)
 
     def _after_update(self, step: Step) -> None:
         if self._surface is not None:
@@ -83,21 +83,21 @@ class WholeHead:
         hair, surface = self.hair if step.reaches(EVERY) else None, self._surface
         if hair and surface and hair.correct(surface, step.fraction_done, step.settings.hair_rate):
             self.follow_hair()
-        self._tidy(step)
+        self._prune_hidden(step)
 
-    def _tidy(self, step: Step) -> None:
+    def _prune_hidden(self, step: Step) -> None:
         """Remove Gaussians that pictures do not show, after a round of density control and at the end."""
         last = step.fraction_done >= 1
-        if not self.unseen.fills or not (step.changed or last) or not step.telling:
+        if not self.unseen.fills or not (step.changed or last) or not step.representative:
             return
 
         def redundant() -> Bool[Tensor, " n"]:
             track = step.track
             views = [
                 (track.face(track.index_of(frame.sequence, frame.timestep)).detach(), step.camera(frame))
-                for frame in step.telling
+                for frame in step.representative
             ]
-            return tidy(step.avatar, self.unseen, views, close=not last)
+            return prune_hidden(step.avatar, self.unseen, views, close=not last)
 
         step.density.thin(step.avatar.gaussian_store(), step.fraction_done, redundant)
 

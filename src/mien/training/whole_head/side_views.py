@@ -1,8 +1,8 @@
-"""Training pictures that no camera took: the head from aside, and with raised expressions.
+"""Training pictures that no camera took: the head from the side, and with raised expressions.
 
 One camera in front shows half of a head at a few expressions. Between its pictures, Gaussians may do as they like: they
 leave the surface, and show as shards and holes once the head turns. A side view is compared with the completed mesh:
-from aside, the head is opaque exactly where the mesh with its hair is, above the cut at the neck, and colours are
+from the side, the head is opaque exactly where the mesh with its hair is, above the cut at the neck, and colours are
 pulled towards those of the mesh. In raised expressions, a difference that a real head could have is free.
 """
 
@@ -26,11 +26,11 @@ from mien.training.whole_head.completion import vertex_means
 from mien.training.whole_head.unseen import Unseen
 
 _EVERY = 8
-"""Number of steps between two side views. Views of raised expressions take turns with those from aside."""
+"""Number of steps between two side views. Views of raised expressions take turns with those from the side."""
 _SIDE = 256
 """Longer side of these pictures, in pixels. The completed colours are no finer."""
 _LEAST, _MOST = 45.0, 180.0
-"""Angles between which the head turns aside, in degrees. Pictures know the outline nearer to the front better."""
+"""Angles between which the head turns to the side, in degrees. Pictures know the outline nearer to the front better."""
 _EXPRESSION_MOST = 45.0
 """Largest angle at which a raised expression is seen, in degrees."""
 _RAISED = 6
@@ -39,7 +39,8 @@ _FREE = 0.06
 """Difference of colour (0..1) between an avatar and the completed mesh that costs nothing in raised expressions. The
 mesh knows neither hair nor pores."""
 _OUTLINE = 3.0
-"""Weight of the difference of alpha from aside against that of colours. Most errors from aside are at the outline."""
+"""Weight of the difference of alpha from the side against that of colours. Most errors from the side are at the
+outline."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,7 @@ class SideViews:
 
         Args:
             avatar: The avatar, on any device.
-            face: One timestep. Its joints and its place are kept, and its expression is that of views from aside. It
+            face: One timestep. Its joints and its place are kept, and its expression is that of views from the side. It
                 gets no gradient.
             camera: The camera in front of the head.
             progress: How far training is.
@@ -82,7 +83,7 @@ class SideViews:
         """
         raised = step % _EVERY != 0
         angle = _drawn_angle(raised, random)
-        face = turned_aside(face.detach(), angle)
+        face = turned_to_side(face.detach(), angle)
         if raised:
             face = replace(face, expression=self._raised(face.expression, random))
         scale = _SIDE / max(camera.width, camera.height)
@@ -145,7 +146,7 @@ def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Te
 
 def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideViews | None:
     """The side views of a filled head, or None if nothing is filled or the weight is 0."""
-    if unseen is None or unseen.prior.made_up is None or weight == 0:
+    if unseen is None or unseen.prior.filled_in is None or weight == 0:
         return None
     model, prior = avatar.face_model, unseen.prior
     like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
@@ -153,7 +154,7 @@ def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideV
     return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
 
 
-def turned_aside(face: FaceParams, angle: float) -> FaceParams:
+def turned_to_side(face: FaceParams, angle: float) -> FaceParams:
     """The head turned about its own upright axis by an angle in radians, at the same place.
 
     A camera sees it as one that goes around the head by this angle.

@@ -28,8 +28,8 @@ from mien.training.footage import (
     spread_frames,
 )
 from mien.training.settings import TrainSettings
+from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.completion import complete_colors
-from mien.training.whole_head.hair_curtain import hair_curtain
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
 from mien.training.whole_head.spreading import Surface
 
@@ -37,7 +37,7 @@ _RARE = 0.02
 """Confidence below which a triangle is made up."""
 _SIGHTS, _RARELY = 240, 0.02
 """Number of frames in which the inside of the mouth is looked for, and the share of them that have to show it."""
-_MOVING, _LOOSE = ("lips", "eyelids", "eyes", "irises"), 3.0
+_MOVING, _WIDENING = ("lips", "eyelids", "eyes", "irises"), 3.0
 """Regions that move most, and the factor on the limits there and inside the mouth. The tracked mesh is millimetres off
 there, and its folds are not those of the skin."""
 _NEAR = (0.008, 0.024)
@@ -64,7 +64,7 @@ class Unseen:
     @property
     def fills(self) -> bool:
         """Whether some sides are filled rather than trained."""
-        return self.prior.made_up is not None
+        return self.prior.filled_in is not None
 
     def weights(self, weights: Photometric) -> Photometric:
         """The weights of the losses, with a loss of alpha if anything is filled."""
@@ -72,15 +72,15 @@ class Unseen:
             return weights
         return replace(weights, alpha_weight=max(weights.alpha_weight, _ALPHA))
 
-    def made_up(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
+    def filled_in(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
         surface = avatar.surface()
-        return None if self.prior.made_up is None or surface is None else self.prior.made_up[surface.triangles()]
+        return None if self.prior.filled_in is None or surface is None else self.prior.filled_in[surface.triangles()]
 
-    def guard(self, avatar: Avatar, *renderings: Rendering) -> None:
+    def mask_gradients(self, avatar: Avatar, *renderings: Rendering) -> None:
         """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
-        made_up = self.made_up(avatar)
-        if made_up is None:
+        filled_in = self.filled_in(avatar)
+        if filled_in is None:
             return
         store = avatar.gaussian_store()
         for name in store.trained:
@@ -89,13 +89,13 @@ class Unseen:
                 continue
             # The second axis of a triangle's frame is its normal.
             height = gradient[:, 1].clone() if name == "means" else None
-            gradient.masked_fill_(made_up.view(-1, *[1] * (gradient.ndim - 1)), 0)
+            gradient.masked_fill_(filled_in.view(-1, *[1] * (gradient.ndim - 1)), 0)
             if height is not None:
                 strong = height.sign() * (height.abs() - _CONTRADICTION).clamp_min(0)
-                gradient[:, 1] = torch.where(made_up, strong, height)
+                gradient[:, 1] = torch.where(filled_in, strong, height)
         for rendering in renderings:
             if rendering.means2d_offset.grad is not None:
-                rendering.means2d_offset.grad.masked_fill_(made_up[:, None], 0)
+                rendering.means2d_offset.grad.masked_fill_(filled_in[:, None], 0)
 
 
 def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -> bool:
@@ -119,8 +119,8 @@ def spare_fills(avatar: Avatar, density: DensityControl, unseen: Unseen) -> Dens
         assert surface is not None
         return ~closed[surface.triangles()]
 
-    made_up = unseen.made_up(avatar)
-    return density.sparing(may_reset, 0 if made_up is None else int(made_up.sum()))
+    filled_in = unseen.filled_in(avatar)
+    return density.sparing(may_reset, 0 if filled_in is None else int(filled_in.sum()))
 
 
 @torch.no_grad()
@@ -143,16 +143,16 @@ def unseen_of(
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
     if avatar.surface() is None:
         return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
-    made_up = (shown < _RARE) & (found.above > 0.5)
-    made_up |= hidden_inside(model, parts.interior, sequences, faces, frames)
-    looseness = looser_where_faces_move(model, neutral, parts.interior)
-    curtain = hair_curtain(model, neutral, hair, hanging)
-    behind = made_up & (curtain > hair)
+    filled_in = (shown < _RARE) & (found.above > 0.5)
+    filled_in |= hidden_inside(model, parts.interior, sequences, faces, frames)
+    widening = wider_where_faces_move(model, neutral, parts.interior)
+    behind_head = back_hair(model, neutral, hair, hanging)
+    behind = filled_in & (behind_head > hair)
     colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
-    hair, hanging = torch.where(behind, curtain, hair), torch.maximum(hanging, curtain)
-    strands = made_up & (parts.scalp | behind) & (hair > _STRANDS_FROM)
+    hair, hanging = torch.where(behind, behind_head, hair), torch.maximum(hanging, behind_head)
+    strands = filled_in & (parts.scalp | behind) & (hair > _STRANDS_FROM)
     return Unseen(
-        found, SurfacePrior(hair, hanging, colors, doubt, made_up, made_up | parts.interior, strands, looseness)
+        found, SurfacePrior(hair, hanging, colors, doubt, filled_in, filled_in | parts.interior, strands, widening)
     )
 
 
@@ -167,7 +167,7 @@ def _hair_colors(
     return Surface.of(vertices, face_model.faces).spread(colors, scalp.to(colors), scalp | behind)
 
 
-def looser_where_faces_move(
+def wider_where_faces_move(
     face_model: FaceModel, vertices: Float[Tensor, "v 3"], interior: Bool[Tensor, " f"]
 ) -> Float[Tensor, " f"]:
     """Factors on the limits to the surface: above 1 at and around lips and lids, and inside the mouth.
@@ -179,10 +179,10 @@ def looser_where_faces_move(
     """
     middles, moving = vertices[face_model.faces.long()].mean(1), face_model.region_mask(*_MOVING)
     if not bool(moving.any()):
-        return torch.where(interior, _LOOSE, 1.0)
+        return torch.where(interior, _WIDENING, 1.0)
     distances = torch.cdist(middles, middles[moving], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     near = smoothstep((_NEAR[1] - distances) / (_NEAR[1] - _NEAR[0]))
-    return 1 + (_LOOSE - 1) * torch.where(interior, 1.0, near)
+    return 1 + (_WIDENING - 1) * torch.where(interior, 1.0, near)
 
 
 def hidden_inside(
@@ -213,9 +213,9 @@ def moved(unseen: Unseen, like: Tensor) -> Unseen:
         "hanging": None if prior.hanging is None else prior.hanging.to(like),
         "colors": None if prior.colors is None else prior.colors.to(like),
         "doubt": None if prior.doubt is None else prior.doubt.to(like),
-        "made_up": None if prior.made_up is None else prior.made_up.to(like.device),
+        "filled_in": None if prior.filled_in is None else prior.filled_in.to(like.device),
         "closed": None if prior.closed is None else prior.closed.to(like.device),
         "strands": None if prior.strands is None else prior.strands.to(like.device),
-        "looseness": None if prior.looseness is None else prior.looseness.to(like),
+        "widening": None if prior.widening is None else prior.widening.to(like),
     }
     return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))

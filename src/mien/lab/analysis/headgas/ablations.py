@@ -16,7 +16,7 @@ from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.headgas.trained import busy_face
 from mien.lab.analysis.result import PartResult, Picture, Table
 from mien.lab.analysis.scoring import METRICS, held_out_scores, perceptual_metric
-from mien.lab.analysis.views import labelled
+from mien.lab.analysis.views import labeled
 from mien.perceptual import PerceptualDistance
 from mien.pictures import side_by_side, to_uint8
 from mien.storage import file_digest
@@ -136,10 +136,10 @@ def _picture(context: Context, trained: dict[str, Variant]) -> tuple[Picture, ..
     if first is None:
         return ()
     frame = _strongest(first)
-    tiles = [labelled(_head(first, frame, None), "truth")]
+    tiles = [labeled(_head(first, frame, None), "truth")]
     for name, experiment in experiments.items():
         assert experiment is not None
-        tiles.append(labelled(_head(experiment, frame, avatar_image(experiment, frame)), name))
+        tiles.append(labeled(_head(experiment, frame, avatar_image(experiment, frame)), name))
     sequence = first.sequences[frame.sequence].name
     caption = f"{sequence}, timestep {frame.timestep}, held out: the truth, and each variant."
     return (Picture("ablations", side_by_side(tiles), caption),)

@@ -13,7 +13,7 @@ from mien.face import FaceModel, FaceParams
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas.trained import trained_range, with_expression
 from mien.lab.analysis.result import Film, PartResult, Picture, Table
-from mien.lab.analysis.views import draw_avatar, draw_mesh, head_camera, labelled
+from mien.lab.analysis.views import draw_avatar, draw_mesh, head_camera, labeled
 from mien.pictures import picture_grid, side_by_side
 from mien.progress import track_progress
 
@@ -51,7 +51,7 @@ def basis(context: Context) -> PartResult:
     for index in shown:
         face = with_expression(start, index, float(start.expression[0, index]) * added + rows[index][1])
         pair = side_by_side([draw_mesh(model, face, camera), draw_avatar(avatar, face, camera)])
-        pairs.append(labelled(pair, f"{names[index]} {rows[index][1]:g}"))
+        pairs.append(labeled(pair, f"{names[index]} {rows[index][1]:g}"))
     films = ()
     if shown:
         write_video(context.folder / "basis.mp4", _film(context, start, shown, added), _FPS)
@@ -104,7 +104,7 @@ def _film(context: Context, start: FaceParams, shown: list[int], added: int) -> 
             value = top * math.sin(math.pi * frame / _FRAMES) ** 2
             face = with_expression(start, index, float(start.expression[0, index]) * added + value)
             pair = side_by_side([draw_mesh(model, face, camera), draw_avatar(avatar, face, camera)])
-            yield labelled(pair, f"{model.expression_names[index]} {value:.2f}")
+            yield labeled(pair, f"{model.expression_names[index]} {value:.2f}")
 
 
 def _caption(added: bool) -> str:

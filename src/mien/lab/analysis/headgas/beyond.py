@@ -12,9 +12,9 @@ from mien.evaluation.plots import Axes, Series
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas.trained import Trained, trained_range, with_expression
 from mien.lab.analysis.result import Chart, Film, PartResult, Picture
-from mien.lab.analysis.views import draw_avatar, draw_mesh, head_camera, labelled
+from mien.lab.analysis.views import draw_avatar, draw_mesh, head_camera, labeled
 from mien.pictures import picture_grid, side_by_side
-from mien.render.camera_paths import aside
+from mien.render.camera_paths import turned_camera
 
 _REACH = 1.4
 """Largest multiple of the training maximum: the supplement's own."""
@@ -34,10 +34,10 @@ def beyond(context: Context) -> PartResult:
     yaws = shown_yaws(trained)
     expressions = [_pair(context, index, factor * most) for factor in _FACTORS]
     rows = [
-        labelled(picture, f"{factor:g} x largest") for factor, (picture, _) in zip(_FACTORS, expressions, strict=True)
+        labeled(picture, f"{factor:g} x largest") for factor, (picture, _) in zip(_FACTORS, expressions, strict=True)
     ]
-    meshes = [labelled(mesh, "") for _, mesh in expressions]
-    views = [labelled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees") for yaw in yaws]
+    meshes = [labeled(mesh, "") for _, mesh in expressions]
+    views = [labeled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees") for yaw in yaws]
     write_video(context.folder / "beyond-expression.mp4", _expression_film(context, index, most), _FPS)
     write_video(context.folder / "beyond-view.mp4", _view_film(context, trained), _FPS)
     low, high = (math.degrees(yaw) for yaw in trained.yaws)
@@ -113,7 +113,7 @@ def view_from(context: Context, trained: Trained, yaw: float) -> Camera:
     """The camera, moved around the person at rest until the head sees it at this yaw, in radians."""
     avatar = context.avatar
     camera = head_camera(avatar.face_model, avatar.subject, context.camera, _SIDE)
-    return aside(camera, avatar.subject.head_translation[0], yaw - trained.yaw_at_rest, 0.0)
+    return turned_camera(camera, avatar.subject.head_translation[0], yaw - trained.yaw_at_rest, 0.0)
 
 
 def _seen_from(context: Context, trained: Trained, yaw: float) -> np.ndarray:
@@ -123,7 +123,7 @@ def _seen_from(context: Context, trained: Trained, yaw: float) -> np.ndarray:
 def _expression_film(context: Context, index: int, most: float) -> Iterator[np.ndarray]:
     for frame in range(_FRAMES):
         factor = _REACH * frame / (_FRAMES - 1)
-        yield labelled(side_by_side(_pair(context, index, factor * most)), f"{factor:.2f} x largest")
+        yield labeled(side_by_side(_pair(context, index, factor * most)), f"{factor:.2f} x largest")
 
 
 def _view_film(context: Context, trained: Trained) -> Iterator[np.ndarray]:
@@ -132,4 +132,4 @@ def _view_film(context: Context, trained: Trained) -> Iterator[np.ndarray]:
         yaw = first + (last - first) * frame / (_FRAMES - 1)
         inside = trained.yaws[0] <= yaw <= trained.yaws[1]
         text = f"{math.degrees(yaw):+.0f} degrees, {'seen' if inside else 'unseen'}"
-        yield labelled(_seen_from(context, trained, yaw), text)
+        yield labeled(_seen_from(context, trained, yaw), text)

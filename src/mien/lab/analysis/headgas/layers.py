@@ -12,7 +12,7 @@ from mien.capture.video import write_video
 from mien.gaussians import Gaussians, world_means
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.result import Film, PartResult, Picture
-from mien.lab.analysis.views import draw_avatar, head_camera, labelled, mouth_camera
+from mien.lab.analysis.views import draw_avatar, head_camera, labeled, mouth_camera
 from mien.pictures import side_by_side
 
 _SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -38,8 +38,7 @@ def layers(context: Context) -> PartResult:
     for name, camera in views.items():
         values[f"in_{name}"] = len(orders[name])
         drawn = [
-            labelled(_without(context, camera, orders[name], share), f"without {100 * share:.0f} %")
-            for share in _SHARES
+            labeled(_without(context, camera, orders[name], share), f"without {100 * share:.0f} %") for share in _SHARES
         ]
         caption = (
             f"The {name} of the person at rest, without the nearest Gaussians among the {len(orders[name]):,} in view."
@@ -89,4 +88,4 @@ def _film(context: Context, views: dict[str, Camera], orders: dict[str, Tensor])
     for frame in range(_FRAMES):
         share = _SHARES[-1] * frame / (_FRAMES - 1)
         pair = side_by_side([_without(context, camera, orders[name], share) for name, camera in views.items()])
-        yield labelled(pair, f"without {100 * share:.0f} %")
+        yield labeled(pair, f"without {100 * share:.0f} %")

@@ -8,7 +8,7 @@ from mien.lab.analysis.context import Context, Variant
 from mien.lab.analysis.mono_gaussian_avatar.subsets import frontal_quarter, masks, measure, mixed_half, ranges
 from mien.lab.analysis.result import PartResult, Picture, Table
 from mien.lab.analysis.scoring import METRICS, held_out_scores, perceptual_metric
-from mien.lab.analysis.views import labelled
+from mien.lab.analysis.views import labeled
 from mien.perceptual import PerceptualDistance
 from mien.pictures import side_by_side, to_uint8
 from mien.training.footage import training_frames
@@ -113,5 +113,5 @@ def _pictures(context: Context, name: str, trained: dict[str, Variant]) -> tuple
         pictures = {"truth": target_image(experiment, frame)} if not tiles else {}
         pictures[label] = avatar_image(experiment, frame)
         box = experiment.crop(frame)
-        tiles += [labelled(to_uint8(crop_to(picture, box)), text) for text, picture in pictures.items()]
+        tiles += [labeled(to_uint8(crop_to(picture, box)), text) for text, picture in pictures.items()]
     return (Picture(name, side_by_side(tiles), "A held-out frame: the truth, then each training."),)

@@ -12,7 +12,7 @@ from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.plots import Axes, Series
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.result import Chart, PartResult, Picture, Table
-from mien.lab.analysis.views import labelled
+from mien.lab.analysis.views import labeled
 from mien.pictures import side_by_side, to_uint8
 from mien.progress import progress_bar
 from mien.render import rasterize
@@ -45,14 +45,14 @@ def convergence(context: Context) -> PartResult:
     context.say_how_long("convergence", 1)
     frames = spread_frames(experiment.held_out_frames, _FRAMES)
     steps = sorted({max(1, round(time * context.options.steps)) for time in TIMES})
-    rows, tiles = [], [labelled(_head(experiment, frames[0], target_image(experiment, frames[0])), "truth")]
+    rows, tiles = [], [labeled(_head(experiment, frames[0], target_image(experiment, frames[0])), "truth")]
     for reached, gaussians, pictures in _snapshots(context, experiment, frames, steps):
         scores = [
             psnr(picture, target_image(experiment, frame), experiment.crop(frame))
             for frame, picture in zip(frames, pictures, strict=True)
         ]
         rows.append({"step": reached, "gaussians": gaussians, "head_psnr": round(float(np.mean(scores)), 3)})
-        tiles.append(labelled(_head(experiment, frames[0], pictures[0]), f"step {reached}"))
+        tiles.append(labeled(_head(experiment, frames[0], pictures[0]), f"step {reached}"))
     x, y, counts = (np.array([row[name] for row in rows], float) for name in ("step", "head_psnr", "gaussians"))
     near = next(row["step"] for row in rows if row["head_psnr"] >= max(y) - 1)
     return PartResult(

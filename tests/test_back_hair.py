@@ -9,7 +9,7 @@ from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.tracking import NeckParts, fit_neck_cut
 from mien.tracking.neck_cut import above_neck_cut
-from mien.training.whole_head.hair_curtain import hair_curtain
+from mien.training.whole_head.back_hair import back_hair
 
 _HAIR = 0.02
 
@@ -26,13 +26,13 @@ def _beside(model: FaceModel, *, low: float = -1.0, left: float = 0.05, right: f
     return torch.where((parts.skin | parts.neck) & (middles[:, 1] > low), hanging, 0.0)
 
 
-def _curtain(model: FaceModel, hanging: torch.Tensor, hair: float = _HAIR) -> torch.Tensor:
-    return hair_curtain(model, model.template, hair * head_parts(model).scalp.float(), hanging)
+def _back_hair(model: FaceModel, hanging: torch.Tensor, hair: float = _HAIR) -> torch.Tensor:
+    return back_hair(model, model.template, hair * head_parts(model).scalp.float(), hanging)
 
 
 def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
     middles, _, normals = triangle_geometry(anny.template, anny.faces)
-    found = _curtain(anny, _beside(anny))
+    found = _back_hair(anny, _beside(anny))
     nape = (found > 0) & (normals[:, 2] < -0.8) & (middles[:, 0].abs() < 0.02)
     assert int(nape.sum()) > 10
     scalp = middles[head_parts(anny).scalp]
@@ -45,7 +45,7 @@ def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
 
 def test_nothing_hangs_in_front(anny):
     normals = triangle_geometry(anny.template, anny.faces)[2]
-    found = _curtain(anny, _beside(anny))
+    found = _back_hair(anny, _beside(anny))
     assert not found[normals[:, 2] >= 0].any()
     assert not found[head_parts(anny).face].any()
 
@@ -55,25 +55,25 @@ def test_nothing_hangs_in_front(anny):
     [{"left": 0.0, "right": 0.0}, {"left": 0.05, "right": 0.005}, {"low": 1.0}],
     ids=["short hair", "one side", "nothing"],
 )
-def test_hair_that_does_not_hang_at_both_sides_has_no_curtain(anny, hanging):
-    assert not _curtain(anny, _beside(anny, **hanging)).any()
+def test_hair_that_does_not_hang_at_both_sides_has_no_back_hair(anny, hanging):
+    assert not _back_hair(anny, _beside(anny, **hanging)).any()
 
 
 def test_a_collar_below_a_bare_neck_is_no_hair(anny):
     """Shoulders stand out beside the lowest part of the neck, with nothing between them and the scalp."""
     middles = anny.template[anny.faces].mean(1)
     collar = torch.where(middles[:, 1] < -0.11, _beside(anny), 0.0)
-    assert not _curtain(anny, collar).any()
+    assert not _back_hair(anny, collar).any()
 
 
 def test_hair_hangs_as_far_down_as_at_the_sides(anny):
     middles = anny.template[anny.faces].mean(1)
-    shorter, longer = (_curtain(anny, _beside(anny, low=low)) for low in (-0.09, -1.0))
+    shorter, longer = (_back_hair(anny, _beside(anny, low=low)) for low in (-0.09, -1.0))
     assert float(middles[longer > 0][:, 1].min()) < float(middles[shorter > 0][:, 1].min()) - 0.01
 
 
 def test_no_hair_hangs_below_the_cut(anny):
-    found = _curtain(anny, _beside(anny))
+    found = _back_hair(anny, _beside(anny))
     middles, _, normals = triangle_geometry(anny.template, anny.faces)
     cut = fit_neck_cut(NeckParts.of(anny), anny.template, torch.tensor([0.0, 1.0, 0.0]))
     assert (cut.margins((middles + found[:, None] * normals)[found > 0]) > 0).all()
@@ -91,5 +91,5 @@ def test_margins_are_those_of_pictures(anny):
         assert (float(cut.margins(point)) > 0) == (above_neck_cut(cut, camera)[row, column] > 0.5)
 
 
-def test_a_bald_head_has_no_curtain(anny):
-    assert not _curtain(anny, _beside(anny), hair=0.0).any()
+def test_a_bald_head_has_no_back_hair(anny):
+    assert not _back_hair(anny, _beside(anny), hair=0.0).any()

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from mien.capture.camera_names import CameraName
-from mien.capture.colours import Colours
+from mien.capture.colors import Colors
 from mien.capture.live_camera import LiveCamera
 from mien.capture.tone import HLG, PQ
 from mien.capture.video import probe_video, read_video_frames
 from test_capture_pictures import hdr_signal, light_of, to_bt2020
 
-COLOUR = np.array([200, 120, 100])
+COLOR = np.array([200, 120, 100])
 WEIGHTS = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
 """Weights of red and blue in luma, by the code of the matrix."""
 PRIMARIES = {1: 1, 2: 2, 5: 5, 6: 6, 9: 9}
-SILENT = Colours()
+SILENT = Colors()
 LIMITED, FULL = 1, 2
 KINDS = {
     "prores.mov": ("prores_ks", "yuv422p10le", {}),
@@ -32,32 +32,32 @@ KINDS = {
 }
 
 
-def numbers_of(colours: Colours, bits: int) -> list[int]:
-    """Return Y', Cb and Cr of `COLOUR` in these colours."""
-    signal = COLOUR / 255
-    if colours.transfer in (PQ, HLG):
-        signal = hdr_signal(to_bt2020(light_of(COLOUR[None])), colours.transfer)[0]
-    red, blue = WEIGHTS[colours.matrix]
+def numbers_of(colors: Colors, bits: int) -> list[int]:
+    """Return Y', Cb and Cr of `COLOR` in these colours."""
+    signal = COLOR / 255
+    if colors.transfer in (PQ, HLG):
+        signal = hdr_signal(to_bt2020(light_of(COLOR[None])), colors.transfer)[0]
+    red, blue = WEIGHTS[colors.matrix]
     luma = float(signal @ [red, 1 - red - blue, blue])
     chroma = [(signal[2] - luma) / (2 - 2 * blue), (signal[0] - luma) / (2 - 2 * red)]
     unit = 1 << (bits - 8)
-    if colours.range == FULL:
+    if colors.range == FULL:
         most = 256 * unit - 1
         return [round(most * luma), *(round(128 * unit + most * value) for value in chroma)]
     return [round(16 * unit + 219 * unit * luma), *(round(128 * unit + 224 * unit * value) for value in chroma)]
 
 
-def write_colour(path: Path, kind: str, true: Colours, header: Colours, container: Colours, height: int = 96) -> None:
-    """Write three frames of `COLOUR` in the colours `true`, whose header and container state something else."""
+def write_color(path: Path, kind: str, true: Colors, header: Colors, container: Colors, height: int = 96) -> None:
+    """Write three frames of `COLOR` in the colours `true`, whose header and container state something else."""
     codec, pixels, options = KINDS[kind]
     with av.open(str(path), "w") as file:
         stream = file.add_stream(codec, rate=25, options=options)
         stream.width, stream.height, stream.pix_fmt = 96, height, pixels
         context = stream.codec_context
 
-        def state(target: av.VideoFrame | av.VideoCodecContext, colours: Colours) -> None:
-            target.color_trc, target.colorspace, target.color_range = colours
-            target.color_primaries = PRIMARIES[colours.matrix]
+        def state(target: av.VideoFrame | av.VideoCodecContext, colors: Colors) -> None:
+            target.color_trc, target.colorspace, target.color_range = colors
+            target.color_primaries = PRIMARIES[colors.matrix]
 
         state(context, header)
         wide = pixels.endswith("10le")
@@ -79,7 +79,7 @@ def write_colour(path: Path, kind: str, true: Colours, header: Colours, containe
 def error_of(path: Path) -> float:
     """Return the largest error of a level in the first picture."""
     _, picture = next(read_video_frames(path))
-    return float(np.abs(picture.reshape(-1, 3).mean(axis=0) - COLOUR).max())
+    return float(np.abs(picture.reshape(-1, 3).mean(axis=0) - COLOR).max())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -89,26 +89,26 @@ def error_of(path: Path) -> float:
     ids=["HLG", "PQ", "709 of 96 lines", "601 (PAL) of 720 lines", "601 (NTSC) of 720 lines"],
 )
 def test_tags_of_the_container_count_where_the_header_is_silent(kind, tags, height, tmp_path):
-    true = Colours(tags[0], tags[1], LIMITED)
-    write_colour(tmp_path / kind, kind, true, SILENT, true, height)
+    true = Colors(tags[0], tags[1], LIMITED)
+    write_color(tmp_path / kind, kind, true, SILENT, true, height)
     assert probe_video(tmp_path / kind).hdr == {PQ: "PQ", HLG: "HLG"}.get(true.transfer, "")
     assert error_of(tmp_path / kind) <= 4
 
 
 @pytest.mark.parametrize("kind", ["hevc.mp4", "hevc.mkv", "vp9.webm", "vp9.mp4", "h264.mp4", "ffv1.mkv", "prores.mkv"])
 def test_full_range_of_the_container_counts(kind, tmp_path):
-    true = Colours(1, 1, FULL)
-    write_colour(tmp_path / kind, kind, true, SILENT, true)
+    true = Colors(1, 1, FULL)
+    write_color(tmp_path / kind, kind, true, SILENT, true)
     assert error_of(tmp_path / kind) <= 4
     if not kind.endswith(".mp4"):  # FFmpeg writes no colours into .mov and .mp4 unless the matrix is among them
-        write_colour(tmp_path / kind, kind, Colours(1, 6, FULL), SILENT, Colours(2, 2, FULL))
+        write_color(tmp_path / kind, kind, Colors(1, 6, FULL), SILENT, Colors(2, 2, FULL))
         assert error_of(tmp_path / kind) <= 4
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_header_counts_before_the_container(kind, tmp_path):
-    true = Colours(HLG, 9, LIMITED)
-    write_colour(tmp_path / kind, kind, true, true, Colours(1, 1, LIMITED))
+    true = Colors(HLG, 9, LIMITED)
+    write_color(tmp_path / kind, kind, true, true, Colors(1, 1, LIMITED))
     if KINDS[kind][0] in ("libx264", "libx265", "prores_ks"):
         assert probe_video(tmp_path / kind).hdr == "HLG"
         assert error_of(tmp_path / kind) <= 4
@@ -119,19 +119,19 @@ def test_the_header_counts_before_the_container(kind, tmp_path):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("height", "matrix"), [(96, 6), (720, 1)])
 def test_without_any_tags_the_height_decides(kind, height, matrix, tmp_path):
-    write_colour(tmp_path / kind, kind, Colours(1, matrix, LIMITED), SILENT, SILENT, height)
+    write_color(tmp_path / kind, kind, Colors(1, matrix, LIMITED), SILENT, SILENT, height)
     assert probe_video(tmp_path / kind).hdr == ""
     assert error_of(tmp_path / kind) <= 4
     if Path(kind).suffix in (".mkv", ".webm"):
-        write_colour(tmp_path / kind, kind, Colours(HLG, 9, LIMITED), SILENT, Colours(HLG, 2, LIMITED), height)
+        write_color(tmp_path / kind, kind, Colors(HLG, 9, LIMITED), SILENT, Colors(HLG, 2, LIMITED), height)
         assert error_of(tmp_path / kind) <= 4, "HDR has the matrix of BT.2020"
 
 
 def test_zeros_in_the_header_of_prores_are_unknown(tmp_path):
     """ProRes writes 0 for unknown. FFmpeg takes a matrix of 0 as RGB."""
     path = tmp_path / "prores.mov"
-    true = Colours(1, 1, LIMITED)
-    write_colour(path, "prores.mov", true, SILENT, true)
+    true = Colors(1, 1, LIMITED)
+    write_color(path, "prores.mov", true, SILENT, true)
     data = path.read_bytes()
     assert data.count(b"icpf") == 3
     for place in (start for start in range(len(data)) if data.startswith(b"icpf", start)):
@@ -143,12 +143,12 @@ def test_zeros_in_the_header_of_prores_are_unknown(tmp_path):
     assert error_of(path) <= 4
 
 
-def test_a_file_that_plays_as_a_camera_has_the_same_colours(tmp_path):
+def test_a_file_that_plays_as_a_camera_has_the_same_colors(tmp_path):
     path = tmp_path / "prores.mov"
-    true = Colours(HLG, 9, LIMITED)
-    write_colour(path, "prores.mov", true, SILENT, true)
+    true = Colors(HLG, 9, LIMITED)
+    write_color(path, "prores.mov", true, SILENT, true)
     with LiveCamera(CameraName(str(path), "v4l2"), again=False) as camera:
         camera.start()
         frame = camera.newest(-1, 5.0)
     assert frame is not None
-    assert np.abs(frame.picture.reshape(-1, 3).mean(axis=0) - COLOUR).max() <= 4
+    assert np.abs(frame.picture.reshape(-1, 3).mean(axis=0) - COLOR).max() <= 4

@@ -1,9 +1,9 @@
 """Long hair behind a head: where it hangs beside the neck in the pictures, it hangs at the back as well.
 
 The front camera sees hair beside jaw and neck, as far as it stands out from the outline, and nothing of the back. A
-head whose hair ended at the hairline of the nape would lack much of its outline from aside. Long hair falls from where
-the head is widest, so behind the ears it is as far from the upright axis as it is above, down to the level to which it
-hangs at the sides.
+head whose hair ended at the hairline of the nape would lack much of its outline from the side. Long hair falls from
+where the head is widest, so behind the ears it is as far from the upright axis as it is above, down to the level to
+which it hangs at the sides.
 """
 
 import math
@@ -35,7 +35,7 @@ _CLEAR = 0.006
 
 
 @torch.no_grad()
-def hair_curtain(
+def back_hair(
     face_model: FaceModel,
     vertices: Float[Tensor, "v 3"],
     hair: Float[Tensor, " f"],
@@ -52,9 +52,9 @@ def hair_curtain(
         hanging: How far hair stands out beside skin and neck (`hanging_hair`), in metres.
     """
     middles, _, normals = triangle_geometry(vertices.detach().float(), face_model.faces.cpu())
-    parts, curtain = head_parts(face_model), torch.zeros_like(hair)
+    parts, behind_head = head_parts(face_model), torch.zeros_like(hair)
     if not bool(parts.scalp.any()) or not bool((hair > 0).any()):
-        return curtain
+        return behind_head
     scalp = middles[parts.scalp][:, [0, 2]]
     axis = (scalp.amin(0) + scalp.amax(0)) / 2
     flat, outwards = middles[:, [0, 2]] - axis, normals[:, [0, 2]]
@@ -65,7 +65,7 @@ def hair_curtain(
     beside = (angle.abs() - math.pi / 2).abs() < _BESIDE
     lowest = _lowest_level(beside, angle > 0, middles[:, 1], share, hanging, parts.scalp)
     if lowest is None:
-        return curtain
+        return behind_head
     behind = (parts.scalp | parts.neck | parts.skin) & (normals[:, 2] < _BEHIND) & (angle.abs() > math.pi / 2)
     behind &= middles[:, 1] >= lowest
     # The distance t along the normal to the wall of hair solves |flat + t outwards| = widest.
@@ -73,7 +73,7 @@ def hair_curtain(
     b, c = (flat * outwards).sum(1), flat.square().sum(1) - widest.square()
     distance = (-b + (b * b - a * c).clamp_min(0).sqrt()) / a
     useful = behind & (distance > hair) & (a > 0.25)
-    distance = torch.where(useful, distance, curtain).clamp(0, HIGHEST)
+    distance = torch.where(useful, distance, behind_head).clamp(0, HIGHEST)
     return distance * _above_cut(face_model, vertices, middles, distance[:, None] * normals)
 
 

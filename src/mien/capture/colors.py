@@ -4,7 +4,7 @@ A video states its colours in two places, the codec's header and the container, 
 the only module that chooses, for the report and for the pictures alike:
 
 1. The codec's header counts, as in FFmpeg's players, value by value.
-2. A value that the header leaves unspecified comes from the container: the `colr` box of .mov and .mp4, the `Colour`
+2. A value that the header leaves unspecified comes from the container: the `colr` box of .mov and .mp4, the `Color`
    element of .mkv and .webm. FFmpeg's decoders of ProRes, HEVC and VP9 forget those.
 3. Without either, HDR has the matrix of BT.2020, and other pictures BT.709 from 720 lines up and BT.601 below.
 
@@ -28,7 +28,7 @@ _UNKNOWN = (_UNSPECIFIED, 0, 3)
 _HIGH_DEFINITION_HEIGHT = 720
 
 
-class Colours(NamedTuple):
+class Colors(NamedTuple):
     """Codes of a picture's colours (ITU-T H.273), as FFmpeg numbers them."""
 
     transfer: int = _UNSPECIFIED
@@ -41,22 +41,22 @@ class Colours(NamedTuple):
         return _HDR_NAMES.get(self.transfer, "")
 
 
-UNSPECIFIED = Colours()
+UNSPECIFIED = Colors()
 
 
-def stated_colours(tagged: av.VideoFrame | VideoCodecContext) -> Colours:
+def stated_colors(tagged: av.VideoFrame | VideoCodecContext) -> Colors:
     """Return the tags of a frame or of a codec context."""
-    return Colours(int(tagged.color_trc), int(tagged.colorspace), int(tagged.color_range))
+    return Colors(int(tagged.color_trc), int(tagged.colorspace), int(tagged.color_range))
 
 
-def colours_of(frame: av.VideoFrame, container: Colours) -> Colours:
+def colors_of(frame: av.VideoFrame, container: Colors) -> Colors:
     """Return the colours of a decoded frame whose container states `container`. The matrix is always specified."""
-    header = stated_colours(frame)
+    header = stated_colors(frame)
     if header.matrix == _RGB and frame.format.is_rgb:
         return header
     is_silent = header.matrix in _UNKNOWN
     takes_range = header.range == ColorRange.UNSPECIFIED or (is_silent and container.range == ColorRange.JPEG)
-    known = Colours(
+    known = Colors(
         transfer=container.transfer if header.transfer in _UNKNOWN else header.transfer,
         matrix=container.matrix if is_silent else header.matrix,
         range=container.range if takes_range else header.range,
@@ -64,8 +64,8 @@ def colours_of(frame: av.VideoFrame, container: Colours) -> Colours:
     return known._replace(matrix=_guessed_matrix(known, frame.height)) if known.matrix in _UNKNOWN else known
 
 
-def _guessed_matrix(colours: Colours, height: int) -> int:
-    if colours.hdr:
+def _guessed_matrix(colors: Colors, height: int) -> int:
+    if colors.hdr:
         return Colorspace.BT2020
     # Players assume BT.709 from 720 lines up and BT.601 below if a file does not name its matrix.
     return Colorspace.ITU709 if height >= _HIGH_DEFINITION_HEIGHT else Colorspace.ITU601
