@@ -61,7 +61,7 @@ class TrainSettings:
     inside: Literal["free", "covered", "filled"] = "free"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
-    each step, so that lids and lips become opaque. Furnished: also, a mouth that is hardly ever seen gets a surface in
+    each step, so that lids and lips become opaque. Filled: also, a mouth that is hardly ever seen gets a surface in
     dark colours at half of the run, which can show as dark spots on cheeks from the side. Methods that bind no
     Gaussians to triangles have no such Gaussians."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0

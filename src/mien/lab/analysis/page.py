@@ -35,7 +35,7 @@ def write_page(path: Path, analysis: Analysis, content: Mapping[str, Any]) -> No
         if part.name in content["parts"]
     ]
     text = render(
-        "analysis/templates/analysis.html",
+        "lab/analysis/templates/analysis.html",
         title=f"{content['run']} · {analysis.method}",
         paper=content["paper"],
         version=content["mien"],
@@ -48,7 +48,7 @@ def write_page(path: Path, analysis: Analysis, content: Mapping[str, Any]) -> No
 def section_html(title: str, part: Mapping[str, Any], folder: Path) -> Markup:
     """The section of a part, from its content in analysis.json and the pictures and films in `folder`."""
     return render(
-        "analysis/templates/section.html",
+        "lab/analysis/templates/section.html",
         title=title,
         findings=part["findings"],
         tables=[_table(table) for table in part["tables"]],
