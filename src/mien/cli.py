@@ -34,7 +34,7 @@ COMMANDS = {
     "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
     "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
     "export": "avatar -> .mien (runs without torch), .html, .glb, Gaussians in a pose, or GaussianAvatars' folder",
-    "import": "GaussianAvatars' folder -> an avatar that can be rendered, driven and exported",
+    "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
     "face-models": "list the face models and bake them ahead of time",
     "bench": "speed of this machine; quality on reference captures with known truth",
     "demo": "the whole path on a synthetic head, in minutes: start here",

@@ -25,7 +25,15 @@ if TYPE_CHECKING:
     from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
     from mien.avatar.headgas.avatar import HeadGas
     from mien.avatar.headgas.settings import HeadGasConfig
-    from mien.avatar.methods import DEFAULT_METHOD, METHODS, Method, method_named, method_of
+    from mien.avatar.methods import (
+        DEFAULT_METHOD,
+        METHODS,
+        Method,
+        has_method,
+        method_named,
+        method_names,
+        method_of,
+    )
     from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
     from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
     from mien.avatar.ops.activation import sigmoid
@@ -78,10 +86,12 @@ __all__ = [
     "RefillSettings",
     "as_array",
     "bake_rig",
+    "has_method",
     "load_avatar",
     "make_portable",
     "measure_filmed",
     "method_named",
+    "method_names",
     "method_of",
     "move_avatar",
     "network_group",

@@ -1,16 +1,19 @@
 """The list of methods. A new method adds one line here (CONTRIBUTING.md, "Add a method").
 
+Other packages add methods by entry points of the group `mien.methods`.
+
 This file needs no torch, because the command line lists the methods' settings and checks them.
 """
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 from mien.avatar.settings import MethodConfig
 from mien.errors import UserError
+from mien.plugins import plugin, plugin_names, plugins
 
 if TYPE_CHECKING:
     from mien.avatar.avatar import Avatar
@@ -60,24 +63,47 @@ METHODS = {
         "mien.avatar.mono_gaussian_avatar.avatar:MonoGaussianAvatar", "mien.avatar.mono_gaussian_avatar.settings"
     ),
 }
-"""All methods by name. A method whose settings import torch comes last: looking for the method of a config goes
+"""Mien's own methods by name. A method whose settings import torch comes last: looking for the method of a config goes
 through the settings in this order."""
 
 DEFAULT_METHOD = "gaussian_avatars"
 """Method of a run that names none."""
 
 
+_GROUP = "mien.methods"
+"""Group of entry points of other packages. It takes 30 ms to read, and commands that name one of mien's own methods do
+not read it."""
+
+
+def method_names() -> list[str]:
+    """The names of all methods: mien's own, then those that other packages add. None of these is imported."""
+    return [*METHODS, *(name for name in plugin_names(_GROUP) if name not in METHODS)]
+
+
+def has_method(name: str) -> bool:
+    """Whether there is a method of a name. Other packages are asked only if it is none of mien's own."""
+    return name in METHODS or name in plugin_names(_GROUP)
+
+
 def method_named(name: str) -> Method:
-    """The method of a name.
+    """The method of a name. Other packages are asked only if it is none of mien's own.
 
     Raises:
-        UserError: there is no method of that name.
+        UserError: there is no method of that name, or that of another package cannot be imported.
     """
-    if name not in METHODS:
-        raise UserError(f"no method {name!r}; the methods are {', '.join(METHODS)}")
-    return METHODS[name]
+    method = METHODS.get(name) or plugin(_GROUP, name, Method)
+    if method is None:
+        names = ", ".join(method_names())
+        raise UserError(f"no method {name!r}; give one of {names}, or install the package that adds it")
+    return method
 
 
 def method_of(config: MethodConfig) -> str:
     """The name of the method that a config belongs to."""
-    return next(name for name, method in METHODS.items() if method.config is type(config))
+    return next(name for name, method in _all_methods() if method.config is type(config))
+
+
+def _all_methods() -> Iterator[tuple[str, Method]]:
+    """Yield mien's own methods, then those of other packages, which are imported only if the loop comes to them."""
+    yield from METHODS.items()
+    yield from plugins(_GROUP, Method).items()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mien.avatar import DEFAULT_METHOD, METHODS
-from mien.commands.options import MethodName, PresetName
+from mien.commands.options import PresetName, check_method, listed_methods
 from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
 from mien.terminal import show
@@ -139,8 +139,7 @@ class Quality:
 
     captures: tuple[CaptureName, ...] = ()
     """Names of reference captures (default: all but ring-16-large, which takes hours)."""
-    method: MethodName = DEFAULT_METHOD
-    """Method of the avatars."""
+    method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
     steps: int = 0
     """Number of optimiser steps. 0 means each capture's own number."""
     out: Path = Path("out/bench-quality")
@@ -149,7 +148,8 @@ class Quality:
     """Print all rows as json, for programs."""
 
     def check(self) -> None:
-        """Check that the number of steps is not negative."""
+        """Check that there is such a method, and that the number of steps is not negative."""
+        check_method("--method", self.method)
         if self.steps < 0:
             raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own number")
 
@@ -173,8 +173,7 @@ class Compare:
     """Tracked workspaces."""
     captures: tuple[CaptureName, ...] = ()
     """Reference captures as well. They are drawn, captured and tracked in --out first."""
-    methods: tuple[MethodName, ...] = tuple(METHODS)
-    """Methods to compare."""
+    methods: Annotated[tuple[str, ...], listed_methods("Methods to compare")] = tuple(METHODS)
     minutes: float = 0.0
     """Minutes of training for each method on each capture. Trials on this machine, which take a tenth more, turn them
     into steps. 0 means --steps."""
@@ -206,6 +205,7 @@ class Compare:
         if not self.methods:
             raise UserError("--methods: give at least one method")
         for method in self.methods:
+            check_method("--methods", method)
             PRESETS[self.preset].config(method)
         roots = [folder.resolve() for folder in self.workspaces]
         names = [root.name for root in roots] + list(self.captures)

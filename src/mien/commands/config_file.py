@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mien.avatar import METHODS
+from mien.avatar import has_method, method_names
 from mien.bounded import parse_json, read_bytes
 from mien.config import no_such_setting
 from mien.errors import UserError
@@ -56,8 +56,8 @@ def read_config_file(path: Path) -> ConfigFile:
         if not isinstance(part, dict):
             raise UserError(f"{path}: {name} is not an object of settings; give {{...}}")
     method = parts["method"].get("kind")
-    if method is not None and (not isinstance(method, str) or method not in METHODS):
-        raise UserError(f"{path}: method.kind {shown(method)}: give the name of a method: {', '.join(METHODS)}")
+    if method is not None and (not isinstance(method, str) or not has_method(method)):
+        raise UserError(f"{path}: method.kind {shown(method)}: give the name of a method: {', '.join(method_names())}")
     changes = {name: value for name, value in parts["method"].items() if name != "kind"}
     return ConfigFile(path, method, changes, parts["settings"], _sequences(content.get("data")))
 

@@ -1,14 +1,16 @@
 """`mien export`: avatars as files for other programs."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
+from mien.commands.help_text import Described
 from mien.commands.options import check_driver, check_neutral
 from mien.errors import UserError
-from mien.formats import Format, endings, find_format, format_of, formats, numbered
+from mien.formats import Format, Holds, endings, find_format, format_of, formats, numbered
 from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
@@ -22,20 +24,47 @@ _REFUSED = {
 """Messages for options that the format does not take."""
 
 
+def _about_workspace() -> str:
+    return (
+        f"Workspace folder. Also a {_any_of(e for f in formats() if f.reads_avatars for e in f.endings)} file, whose "
+        "avatar is written as another file, at rest."
+    )
+
+
+def _about_out() -> str:
+    held = {holds: [e for f in formats() if f.holds == holds for e in f.endings] for holds in get_args(Holds)}
+    return (
+        f"The file to write. A whole avatar is {_any_of(held['avatar'])}; Gaussians in a pose are "
+        f"{_any_of(held['pose'] + held['sequence'])}. With --series, {_any_of(held['pose'])} files get numbers: "
+        f"NAME_000000.ply; {_any_of(held['sequence'])} files have all frames. With --format "
+        f"{_any_of(_folders())}, a folder."
+    )
+
+
+def _about_format() -> str:
+    return (
+        f"Name of the format: {_any_of(each.name for each in formats())} (default: by the ending of --out). "
+        "gaussian-avatars is a folder with point_cloud.ply, whose Gaussians are bound to triangles, and "
+        "flame_param.npz with all timesteps of the run's training."
+    )
+
+
+def _any_of(words: Iterable[str]) -> str:
+    *others, last = words
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _folders() -> list[str]:
+    return [each.name for each in formats() if each.holds == "folder"]
+
+
 @dataclass(frozen=True)
 class Command:
     """Write an avatar: .mien (all of it), .html and .packed (for pages), .glb (for engines), a pose, or a folder."""
 
-    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Workspace folder. Also a .mien or .glb file, whose avatar becomes a .mien, a .html or .packed, or the pose at
-    rest."""
-    out: Path
-    """The file to write: .mien, .html, .packed, .glb, or Gaussians in a pose: .ply, .spz, .sog, .usd, .usda, .usdc or
-    .usdz. With --series, .ply, .spz and .sog files get numbers: NAME_000000.ply; a USD file has all frames. With
-    --format gaussian-avatars, a folder."""
-    format: str | None = None
-    """Format of the output (default: by the ending of --out), or gaussian-avatars: a folder with point_cloud.ply, whose
-    Gaussians are bound to triangles, and flame_param.npz with all timesteps of the run's training."""
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), Described(_about_workspace)]
+    out: Annotated[Path, Described(_about_out)]
+    format: Annotated[str | None, Described(_about_format)] = None
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
@@ -43,7 +72,7 @@ class Command:
     (default: the person's neutral)."""
     series: str | None = None
     """A motion: the name of a sequence of the workspace, or anything that `mien drive --by` takes. A page plays it. For
-    .ply, .spz and .sog, every frame becomes a file, and for USD a time sample; the head stays at the origin."""
+    Gaussians in a pose, every frame becomes a file, or a time sample of the file; the head stays at the origin."""
     neutral: str | None = None
     """With --series, the driver's face at rest, as for `mien drive`: first, calm, model, or a video, recording,
     workspace or sequence folder of the driver at rest."""
@@ -128,10 +157,10 @@ class Command:
         return kind
 
     def _unknown_ending(self) -> UserError:
-        *others, last = endings(only_from_files=self._is_file())
-        folder = "" if self._is_file() else ", or --format gaussian-avatars for a folder"
+        folder = "" if self._is_file() else f", or --format {_any_of(_folders())} for a folder"
         ending = self.out.suffix.lower() or "a file without ending"
-        return UserError(f"{self.out}: cannot write {ending}; use {', '.join(others)} or {last}{folder}")
+        use = _any_of(endings(only_from_files=self._is_file()))
+        return UserError(f"{self.out}: cannot write {ending}; use {use}{folder}")
 
     def _check_options(self, kind: Format) -> None:
         from mien.export.webcam import find_webcam_files

@@ -4,7 +4,7 @@ import ast
 import inspect
 import textwrap
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -14,6 +14,13 @@ _COMMON = {
     "tracking": ("focal", "same_camera", "schedule"),
 }
 """Common fields of each group of settings, by the prefix of the group's options."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """Mark of an option whose description is made when help is shown, because it lists what is registered."""
+
+    text: Callable[[], str]
 
 
 def without_details(command: type) -> tuple[type, list[str]]:
@@ -53,8 +60,10 @@ def readable(options: Any) -> Any:
     """
     import tyro
 
-    about = field_docs(options)
     hints = get_type_hints(options, include_extras=True)
+    about = dict(field_docs(options)) | {
+        name: mark.text() for name, hint in hints.items() for mark in _unwrapped(hint) if isinstance(mark, Described)
+    }
     changed: dict[str, Any] = {}
     defaults: dict[str, Any] = {}
     for one in fields(options):

@@ -1,4 +1,4 @@
-"""`mien import`: avatars that another program trained."""
+"""`mien import`: datasets and avatars of other programs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,41 +6,57 @@ from typing import Annotated
 
 import tyro
 
+from mien.commands.help_text import Described
 from mien.commands.stages.names import check_new_run, run_name
+from mien.datasets import Dataset, find_dataset, known_datasets, recognised
 from mien.errors import UserError
 from mien.workspace import Workspace, check_new_workspace
 
 
+def _about_path() -> str:
+    return f"The files of a dataset: {known_datasets()}."
+
+
 @dataclass(frozen=True)
 class Command:
-    """Make a run of GaussianAvatars' own folder (point_cloud.ply with binding_0, and flame_param.npz)."""
+    """Read the files of another program, and write its avatar as a run, or its sequences with their tracking."""
 
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-    """The folder with point_cloud.ply and flame_param.npz."""
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH"), Described(_about_path)]
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Workspace folder to put the run into. It is made if it is missing."""
-    name: Annotated[str, tyro.conf.arg(name="run")] = "gaussian_avatars"
-    """Name of the run."""
+    """Workspace folder to put the run or the sequences into. It is made if it is missing."""
+    name: Annotated[str | None, tyro.conf.arg(name="run")] = None
+    """Name of the run that an avatar becomes (default: the name of the dataset)."""
+    dataset: str | None = None
+    """Name of the dataset (default: it is recognised by its files)."""
     face_model: str | None = None
-    """The FLAME model of the avatar: its name among your face models, or a .npz or .pkl (added at its first use). It is
-    not needed for folders that `mien export` wrote with the face model inside."""
+    """The face model that the files belong to: its name among your face models, or a .npz or .pkl in FLAME's schema
+    (added at its first use). It is not needed for folders that `mien export` wrote with the face model inside."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        if not self.folder.is_dir():
-            raise UserError(f"{self.folder}: no such folder; give one with point_cloud.ply and flame_param.npz")
+        if not self.path.exists():
+            raise UserError(f"{self.path}: no such file or folder; give one of {known_datasets()}")
+        dataset, _ = self._found()
         check_new_workspace(self.out)
-        run_dir = Workspace(self.out).run_dir(run_name(self.name))
-        check_new_run(run_dir)
+        run = run_name(self._run(dataset))
+        if dataset.holds == "avatar":
+            check_new_run(Workspace(self.out).run_dir(run))
+        elif self.name is not None:
+            raise UserError(f"--run {self.name}: {dataset.name} holds sequences, which are no run; leave --run out")
 
     def run(self) -> None:
-        """Read the folder and write the run."""
-        from mien.commands.stages.importing import import_gaussian_avatars
+        """Read the files and write what they hold."""
+        from mien.commands.stages.importing import run_import_stage
         from mien.progress import say
-        from mien.terminal import counted
 
-        run_dir = Workspace(self.out).run_dir(self.name)
-        content = import_gaussian_avatars(self.folder, run_dir, self.face_model)
-        count = len(content.avatar.gaussian_store())
-        timesteps = counted(len(content.face), "timestep")
-        say(f"{run_dir}: {counted(count, 'Gaussian')} on {content.avatar.face_model.name}, {timesteps}")
+        dataset, told = self._found()
+        if told is not None:
+            say(f"{self.path}: {told}")
+        run_import_stage(dataset, self.path, Workspace(self.out), self._run(dataset), self.face_model)
+
+    def _found(self) -> tuple[Dataset, str | None]:
+        """The dataset, and what it found; None if the user names the dataset."""
+        return recognised(self.path) if self.dataset is None else (find_dataset(self.dataset), None)
+
+    def _run(self, dataset: Dataset) -> str:
+        return dataset.name.replace("-", "_") if self.name is None else self.name

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 
 import tyro
 
-from mien.avatar import DEFAULT_METHOD, METHODS, MethodConfig
+from mien.avatar import DEFAULT_METHOD, MethodConfig, has_method, method_names
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.config_file import ConfigFile, read_config_file
-from mien.commands.help_text import subclass_with
+from mien.commands.help_text import Described, subclass_with
 from mien.commands.settings_options import apply_options, check_names, leaves, options_type
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
@@ -21,10 +21,8 @@ from mien.training import MAIN_SETTINGS, NAMED_SPLIT, PRESETS, Split, TrainSetti
 from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
-    MethodName = str
     PresetName = str
 else:
-    MethodName = Literal[tuple(METHODS)]
     PresetName = Literal[tuple(PRESETS)]
 
 NEUTRALS = ("first", "calm", "model")
@@ -34,12 +32,16 @@ _IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
 """Options that depend on the method. `with_settings` fills them in."""
 
 
+def listed_methods(about: str) -> Described:
+    """A mark that describes an option by `about` and the names of all methods, also those of other packages."""
+    return Described(lambda: f"{about}: {', '.join(method_names())} (compared in docs/results.md).")
+
+
 @dataclass(frozen=True)
 class TrainOptions:
     """The main options of training. All other settings come from the preset, the file and the method."""
 
-    method: MethodName = DEFAULT_METHOD
-    """Method that makes the avatar (compared in docs/results.md)."""
+    method: Annotated[str, listed_methods("Method that makes the avatar")] = DEFAULT_METHOD
     config: Path | None = None
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""
@@ -153,8 +155,10 @@ def with_settings(command: type, arguments: Sequence[str]) -> type:
     """
     name = training_options(command)
     chosen = _chosen(arguments)
-    if name is None or chosen.method not in (None, *METHODS) or chosen.preset not in (None, *PRESETS):
-        return command  # tyro reports the wrong names
+    if name is None or chosen.preset not in (None, *PRESETS):
+        return command  # tyro reports the wrong name
+    if chosen.method is not None:
+        check_method("--method", chosen.method)
     file = read_config_file(Path(chosen.config)) if chosen.config is not None else None
     options = _with_defaults(chosen.method, chosen.preset or TrainOptions.preset, file, arguments)
     hint = get_type_hints(command, include_extras=True)[name]
@@ -166,8 +170,8 @@ def settings_groups(command: type, arguments: Sequence[str]) -> tuple[list[str],
     """The prefixes of the options that `with_settings` adds to a command, and the words to type to see them."""
     if training_options(command) is None:
         return [], ""
-    method = _chosen(arguments).method
-    return ["training", "method"], f" --method {method if method in METHODS else TrainOptions.method}"
+    method = _chosen(arguments).method or TrainOptions.method
+    return ["training", "method"], f" --method {method if has_method(method) else TrainOptions.method}"
 
 
 def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arguments: Sequence[str]) -> type:
@@ -193,7 +197,7 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
     dials |= {"method": name, "face_tuning": config.face_tuning.enabled}
     if file and "steps" in file.settings_changes:
         dials["steps"] = settings.steps
-    hints = get_type_hints(TrainOptions, include_extras=True) | {"method": Literal[tuple(METHODS)]}
+    hints = get_type_hints(TrainOptions, include_extras=True)
     defaults = {dial: field(default=value) for dial, value in dials.items()}
     defaults |= {group: field(default_factory=kind) for group, kind in in_detail.items()}
     return subclass_with(TrainOptions, {dial: hints[dial] for dial in dials} | in_detail, defaults)
@@ -205,6 +209,17 @@ def _chosen(arguments: Sequence[str]) -> argparse.Namespace:
     for name in ("method", "preset", "config"):
         parser.add_argument(f"--{name}", nargs="?")
     return parser.parse_known_args(list(arguments))[0]
+
+
+def check_method(option: str, name: str) -> None:
+    """Check that there is a method of a name.
+
+    Raises:
+        UserError: there is none.
+    """
+    if not has_method(name):
+        names = ", ".join(method_names())
+        raise UserError(f"{option}: give one of {names} instead of {name!r}, or install the package that adds it")
 
 
 def check_avatar(avatar: Path, run: str | None) -> None:

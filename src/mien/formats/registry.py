@@ -5,7 +5,6 @@ Other packages add formats by entry points of the group `mien.formats`.
 
 from pathlib import Path
 
-from mien.errors import UserError
 from mien.formats.format import Format
 from mien.formats.gaussian_avatars import GAUSSIAN_AVATARS
 from mien.formats.glb import GLB
@@ -15,7 +14,7 @@ from mien.formats.ply import PLY
 from mien.formats.sog import SOG
 from mien.formats.spz import SPZ
 from mien.formats.usd import USD
-from mien.plugins import plugins
+from mien.plugins import with_plugins
 
 _OWN = (MIEN, PAGE, PACKED, GLB, PLY, SPZ, SOG, USD, GAUSSIAN_AVATARS)
 
@@ -26,13 +25,7 @@ def formats() -> list[Format]:
     Raises:
         UserError: a format of another package cannot be imported, or has the name or an ending of one before it.
     """
-    found: list[Format] = list(_OWN)
-    for name, added in plugins("mien.formats", Format).items():
-        taken = {word for each in found for word in (each.name, *each.endings)}
-        if clash := taken & {added.name, *added.endings}:
-            raise UserError(f"the format {name!r}: {min(clash)} is taken by another format; uninstall its package")
-        found.append(added)
-    return found
+    return with_plugins("mien.formats", Format, _OWN, lambda each: (each.name, *each.endings))
 
 
 def endings(only_from_files: bool = False) -> list[str]:

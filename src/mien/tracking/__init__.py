@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
     from mien.tracking.fitting import has_enough_faces
     from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
+    from mien.tracking.neck_line import fit_neck_lines
     from mien.tracking.pipeline import track, track_subject
     from mien.tracking.report import (
         frontal_camera,
@@ -35,6 +36,7 @@ __all__ = [
     "TrackingSettings",
     "check_tracking_of",
     "fit_neck_cut",
+    "fit_neck_lines",
     "frontal_camera",
     "has_enough_faces",
     "head_crop",

@@ -1,6 +1,7 @@
-"""From another program's avatar to a run of a workspace."""
+"""From the files of other programs to runs and sequences of a workspace."""
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -8,12 +9,15 @@ import torch
 from mien.avatar import Avatar
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.commands.stages.face_models import face_model_of
-from mien.commands.stages.names import check_new_run
-from mien.export import GaussianAvatarsFolder, read_gaussian_avatars_folder
+from mien.commands.stages.names import check_new_run, check_new_sequence
+from mien.datasets import Dataset, TrackedSequence, TrainedAvatar, write_sequence
 from mien.inside import remove_tree
 from mien.locks import check_free, hold
+from mien.progress import say
+from mien.terminal import counted
 from mien.training import write_imported_run
 from mien.training.run import BUSY_REMEDY
+from mien.workspace import Workspace
 
 _DISTANCE = 1.2
 """Distance of the camera from the middle of the head, in metres."""
@@ -22,28 +26,55 @@ _MARGIN = 1.15
 """Size of the picture relative to the largest extent of the head's mesh."""
 
 
-def import_gaussian_avatars(folder: Path, run_dir: Path, face_model: str | None) -> GaussianAvatarsFolder:
-    """Read GaussianAvatars' folder and write it as a run.
+def run_import_stage(dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None) -> None:
+    """Read a dataset, and write its avatar as a run, or its sequences.
 
     Args:
-        folder: The folder.
-        run_dir: The run's folder, which must be missing.
-        face_model: Name or file of its FLAME model, unless the folder has a face model in it.
+        dataset: The dataset.
+        path: Its files.
+        workspace: The workspace.
+        run: Name of the run that an avatar becomes.
+        face_model: Name or file of the face model that the files belong to, if the user gives one.
 
     Raises:
-        UserError: the folder or the face model cannot be read, or the run cannot be written.
-        BeingWrittenError: another process is writing the run.
+        UserError: the files or the face model cannot be read, or the run or a sequence is there already or cannot be
+            written. Sequences before that one stay.
+        BeingWrittenError: another process is writing the run or the sequence.
     """
-    check_free(run_dir, BUSY_REMEDY)
-    content = read_gaussian_avatars_folder(folder, None if face_model is None else face_model_of(face_model))
+    run_dir = workspace.run_dir(run)
+    if dataset.holds == "avatar":
+        check_free(run_dir, BUSY_REMEDY)
+    content = dataset.read(path, None if face_model is None else face_model_of(face_model))
+    if isinstance(content, TrainedAvatar):
+        _write_run(content, run_dir, path)
+    else:
+        _write_sequences(content, workspace, dataset, path)
+
+
+def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
+    avatar, face = content.avatar, content.face
     with hold(run_dir, remedy=BUSY_REMEDY):
         check_new_run(run_dir)  # another process may have written it meanwhile
         try:
-            write_imported_run(run_dir, content.avatar, content.face, front_camera(content.avatar), folder)
+            write_imported_run(run_dir, avatar, face, front_camera(avatar), source)
         except BaseException:
             remove_tree(run_dir)
             raise
-    return content
+    count = counted(len(avatar.gaussian_store()), "Gaussian")
+    say(f"{run_dir}: {count} on {avatar.face_model.name}, {counted(len(face), 'timestep')}")
+
+
+def _write_sequences(
+    sequences: Iterable[TrackedSequence], workspace: Workspace, dataset: Dataset, source: Path
+) -> None:
+    for sequence in sequences:
+        capture = sequence.capture
+        folder = workspace.sequence_dir(capture.name)
+        with hold(folder):
+            check_new_sequence(folder)
+            write_sequence(folder, sequence, dataset, source)
+        cameras = counted(len(capture.camera_ids), "camera")
+        say(f"{folder}: {counted(capture.timesteps, 'timestep')}, {cameras}, tracked on {sequence.face_model.name}")
 
 
 @torch.no_grad()

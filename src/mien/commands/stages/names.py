@@ -33,6 +33,16 @@ def check_new_run(run_dir: Path) -> None:
         raise UserError(f"{run_dir}: is there already; give the imported run another name (--run NAME)")
 
 
+def check_new_sequence(folder: Path) -> None:
+    """Check that there is no sequence of this name yet.
+
+    Raises:
+        UserError: there is one.
+    """
+    if folder.exists():
+        raise UserError(f"{folder}: is there already; delete it to import it again, or import into another workspace")
+
+
 def run_name(name: str) -> str:
     """`name`, if a folder can have it.
 

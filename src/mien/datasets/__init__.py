@@ -1,0 +1,29 @@
+"""Datasets: folders of other programs and laboratories, each with the file that recognises and reads it.
+
+`registry` lists them and `dataset` says what one is. `sequences` makes what a reader returns, and `writing` puts that
+into a workspace.
+"""
+
+from typing import TYPE_CHECKING
+
+from mien.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mien.datasets.dataset import Dataset, TrackedSequence, TrainedAvatar
+    from mien.datasets.registry import datasets, find_dataset, known_datasets, recognised
+    from mien.datasets.sequences import tracked_sequence
+    from mien.datasets.writing import write_sequence
+else:
+    __getattr__, __dir__ = lazy_names(__name__, __file__)
+
+__all__ = [
+    "Dataset",
+    "TrackedSequence",
+    "TrainedAvatar",
+    "datasets",
+    "find_dataset",
+    "known_datasets",
+    "recognised",
+    "tracked_sequence",
+    "write_sequence",
+]

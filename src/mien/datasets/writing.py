@@ -1,0 +1,58 @@
+"""From what a dataset's reader returns to a folder of a workspace, with scoring masks and fingerprints."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from mien.capture import write_capture
+from mien.datasets.dataset import Dataset, TrackedSequence
+from mien.errors import UserError
+from mien.face.checks import check_face_params
+from mien.inside import remove_tree
+from mien.storage import replace_folder
+from mien.tracking import make_scoring, write_scoring, write_tracking
+from mien.training import read_sequence
+
+_REMEDY = "check the files of the dataset"
+
+
+def write_sequence(folder: Path, sequence: TrackedSequence, dataset: Dataset, source: Path) -> None:
+    """Write a sequence as `mien capture` and `mien track` leave one: capture/, tracking/ and scoring/.
+
+    The folder appears as a whole, after its files were read back.
+
+    Args:
+        folder: The sequence's folder, which is missing.
+        sequence: The sequence.
+        dataset: The dataset that it comes from.
+        source: The place that it was read from.
+
+    Raises:
+        UserError: numbers of the dataset cannot be used, or a file cannot be written. Nothing is left then.
+    """
+    partial = folder.with_name(f".{folder.name}.partial")
+    remove_tree(partial)
+    try:
+        _write_into(partial, sequence, dataset, source)
+        try:
+            read_sequence(partial)
+        except UserError as error:
+            fault = str(error).partition(": ")[2].split("; ")[0]  # without the path of a file that nobody will find
+            raise UserError(f"{source} ({folder.name}): {fault}; {_REMEDY}") from None
+        replace_folder(folder, partial)
+    except BaseException:
+        remove_tree(partial)
+        raise
+
+
+def _write_into(folder: Path, sequence: TrackedSequence, dataset: Dataset, source: Path) -> None:
+    capture, tracking, face_model = sequence.capture, sequence.tracking, sequence.face_model
+    check_face_params(face_model, tracking.face, f"{source} ({capture.name})", _REMEDY)
+    capture_hash = write_capture(folder / "capture", capture)
+    imported = {"dataset": dataset.name, "from": str(source.absolute())}
+    content = json.dumps([imported["dataset"], capture_hash, face_model.name, face_model.content_hash])
+    fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]
+    settings = {**tracking.settings, "imported": imported, "fingerprint": fingerprint}
+    write_tracking(folder / "tracking", replace(tracking, settings=settings))
+    write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model, scratch=folder), capture_hash)
