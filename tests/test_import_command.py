@@ -75,8 +75,15 @@ def test_it_is_exported_again(made: Path, tmp_path: Path) -> None:
 
 def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, out = str(made / "F"), str(tmp_path / "N")
-    refused(["import", str(tmp_path / "gone"), "--out", out], "no such folder", capsys)
-    refused(["import", str(made / "W"), "--out", out], "has no point_cloud.ply", capsys)
+    refused(
+        ["import", str(tmp_path / "gone"), "--out", out],
+        "no such file or folder; give one of gaussian-avatars (",
+        capsys,
+    )
+    refused(["import", str(made / "W"), "--out", out], "is no dataset that mien knows; give one of gaus", capsys)
+    named = ["--dataset", "gaussian-avatars"]
+    refused(["import", str(made / "W"), "--out", out, *named], "has no point_cloud.ply", capsys)
+    refused(["import", folder, "--out", out, "--dataset", "nobody"], "there is no such dataset; choose one of", capsys)
     refused(["import", folder, "--out", str(made / "I")], "is there already; give the imported run", capsys)
     refused(["import", folder, "--out", out, "--run", "a/b"], "cannot be the name", capsys)
     refused(["import", folder, "--out", out, "--face-model", "gone"], "no face model 'gone'", capsys)

@@ -1,7 +1,7 @@
 """Datasets: folders of other programs and laboratories, each with the file that recognises and reads it.
 
-`registry` lists them and `dataset` says what one is. `sequences` makes what a reader returns, and `writing` puts that
-into a workspace.
+`registry` lists them and `dataset` says what one is. Readers use `arrays`, and `sequences` makes what they return.
+`writing` puts that into a workspace.
 """
 
 from typing import TYPE_CHECKING
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.datasets.arrays import read_arrays
     from mien.datasets.dataset import Dataset, TrackedSequence, TrainedAvatar
     from mien.datasets.registry import datasets, find_dataset, known_datasets, recognised
     from mien.datasets.sequences import tracked_sequence
@@ -23,6 +24,7 @@ __all__ = [
     "datasets",
     "find_dataset",
     "known_datasets",
+    "read_arrays",
     "recognised",
     "tracked_sequence",
     "write_sequence",

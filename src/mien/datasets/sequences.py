@@ -1,7 +1,7 @@
 """What a reader of sequences returns, made from the parts that datasets have: pictures, cameras, face parameters."""
 
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,17 +9,23 @@ from jaxtyping import Float, UInt8
 
 from mien.camera import Camera
 from mien.capture import Capture
+from mien.datasets.arrays import REMEDY
 from mien.datasets.dataset import TrackedSequence
+from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
+from mien.face.checks import check_face_params
+from mien.limits import camera_fault
 from mien.tracking import Tracking, fit_neck_lines
 
 _LANDMARKS = "mediapipe"
 _CHUNK = 32
 """Number of timesteps posed at once."""
+_MAX_FPS = 10_000
 
 
 @torch.no_grad()
 def tracked_sequence(
+    path: Path,
     name: str,
     images: UInt8[np.ndarray, "t c h w 3"],
     mattes: UInt8[np.ndarray, "t c h w"],
@@ -27,24 +33,35 @@ def tracked_sequence(
     face_model: FaceModel,
     face: FaceParams,
     fps: float,
-    source: Mapping[str, Any],
 ) -> TrackedSequence:
     """Return a sequence whose every frame is tracked.
 
     Landmarks are those of the face model, projected, because no dataset has the points of mien's detector. Residuals
-    are therefore 0, and training and scoring do not read landmarks.
+    are therefore 0. Training and scoring do not read landmarks.
 
     Args:
+        path: The file or folder that it was read from.
         name: Name of the sequence.
         images: Decoded sRGB pixels. They may be a memory map.
         mattes: Opacity of the person; 255 is the person.
         cameras: Each camera by its id, in the order of the axis c, in one world, for pictures of this size.
-        face_model: The face model of the parameters.
+        face_model: The face model of the parameters. It needs the landmarks of mien's detector.
         face: The person at the t timesteps, in the cameras' world.
         fps: Frames per second.
-        source: What the sequence was read from, for people: the file, and what the dataset says of itself.
+
+    Raises:
+        UserError: a number is NaN or infinite or out of range, or belongs to another face model. It names the path.
     """
-    views, frames = tuple(cameras.values()), mattes.shape[:2]
+    views = tuple(cameras.values())
+    for camera_id, camera in cameras.items():
+        fault = camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
+        if fault is not None:
+            raise UserError(f"{path}: camera {camera_id!r} is not valid ({fault}); {REMEDY}")
+    check_face_params(face_model, face, str(path), REMEDY)
+    if not 0 < fps <= _MAX_FPS:
+        raise UserError(f"{path}: has {fps:g} frames per second, not a number above 0 and at most {_MAX_FPS}; {REMEDY}")
+    if _LANDMARKS not in face_model.landmarks:
+        raise UserError(f"{path}: the face model {face_model.name!r} has no landmarks; add it with `mien face-models`")
     capture = Capture(
         name=name,
         camera_ids=tuple(cameras),
@@ -53,9 +70,9 @@ def tracked_sequence(
         images=images,
         mattes=mattes,
         landmarks=_landmarks(face_model, face, views),
-        valid=np.ones(frames, bool),
+        valid=np.ones(mattes.shape[:2], bool),
         principal_point=np.stack([camera.K[:2, 2].double().numpy() for camera in views]),
-        source=dict(source),
+        source={"file": path.name},
         calibration=views,
     )
     tracking = Tracking(
@@ -65,7 +82,7 @@ def tracked_sequence(
         valid=torch.ones(len(mattes), dtype=torch.bool),
         cameras=views,
         neck_lines=fit_neck_lines(face_model, face, views),
-        residuals=torch.zeros(frames),
+        residuals=torch.zeros(mattes.shape[:2]),
     )
     return TrackedSequence(capture, tracking, face_model)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mien.capture import write_capture
+from mien.datasets.arrays import REMEDY
 from mien.datasets.dataset import Dataset, TrackedSequence
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -13,8 +14,6 @@ from mien.inside import remove_tree
 from mien.storage import replace_folder
 from mien.tracking import make_scoring, write_scoring, write_tracking
 from mien.training import read_sequence
-
-_REMEDY = "check the files of the dataset"
 
 
 def write_sequence(folder: Path, sequence: TrackedSequence, dataset: Dataset, source: Path) -> None:
@@ -31,24 +30,24 @@ def write_sequence(folder: Path, sequence: TrackedSequence, dataset: Dataset, so
     Raises:
         UserError: numbers of the dataset cannot be used, or a file cannot be written. Nothing is left then.
     """
-    partial = folder.with_name(f".{folder.name}.partial")
-    remove_tree(partial)
+    aside = folder.with_name(f".{folder.name}.partial")
+    partial = aside / folder.name  # one level deeper than sequences, so that a killed import leaves none
+    remove_tree(aside)
     try:
         _write_into(partial, sequence, dataset, source)
         try:
             read_sequence(partial)
         except UserError as error:
             fault = str(error).partition(": ")[2].split("; ")[0]  # without the path of a file that nobody will find
-            raise UserError(f"{source} ({folder.name}): {fault}; {_REMEDY}") from None
+            raise UserError(f"{source} ({folder.name}): {fault}; {REMEDY}") from None
         replace_folder(folder, partial)
-    except BaseException:
-        remove_tree(partial)
-        raise
+    finally:
+        remove_tree(aside)
 
 
 def _write_into(folder: Path, sequence: TrackedSequence, dataset: Dataset, source: Path) -> None:
     capture, tracking, face_model = sequence.capture, sequence.tracking, sequence.face_model
-    check_face_params(face_model, tracking.face, f"{source} ({capture.name})", _REMEDY)
+    check_face_params(face_model, tracking.face, f"{source} ({capture.name})", REMEDY)
     capture_hash = write_capture(folder / "capture", capture)
     imported = {"dataset": dataset.name, "from": str(source.absolute())}
     content = json.dumps([imported["dataset"], capture_hash, face_model.name, face_model.content_hash])

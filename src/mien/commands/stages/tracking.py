@@ -175,6 +175,10 @@ def _current_trackings(
         return None if set(missing) & together else found
     if not tell:
         return None
+    imported = [name for name, tracking in found.items() if "imported" in tracking.settings]
+    if imported:
+        say(f"{', '.join(imported)}: came with a tracking of its dataset; mien's own takes its place")
+        return None
     added = [name for name in missing if name not in together]
     reason = f"{', '.join(added)} added" if added else "captures or settings changed"
     say(f"{reason}: all {len(names)} sequences are tracked again, so that they share one identity" if len(names) > 1

@@ -1,0 +1,43 @@
+"""Arrays in the files of strangers: nothing in them is run, their size is limited, and their shapes are checked."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mien.errors import UserError
+from mien.face.npz import read_npz
+
+REMEDY = "copy the files of the dataset again"
+
+
+def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Return arrays of an .npz by name. Floating point numbers become float32, and other types stay.
+
+    Args:
+        path: The file.
+        axes: A letter for each axis of each array, such as "thw3". Axes of one letter are equally long, and a digit is
+            a length.
+        sizes: Lengths that are known, by letter.
+
+    Raises:
+        UserError: the file is missing, damaged or too large, or an array is missing, is of another shape, or is empty.
+    """
+    try:
+        arrays = read_npz(path, tuple(axes))[1]
+    except FileNotFoundError:
+        raise UserError(f"{path}: is missing; {REMEDY}") from None
+    except Exception as error:  # a damaged archive may fail in any way
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: cannot be read as .npz ({reason}); {REMEDY}") from None
+    known = {**{str(digit): digit for digit in range(10)}, **sizes}
+    for name, letters in axes.items():
+        if name not in arrays:
+            raise UserError(f"{path}: has no {name!r}; {REMEDY}")
+        shape = arrays[name].shape
+        expected = [known.setdefault(letter, size) for letter, size in zip(letters, shape, strict=False)]
+        if len(letters) != len(shape) or list(shape) != expected or 0 in shape:
+            raise UserError(
+                f"{path}: {name!r} has the shape {list(shape)}, which is not [{', '.join(letters)}]; {REMEDY}"
+            )
+    return {name: each.astype(np.float32) if each.dtype.kind == "f" else each for name, each in arrays.items()}
