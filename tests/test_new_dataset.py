@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from mien.capture import read_capture_hash
-from mien.datasets import Dataset, datasets
+from mien.datasets import Dataset, TrackedSequence, datasets, write_sequence
+from mien.errors import UserError
 from mien.face import Landmarks, add_face_model
 from mien.plugins import plugins
 from mien.tracking import scoring_exists
@@ -105,10 +106,7 @@ FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], object], str]] = {
     "pickle": (lambda a: a.update(K=np.array([{}], object)), "'K': holds object, not plain numbers"),
     "nan": (lambda a: a.update(expression=np.full((5, 2), np.nan, np.float32)), "expression holds NaN"),
     "mirrored": (lambda a: a.update(K=a["K"] * [[-1], [1], [1]]), "camera '0' is not valid (focal lengths -40 and 36"),
-    "behind": (
-        lambda a: a.update(head_translation=np.float32([[0, 0, 0]] * 5), viewmat=np.eye(4)),
-        "landmarks holds impossible numbers",
-    ),
+    "behind": (lambda a: a.update(viewmat=np.eye(4)), "in frame 0 the head is behind every camera"),
 }
 
 
@@ -127,6 +125,19 @@ def test_damage_is_told_in_one_line_and_leaves_nothing(fault: str, tmp_path: Pat
     assert [each for each in out.rglob("*") if each.is_file() and not each.name.endswith(".lock")] == []
 
 
+def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
+    """The reader's own checks may be too few. Nothing is left, and the message names the place that was read."""
+    model, toy = toy_sequence(5, 32)
+    capture = replace(toy.capture, timestamps=toy.capture.timestamps[::-1].copy())
+    dataset = Dataset("toy", "a toy", "sequences", lambda path: None, lambda path, model: [])
+    folder = tmp_path / "sequences/clip"
+    with pytest.raises(UserError, match=r"^me \(clip\): timestamps holds impossible numbers; copy the files"):
+        write_sequence(folder, TrackedSequence(capture, toy.tracking, model), dataset, Path("me"))
+    assert list((tmp_path / "sequences").iterdir()) == []
+    write_sequence(folder, TrackedSequence(toy.capture, toy.tracking, model), dataset, Path("me"))
+    assert [path.name for path in (tmp_path / "sequences").iterdir()] == ["clip"]
+
+
 def test_what_is_not_recognised_is_told(tmp_path: Path) -> None:
     follow(tmp_path)
     (tmp_path / "a.txt").touch()
@@ -134,7 +145,7 @@ def test_what_is_not_recognised_is_told(tmp_path: Path) -> None:
     out = ("--out", str(tmp_path / "out"))
     unknown = mien(tmp_path, "import", str(tmp_path / "a.txt"), *out)
     assert unknown.returncode == 2
-    assert f"is no dataset that mien knows; give one of gaussian-avatars (" in unknown.stderr
+    assert "is no dataset that mien knows; give one of gaussian-avatars (" in unknown.stderr
     assert f"{WORD}9 (a .{WORD}9 file)" in unknown.stderr
     run = mien(tmp_path, "import", str(path), *out, "--run", "a")
     assert (run.returncode, "holds sequences, which are no run; leave --run out" in run.stderr) == (2, True)

@@ -50,8 +50,8 @@ class Command:
         from mien.progress import say
 
         dataset, told = self._found()
-        if told is not None:
-            say(f"{self.path}: {told}")
+        if told is not None and dataset.holds == "sequences":
+            say(f"{self.path}: {told}")  # before they are read, which takes long
         run_import_stage(dataset, self.path, Workspace(self.out), self._run(dataset), self.face_model)
 
     def _found(self) -> tuple[Dataset, str | None]:

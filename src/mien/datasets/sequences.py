@@ -50,7 +50,8 @@ def tracked_sequence(
         fps: Frames per second.
 
     Raises:
-        UserError: a number is NaN or infinite or out of range, or belongs to another face model. It names the path.
+        UserError: a number is NaN or infinite or out of range, or belongs to another face model, or the head is behind
+            all cameras, as with the axes of another convention. It names the path.
     """
     views = tuple(cameras.values())
     for camera_id, camera in cameras.items():
@@ -58,6 +59,10 @@ def tracked_sequence(
         if fault is not None:
             raise UserError(f"{path}: camera {camera_id!r} is not valid ({fault}); {REMEDY}")
     check_face_params(face_model, face, str(path), REMEDY)
+    depths = torch.stack([camera.project(face.head_translation)[1] for camera in views])
+    behind = (depths <= 0).all(0)
+    if behind.any():
+        raise UserError(f"{path}: in frame {int(behind.int().argmax())} the head is behind every camera; {REMEDY}")
     if not 0 < fps <= _MAX_FPS:
         raise UserError(f"{path}: has {fps:g} frames per second, not a number above 0 and at most {_MAX_FPS}; {REMEDY}")
     if _LANDMARKS not in face_model.landmarks:

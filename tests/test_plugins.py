@@ -1,0 +1,105 @@
+"""A package of a stranger adds a method, a format and a dataset, each by its recipe in CONTRIBUTING.md."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mien.avatar import METHODS, has_method, method_named, method_names
+from mien.avatar.methods import Method
+from mien.errors import UserError
+from mien.plugins import plugin, plugin_names
+from test_new_dataset import cache, puppet, write
+from toy_package import blocks, entry_points, install, mien
+
+__all__ = ["cache"]
+RECIPES = ("Add a method", "Add a format", "Add a dataset")
+
+
+def install_toys(folder: Path) -> None:
+    """Install `mien_toys`: what the three recipes make, in one module, under names that mien may not have."""
+    method = blocks(RECIPES[0], "python")[:-1]
+    (ending,) = re.findall(r"`(METHOD = [^`]*)`", " ".join(Path("CONTRIBUTING.md").read_text("utf-8").split()))
+    code = [
+        *method,
+        f"from mien.avatar import Method\n{ending}\n",
+        *(blocks(each, "python")[0] for each in RECIPES[1:]),
+    ]
+    points = re.sub(r"= mien_\w+:", "= mien_toys:", "".join(entry_points(each) for each in RECIPES))
+    for word in ("mesh_points", "xyz", "puppet"):
+        points = points.replace(f"{word} =", f"{word}9 =")
+    text = "\n".join(code).replace("mien_mesh_points:", "mien_toys:")
+    text = text.replace('"xyz"', '"xyz9"').replace('".xyz"', '".xyz9"').replace('"puppet"', '"puppet9"')
+    install(folder, "mien_toys", text.replace('".puppet"', '".puppet9"'), points)
+
+
+@pytest.mark.slow
+def test_one_package_adds_one_of_each(tmp_path: Path, cache: str) -> None:  # noqa: F811
+    """Footage is imported by its dataset, an avatar is trained by its method and exported in its format."""
+    install_toys(tmp_path)
+    out, me = str(tmp_path / "out"), tmp_path / "me.xyz9"
+    path = str(write(tmp_path / "me.puppet9", puppet()))
+    lines = (
+        ("import", path, "--out", out, "--face-model", "mine"),
+        ("train", out, "--method", "mesh_points9", "--method.start-scale", "0.01", "--steps", "2", "--split", "tail"),
+        ("export", out, "--out", str(me)),
+        ("export", out, "--out", str(tmp_path / "me.mien")),
+        ("export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "again.xyz9")),
+    )
+    for line in lines:
+        done = mien(tmp_path, *line, MIEN_CACHE=cache)
+        assert done.returncode == 0, done.stderr
+    assert len(me.read_text().splitlines()) == len(puppet_vertices())
+    assert (tmp_path / "again.xyz9").read_text() == me.read_text()
+    assert '"kind": "mesh_points9"' in (Path(out) / "runs/mesh_points9/avatar/avatar.json").read_text()
+    shown = mien(tmp_path, "train", "--help").stdout
+    assert "mono_gaussian_avatar, mesh_points9 (compared" in " ".join(shown.replace("\u2502", " ").split())
+    assert ".xyz9 files get numbers" in " ".join(
+        mien(tmp_path, "export", "--help").stdout.replace("\u2502", " ").split()
+    )
+    wrong = mien(tmp_path, "train", out, "--method", "nerf").stderr
+    assert "give one of gaussian_avatars, headgas, mono_gaussian_avatar, mesh_points9 instead of 'nerf'" in wrong
+    # Without the package, its avatar is refused with the remedy.
+    gone = mien(Path(out), "export", out, "--out", str(tmp_path / "b.ply"))
+    assert gone.returncode == 2
+    assert "no method 'mesh_points9'; give one of" in gone.stderr
+    assert "or install the package that adds it" in gone.stderr
+
+
+def puppet_vertices() -> list[int]:
+    from toy_scene import toy_face_model
+
+    return list(range(len(toy_face_model().template)))
+
+
+def test_methods_of_packages_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "from mien.avatar.methods import Method\nOWN = Method('nowhere:Toy')\nWRONG = 1\n"
+    points = "[mien.methods]\ntoy_a = mien_toys_a:OWN\nheadgas = mien_toys_a:OWN\nwrong = mien_toys_a:WRONG\n"
+    install(tmp_path, "mien_toys_a", code, points)
+    monkeypatch.syspath_prepend(tmp_path)
+    _forget()
+    try:
+        assert method_names() == [*METHODS, "toy_a", "wrong"]
+        assert has_method("toy_a")
+        assert not has_method("toy_b")
+        assert method_named("toy_a") == Method("nowhere:Toy")
+        assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
+        with pytest.raises(UserError, match="it is no Method; update or uninstall mien-toys-a"):
+            method_named("wrong")
+        with pytest.raises(UserError, match="no method 'toy_b'; give one of gaussian_avatars, .*, toy_a, wrong, or"):
+            method_named("toy_b")
+        install(tmp_path, "mien_toys_b", code, "[mien.methods]\ntoy_a = mien_toys_b:OWN\n")
+        _forget()
+        with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'toy_a' to mien.methods; uninstall"):
+            method_names()
+    finally:
+        _forget()
+
+
+def _forget() -> None:
+    """Read entry points again."""
+    from mien import plugins
+
+    plugin.cache_clear()
+    plugins._points.cache_clear()
+    assert plugin_names is plugins.plugin_names
