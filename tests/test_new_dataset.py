@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
 import torch
 
+from fuzzing import uses
 from mien.capture import read_capture_hash
 from mien.datasets import Dataset, TrackedSequence, datasets, write_sequence
 from mien.errors import UserError
@@ -136,6 +138,8 @@ def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
     assert list((tmp_path / "sequences").iterdir()) == []
     write_sequence(folder, TrackedSequence(toy.capture, toy.tracking, model), dataset, Path("me"))
     assert [path.name for path in (tmp_path / "sequences").iterdir()] == ["clip"]
+    uses.use_sequences(tmp_path, [TrackedSequence(toy.capture, toy.tracking, model)], Random(0))
+    assert (tmp_path / "I/sequences/toy/scoring/scoring.json").is_file()
 
 
 def test_what_is_not_recognised_is_told(tmp_path: Path) -> None:

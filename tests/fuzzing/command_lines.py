@@ -15,6 +15,7 @@ import tyro
 from fuzzing import faults
 from fuzzing.edges import PORT, TEXTS
 from fuzzing.faults import Place
+from mien.avatar import METHODS
 from mien.cli import COMMANDS
 
 BASES = (
@@ -66,6 +67,8 @@ _PATHS = (
     "o.html", "o", "o_%06d.png", "out/deep/o.png", "W/o.png", "head.ply/x.png", "/dev/full", "/proc/x.png",
     "outside_link/o.png",
 )  # fmt: skip
+_METHODS: dict[str, Any] = {"method": Literal[tuple(METHODS)], "methods": tuple[Literal[tuple(METHODS)], ...]}
+"""Options whose texts are names of methods. Their types do not say so, because other packages add methods."""
 _SURROUNDINGS: dict[str, dict[str, Any]] = {
     "LANG=C": {"env": {"LANG": "C", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}},
     "no HOME": {"without": ["HOME"]},
@@ -169,7 +172,7 @@ def _options(kind: type, prefix: str) -> Iterator[tuple[str, Any]]:
             for one in inner:
                 yield from _options(one, f"{prefix}{name}." if name else prefix)
         else:
-            yield f"--{prefix}{name}".replace("_", "-"), hint
+            yield f"--{prefix}{name}".replace("_", "-"), _METHODS.get(each.name, hint)
 
 
 def _with_value(option: tuple[str, Any], dice: Random) -> list[str]:

@@ -16,6 +16,7 @@ from mien.capture.crop import whole_picture
 from mien.capture.given import GivenMattes, read_landmarks
 from mien.capture.source import FrameSelection, open_source, read_image
 from mien.capture.video import count_frames, probe_video, read_video_frames
+from mien.datasets import TrainedAvatar, datasets, recognised
 from mien.driving import read_blendshape_json, read_live_link_face
 from mien.errors import UserError
 from mien.evaluation import read_metrics as read_figures
@@ -186,8 +187,13 @@ def read_analysis(root: Path, file: Path) -> Any:
     return run_analysis(GROWTH, GROWTH.parts, root / RUN, [root / SEQUENCE], root / ANALYSIS, options)["parts"]
 
 
-def read_gaussian_avatars(root: Path, file: Path) -> Any:
-    return read_gaussian_avatars_folder(file.parent)
+def read_dataset(root: Path, file: Path) -> Any:
+    """Return what the dataset holds that a file belongs to: an avatar, or a list of sequences."""
+    places = [path for path in (file, *file.parents) if root in path.parents]
+    known = [path for path in places if any(each.recognises(path) is not None for each in datasets())]
+    path = (known or places[-1:])[0]
+    found = recognised(path)[0].read(path, None)
+    return found if isinstance(found, TrainedAvatar) else list(found)
 
 
 def read_avatar_on_flame(root: Path, file: Path) -> Any:

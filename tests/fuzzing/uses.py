@@ -19,6 +19,7 @@ from mien import cli
 from mien.avatar import load_avatar
 from mien.avatar.baking import make_portable
 from mien.commands.stages.importing import front_camera
+from mien.datasets import datasets, write_sequence
 from mien.driving import Motion, drive
 from mien.errors import UserError
 from mien.evaluation import evaluate
@@ -35,6 +36,7 @@ from mien.render import rasterize
 from mien.runtime import Avatar, write_portable
 from mien.training import read_face_track, read_sequence, train, write_imported_run
 from mien.training.run import run_camera
+from mien.workspace import Workspace
 from toy_scene import toy_camera, toy_face_model
 
 
@@ -182,6 +184,16 @@ def use_gaussian_avatars(root: Path, found: Any, dice: Random) -> None:
         write_imported_run(root / "I/runs/a", found.avatar, found.face, camera, root / "gaussian_avatars")
         again = load_avatar(root / "I/runs/a")
         write_gaussian_avatars_folder(root / "again", again, read_face_track(root / "I/runs/a", again.face_model))
+
+
+def use_sequences(root: Path, found: Any, dice: Random) -> None:
+    """Write the sequences of a dataset as an import does, and read them as training does."""
+    workspace = Workspace(root / "I")
+    for sequence in found:
+        content.expect_finite(sequence.tracking)
+        folder = workspace.sequence_dir(sequence.capture.name)
+        write_sequence(folder, sequence, datasets()[0], root)
+        read_sequence(folder)
 
 
 LINES = (
