@@ -80,7 +80,7 @@ def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFix
         "no such file or folder; give one of gaussian-avatars (",
         capsys,
     )
-    refused(["import", str(made / "W"), "--out", out], "is no dataset that mien knows; give one of gaus", capsys)
+    refused(["import", str(made / "W"), "--out", out], "is no dataset that mien knows; give one of", capsys)
     named = ["--dataset", "gaussian-avatars"]
     refused(["import", str(made / "W"), "--out", out, *named], "has no point_cloud.ply", capsys)
     refused(["import", folder, "--out", out, "--dataset", "nobody"], "there is no such dataset; choose one of", capsys)

@@ -54,15 +54,7 @@ def tracked_sequence(
             all cameras, as with the axes of another convention. It names the path.
     """
     views = tuple(cameras.values())
-    for camera_id, camera in cameras.items():
-        fault = camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
-        if fault is not None:
-            raise UserError(f"{path}: camera {camera_id!r} is not valid ({fault}); {REMEDY}")
-    check_face_params(face_model, face, str(path), REMEDY)
-    depths = torch.stack([camera.project(face.head_translation)[1] for camera in views])
-    behind = (depths <= 0).all(0)
-    if behind.any():
-        raise UserError(f"{path}: in frame {int(behind.int().argmax())} the head is behind every camera; {REMEDY}")
+    _check_places(path, cameras, face_model, face)
     if not 0 < fps <= _MAX_FPS:
         raise UserError(f"{path}: has {fps:g} frames per second, not a number above 0 and at most {_MAX_FPS}; {REMEDY}")
     if _LANDMARKS not in face_model.landmarks:
@@ -90,6 +82,19 @@ def tracked_sequence(
         residuals=torch.zeros(mattes.shape[:2]),
     )
     return TrackedSequence(capture, tracking, face_model)
+
+
+def _check_places(path: Path, cameras: Mapping[str, Camera], face_model: FaceModel, face: FaceParams) -> None:
+    """Check cameras and face parameters, and that a camera sees the head at every timestep."""
+    for camera_id, camera in cameras.items():
+        fault = camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
+        if fault is not None:
+            raise UserError(f"{path}: camera {camera_id!r} is not valid ({fault}); {REMEDY}")
+    check_face_params(face_model, face, str(path), REMEDY)
+    depths = torch.stack([camera.project(face.head_translation)[1] for camera in cameras.values()])
+    behind = (depths <= 0).all(0)
+    if behind.any():
+        raise UserError(f"{path}: in frame {int(behind.int().argmax())} the head is behind every camera; {REMEDY}")
 
 
 def _landmarks(face_model: FaceModel, face: FaceParams, cameras: tuple[Camera, ...]) -> Float[np.ndarray, "t c l 2"]:
