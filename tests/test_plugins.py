@@ -7,6 +7,7 @@ import pytest
 
 from mien.avatar import METHODS, has_method, method_named, method_names
 from mien.avatar.methods import Method
+from mien.cli import main
 from mien.errors import UserError
 from mien.plugins import plugin, plugin_names
 from test_new_dataset import cache, puppet, write
@@ -34,6 +35,7 @@ def install_toys(folder: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)  # nine commands, each in a process of its own
 def test_one_package_adds_one_of_each(tmp_path: Path, cache: str) -> None:  # noqa: F811
     """Footage is imported by its dataset, an avatar is trained by its method and exported in its format."""
     install_toys(tmp_path)
@@ -94,6 +96,15 @@ def test_methods_of_packages_are_found_by_name(tmp_path: Path, monkeypatch: pyte
             method_names()
     finally:
         _forget()
+
+
+def test_entry_points_are_read_only_for_methods_that_mien_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: pytest.fail("read"))
+    _forget()
+    assert main(["train", "gone"]) == 2
+    assert main(["train", "gone", "--method", "headgas"]) == 2
+    with pytest.raises(pytest.fail.Exception, match="read"):
+        main(["train", "gone", "--method", "nerf"])
 
 
 def _forget() -> None:

@@ -140,12 +140,6 @@ def test_wrong_values_and_paths_import_nothing_heavy(tmp_path: Path) -> None:
     expect_light(lines, tmp_path, 2)
 
 
-def test_other_packages_are_asked_only_for_methods_that_mien_lacks(tmp_path: Path) -> None:
-    lines = [["train", "gone"], ["train", "gone", "--method", "headgas"], ["train", "gone", "--method", "nerf"]]
-    asked = ["importlib.metadata" in modules for _, modules in modules_after(lines, tmp_path)]
-    assert asked == [False, False, True]
-
-
 @pytest.mark.parametrize("room", LAZY_ROOMS)
 def test_lazy_rooms_give_all_their_names(room: str) -> None:
     """Lazy rooms give all their names, each from a module of the room. No submodule of the same name hides one."""
