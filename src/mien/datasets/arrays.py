@@ -16,7 +16,7 @@ def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -
 
     Args:
         path: The file.
-        axes: A letter for each axis of each array, such as "thw3". Axes of one letter are equally long, and a digit is
+        axes: A letter for each axis of each array, such as "tyx3". Axes of one letter are equally long, and a digit is
             a length.
         sizes: Lengths that are known, by letter.
 
