@@ -1,6 +1,7 @@
 """Every former finding of the fuzzers is refused when it is read, in one line that names the file."""
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from mien.capture.crop import whole_picture
 from mien.capture.given import GivenMattes
 from mien.driving import drive, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
-from mien.export import ply, read_ply
+from mien.export import ply, read_ply, read_usd
 from mien.face import FaceParams
 from mien.face.checks import check_face_params
 from mien.face.flame import read_flame
@@ -256,3 +257,22 @@ def test_numbers_of_a_type_that_numpy_lacks(tmp_path: Path) -> None:
     file.write_bytes(safetensors.torch.save({"points": torch.zeros(4).to(torch.float8_e5m2)}))
     with pytest.raises(UserError, match="arrays.safetensors: damaged safetensors file"):
         read_arrays(file)
+
+
+def test_a_prim_of_usd_without_a_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """USD would end the process when it is asked for the files that such a layer refers to."""
+    Sdf = pytest.importorskip("pxr.Sdf", reason="usd-core is not installed")
+    layer = Sdf.Layer.CreateNew(str(tmp_path / "head.usda"))
+    layer.Save()
+
+    class Damaged:
+        def Traverse(self, start: object, visit: Callable[[object], None]) -> None:
+            visit(Sdf.Path.emptyPath)
+            visit(Sdf.Path.absoluteRootPath)
+
+        def GetCompositionAssetDependencies(self) -> None:
+            pytest.fail("USD would end the process here")
+
+    monkeypatch.setattr(Sdf.Layer, "FindOrOpen", lambda path: Damaged())
+    with pytest.raises(UserError, match="is damaged, or not a USD file"):
+        read_usd(tmp_path / "head.usda")

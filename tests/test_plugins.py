@@ -35,7 +35,6 @@ def install_toys(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)  # nine commands, each in a process of its own
 def test_one_package_adds_one_of_each(tmp_path: Path, cache: str) -> None:  # noqa: F811
     """Footage is imported by its dataset, an avatar is trained by its method and exported in its format."""
     install_toys(tmp_path)

@@ -135,9 +135,13 @@ def _layer_alone(path: Path) -> Any:
     layer = Sdf.Layer.FindOrOpen(str(path.absolute()))
     if layer is None:
         raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
-    prims: list[Any] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda place: prims.append(place) if place.IsPrimPath() else None)
-    clips = any(layer.GetPrimAtPath(place).HasInfo("clips") for place in prims)
+    places: list[Any] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, places.append)
+    found = [layer.GetPrimAtPath(place) for place in places if place.IsPrimPath()]
+    # USD ends the whole process where it uses a prim without a name.
+    if any(place.isEmpty for place in places) or not all(found):
+        raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
+    clips = any(prim.HasInfo("clips") for prim in found)
     if clips or layer.GetCompositionAssetDependencies():
         raise UserError(f"{path}: refers to other files, which are not opened; flatten it into one file")
     return layer
