@@ -67,7 +67,7 @@ def compare(built: Path, path: Path, portable: runtime.PortableAvatar) -> None:
     rows = np.fromfile(out, np.float32).reshape(len(faces), 14 * n)
     moved = []
     for face, row in zip(faces, rows, strict=True):
-        centres, logits, colors, quats, scales = np.split(row, np.cumsum([3 * n, n, 3 * n, 4 * n]))
+        centers, logits, colors, quats, scales = np.split(row, np.cumsum([3 * n, n, 3 * n, 4 * n]))
         posed = runtime.pose(portable.baked, face)
         np.testing.assert_allclose(centers, posed.means.reshape(-1), rtol=0, atol=1e-5)
         np.testing.assert_allclose(1 / (1 + np.exp(-logits)), posed.opacities, rtol=0, atol=1e-3)
