@@ -109,7 +109,9 @@ def override_faults(texts: Mapping[str, str]) -> Iterator[str]:
         _read_classes(place, text, classes, doors)
 
     def found(name: str) -> str | None:
-        while name not in classes and name in doors and doors[name] != name:
+        seen: set[str] = set()
+        while name not in classes and name in doors and name not in seen:
+            seen.add(name)
             name = doors[name]
         return name if name in classes else None
 
