@@ -75,7 +75,7 @@ def _line_of(place: str, text: str, method: MethodNames) -> int | None:
     found = re.search(rf"\b{method.name}\b", text)
     if found is not None:
         return text.count("\n", 0, found.start()) + 1
-    if not place.endswith(".py"):
+    if not place.endswith(".py") or not any(one in text for one in method.classes):
         return None
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     return next(
