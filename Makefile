@@ -114,6 +114,7 @@ lint: setup
 	$(BIN)/ruff format --check src tests examples benchmarks docs/site docs/pictures
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/python tests/sizes.py
+	$(BIN)/python tests/seams.py
 	$(BIN)/typos
 	$(BIN)/lint-imports
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python

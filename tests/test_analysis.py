@@ -6,7 +6,7 @@ import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from capture_helpers import tree_bytes
 from damage import edit_json
 from mien.capture.video import write_video
 from mien.cli import main
-from mien.commands.analyze import AnalysisName, Command
+from mien.commands.analyze import Command
 from mien.errors import UserError
 from mien.evaluation.plots import Axes, Series
 from mien.face import FaceModel
@@ -257,7 +257,6 @@ def part_of_everything(context: Any) -> PartResult:
 
 
 def test_the_command_names_every_analysis_and_part(capsys: pytest.CaptureFixture[str]) -> None:
-    assert get_args(AnalysisName) == tuple(ANALYSES)
     with pytest.raises(SystemExit):
         main(["analyze", "--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())

@@ -1,5 +1,6 @@
 """Every method keeps the promises of the interface, in one suite on a toy scene."""
 
+import base64
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,11 +19,14 @@ from mien.avatar import (
     MethodConfig,
     ParameterGroup,
     Progress,
+    as_array,
+    bake_rig,
     load_avatar,
     make_portable,
     write_avatar,
 )
 from mien.config import decode, encode
+from mien.export import MeshModel, pack, read_glb_avatar, write_glb, write_page
 from mien.progress import Advance
 from mien.render import rasterize
 from mien.training import TrainSettings
@@ -118,6 +122,22 @@ def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> N
             np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-4, err_msg=name)
         picture = rasterize(truth, toy_camera(SIZE), torch.ones(3)).image.detach().numpy()
         np.testing.assert_allclose(portable.render(found)[0], picture, atol=1e-3, rtol=0)
+
+
+@method
+def test_an_avatar_becomes_a_file_a_page_and_a_mesh(method: str, tmp_path: Path) -> None:
+    """The whole avatar is in a .mien and in a .glb file, and a page loses nothing that can be seen."""
+    avatar = new_avatar(method)
+    portable, model = make_portable(avatar, toy_camera(64), "toy"), avatar.face_model
+    runtime.write_portable(tmp_path / "a.mien", portable)
+    mesh = MeshModel(bake_rig(model, avatar.subject), *map(as_array, (model.faces, model.uv, model.uv_faces)))
+    write_glb(tmp_path / "a.glb", runtime.read_portable(tmp_path / "a.mien"), mesh, 32)
+    read = read_glb_avatar(tmp_path / "a.glb")
+    assert read.about.method == method
+    runtime.write_portable(tmp_path / "b.mien", read)
+    assert (tmp_path / "b.mien").read_bytes() == (tmp_path / "a.mien").read_bytes()
+    assert write_page(tmp_path / "a.html", read).psnr >= 45
+    assert base64.b64encode(pack(portable)).decode() in (tmp_path / "a.html").read_text(encoding="utf-8")
 
 
 @method

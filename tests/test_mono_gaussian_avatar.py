@@ -435,7 +435,7 @@ def test_a_run_may_begin_at_a_later_epoch() -> None:
         assert late.rendering_radius(fraction) == whole.rendering_radius(at)
         assert late.points_at(fraction) == whole.points_at(at)
         assert late.face_decay(fraction) == whole.face_decay(at)
-    with pytest.raises(UserError, match="--method.first-epoch 60: has to be smaller than --method.epochs 60"):
+    with pytest.raises(UserError, match="--method.epochs 60: give more than --method.first-epoch 60"):
         MonoGaussianAvatarConfig(epochs=60, first_epoch=60).check()
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from web_case import node
+
 TESTS = Path(__file__).parent
 PAGE = TESTS.parent / "CONTRIBUTING.md"
 SUITE = (
@@ -57,7 +59,7 @@ def run(folder: Path, *words: str) -> str:
 
 @pytest.mark.slow
 def test_the_suite_passes_as_it_is(tmp_path: Path) -> None:
-    """Pose, regularizers, density, bake, train, resume to the bit, render, damaged files, options."""
+    """Pose, regularizers, density, bake, train, resume to the bit, render, export, damaged files, options."""
     name = follow(tmp_path)
     files = [str(TESTS / file) for file in SUITE]
     shown = run(tmp_path, "pytest", "-p", "a_new_method", "-p", "no:cacheprovider", "-k", name, "-v", *files)
@@ -67,12 +69,22 @@ def test_the_suite_passes_as_it_is(tmp_path: Path) -> None:
         "test_first_fifty_steps_lower_the_loss",
         "test_saved_avatar_renders_the_same_picture",
         "test_baked_avatar_poses_as_the_avatar_does",
+        "test_an_avatar_becomes_a_file_a_page_and_a_mesh",
         "test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped",
         "test_pictures_equal_those_of_training",
         "test_numbers_that_cannot_be_drawn",
         "test_a_step_of_training_asks_for_no_number",
         "test_help_all_lists_every_setting_of_the_method",
     } <= passed
+
+
+@pytest.mark.slow
+def test_a_page_reads_its_avatars(tmp_path: Path) -> None:
+    node()
+    name = follow(tmp_path)
+    words = ("-p", "a_new_method", "-p", "no:cacheprovider", "-k", f"every_method and {name}", "-v")
+    shown = run(tmp_path, "pytest", *words, str(TESTS / "test_web_skinned.py"))
+    assert f"test_a_page_reads_avatars_of_every_method[{name}] PASSED" in shown
 
 
 def test_it_is_written_as_the_project_is(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame, resolved
 from mien.training.whole_head.side_views import SideViews, side_views, turned_to_side
 from mien.training.whole_head.unseen import fills_sides
+from test_runtime import new_avatar
 from toy_scene import surface_of
 
 _PROGRESS = Progress(0, 100, 0, 1.0, 1)
@@ -151,7 +152,7 @@ def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("kind", "background", "unseen", "white"),
+    ("method", "background", "unseen", "white"),
     [
         ("gaussian_avatars", "auto", "auto", False),
         ("gaussian_avatars", "auto", "trained", True),
@@ -160,10 +161,10 @@ def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> N
         ("headgas", "auto", "auto", True),
     ],
 )
-def test_transparent_pictures_warn_of_white_only_where_it_was(kind, background, unseen, white, tmp_path, monkeypatch):
-    config = {"method": {"kind": kind}, "settings": {"background": background, "unseen": unseen}}
+def test_transparent_pictures_warn_of_white_only_where_it_was(method, background, unseen, white, tmp_path, monkeypatch):
+    config = {"settings": {"background": background, "unseen": unseen}}
     said: list[str] = []
     monkeypatch.setattr(pictures, "read_run_config", lambda run_dir: config)
     monkeypatch.setattr(pictures, "say", said.append)
-    pictures.warn_of_white(PictureOptions(background="transparent"), tmp_path)
+    pictures.warn_of_white(PictureOptions(background="transparent"), tmp_path, new_avatar(method))
     assert bool(said) is white

@@ -42,3 +42,9 @@ def lazy_names(room: str, file: str) -> tuple[Callable[[str], Any], Callable[[],
         return sorted({*vars(sys.modules[room]), *homes()})
 
     return get, names
+
+
+def named(place: str) -> Any:
+    """The object of a module that is named as "MODULE:NAME". The module is imported now."""
+    module, name = place.split(":")
+    return getattr(importlib.import_module(module), name)

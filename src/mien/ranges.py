@@ -62,6 +62,13 @@ class NotBelow:
 
 
 @dataclass(frozen=True)
+class Above:
+    """A mark beside a field: its number must be larger than that of another field of the same settings."""
+
+    other: str
+
+
+@dataclass(frozen=True)
 class ToLoad:
     """A mark beside a field that matters only when a new avatar is made.
 
@@ -105,6 +112,9 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
             if isinstance(mark, NotBelow) and value < getattr(settings, mark.other):
                 other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
                 raise UserError(f"{option(field.name)} {shown(value)}: give at least as much as {other}")
+            if isinstance(mark, Above) and value <= getattr(settings, mark.other):
+                other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
+                raise UserError(f"{option(field.name)} {shown(value)}: give more than {other}")
 
 
 def check_range(value: Any, allowed: Range, option: str) -> None:

@@ -1,5 +1,4 @@
-// What a .mien file holds, as src/mien/runtime/baked.py documents it. Only bound Gaussians (`MeshBound`) are known here:
-// `mien export` writes those of headgas bound to a single triangle that never moves.
+// What a .mien file holds, as src/mien/runtime/baked.py documents it. Letters in shapes mean what they mean there.
 
 /** m points of one person that move with expressions and joints. Arrays are row by row. */
 export interface Rig {
@@ -16,7 +15,7 @@ export interface Rig {
   pose_basis: Float32Array | null; // [9 j, m, 3]
 }
 
-/** Raw values of n Gaussians, in the frames of their triangles. */
+/** Raw values of n Gaussians, independent of how they are bound. */
 export interface Attributes {
   quats: Float32Array; // [n, 4], wxyz, not of unit length
   log_scales: Float32Array; // [n, 3]
@@ -41,17 +40,45 @@ export interface ExpressionChanges {
   color: Float32Array | null; // [n, 3, c], where the first c of the r activations count
   opacity_logits: Float32Array | null; // [n, c]
   means: Float32Array | null; // [n, 3, c]
-  features?: FeatureChanges | null;
+  features: FeatureChanges | null;
 }
 
-/** A small network, the same for all Gaussians: rows of `base`, then the centre's motion in metres, are its inputs. */
-export interface PointNetwork {
-  input: string;
+/** Changes of the raw values per unit of each expression coefficient. Null means no change. */
+export interface LinearBases {
+  means: Float32Array | null; // [e, n, 3]
+  log_scales: Float32Array | null; // [e, n, 3]
+  opacity_logits: Float32Array | null; // [e, n]
+  sh: Float32Array | null; // [e, n, s, 3]
+}
+
+/** Directions of the face, along which features change. */
+export interface FeatureDirections {
+  rest: Float32Array; // [i]
+  directions: Float32Array; // [i, k]
+  basis: Float32Array; // [n, k, w]
+}
+
+/** A small network, the same for all Gaussians: rows of `base` with an addition are its inputs. */
+export interface AttributeNetwork {
+  input: "features" | "displacement";
   base: Float32Array; // [n, _]
   weights: Float32Array[]; // of each layer: [out, in]
   biases: Float32Array[];
-  activation: string;
+  activation: "relu" | "leaky_relu" | "softplus";
   outputs: string[];
+  along: FeatureDirections | null;
+}
+
+/** Gaussians in the frames of a mesh's triangles. A single triangle is no mesh: it never moves. */
+export interface MeshBound {
+  kind: "MeshBound";
+  rig: Rig;
+  faces: Int32Array; // [f, 3]
+  face_index: Int32Array; // [n]
+  means: Float32Array; // [n, 3], in the triangle's frame and units
+  attributes: Attributes;
+  sh_frame: "world" | "head";
+  changes: ExpressionChanges | null;
 }
 
 /** Gaussians that have their own blend directions and skinning weights. */
@@ -63,24 +90,25 @@ export interface BlendSkinned {
   scale_gain: number;
   scale_offset: number; // metres
   color_activation: "sh" | "sigmoid";
-  bases: unknown;
-  network: PointNetwork;
-  still_weights?: Float32Array | null; // [n]
-  still_pose?: Float32Array | null; // [4, 4]
+  bases: LinearBases | null;
+  network: AttributeNetwork | null;
+  still_weights: Float32Array | null; // [n]
+  still_pose: Float32Array | null; // [4, 4]
 }
 
-export interface MeshBound {
-  kind: "MeshBound";
-  rig: Rig;
-  faces: Int32Array; // [f, 3]
-  face_index: Int32Array; // [n]
-  means: Float32Array; // [n, 3], in the triangle's frame and units
+/** Gaussians that do not move in the head frame. */
+export interface Static {
+  kind: "Static";
+  means: Float32Array; // [n, 3]
   attributes: Attributes;
-  sh_frame: "world" | "head";
-  changes?: ExpressionChanges;
-  /** What moves the Gaussians, if they are bound to no mesh (`onTriangle`). */
-  skinned?: BlendSkinned;
+  expression_names: string[];
+  joint_names: string[];
+  bases: LinearBases | null;
+  network: AttributeNetwork | null;
 }
+
+/** The closed family of records. Whoever reads them asks for `kind`. */
+export type Baked = MeshBound | BlendSkinned | Static;
 
 /** A pinhole camera, OpenCV convention: +x right, +y down, +z forward. */
 export interface Camera {
@@ -104,7 +132,7 @@ export interface Motion extends Face {
 }
 
 export interface Avatar {
-  baked: MeshBound;
+  baked: Baked;
   expression_names: string[];
   expression_bounds: Float32Array; // [e, 2]
   joint_names: string[];

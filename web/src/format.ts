@@ -1,7 +1,7 @@
 // Reads .mien files (docs/avatar_file.md) and their packed form, which `mien export --out NAME.html` puts into pages.
 
-import type { Avatar, BlendSkinned, ExpressionChanges, Face, Motion, Rig } from "./avatar";
-import { onTriangle, skinnedFault } from "./skinned";
+import type { Avatar, BlendSkinned, ExpressionChanges, Face, LinearBases, MeshBound, Motion, Rig, Static } from "./avatar";
+import { WIDTHS } from "./points";
 
 type Numbers = Float32Array | Int32Array;
 type Tree = null | boolean | number | string | Tree[] | { [key: string]: Tree };
@@ -18,7 +18,8 @@ const MOST_BYTES = 1 << 27;
 /** Most bytes of the json text; it becomes many times as large. */
 const MOST_TEXT = 1 << 23;
 
-const APART = "is damaged: its arrays do not fit together";
+/** Of points, colours that depend on the view do not change with the face here. */
+const APART = "is damaged, or not for pages: its arrays do not fit together";
 
 const isWhole = (value: unknown, most: number): value is number => Number.isSafeInteger(value) && (value as number) >= 0 && (value as number) <= most;
 const areNumbers = (values: unknown): values is number[] => Array.isArray(values) && values.every((value) => Number.isFinite(value));
@@ -213,22 +214,42 @@ function isChanges({ rest, directions, features, ...others }: ExpressionChanges,
   );
 }
 
-/** Refuses what this runtime cannot draw, and indices that lead nowhere. */
-function checked(given: Avatar): Avatar {
-  const isSkinned = (given.baked.kind as string) === "BlendSkinned";
-  const fault = isSkinned ? skinnedFault(given.baked as unknown as BlendSkinned) : "";
-  if (fault) throw new AvatarError(fault);
-  const avatar = isSkinned ? onTriangle(given) : given, { baked, neutral, camera } = avatar, { rig, attributes, changes } = baked;
-  if (baked.kind !== "MeshBound") throw new AvatarError(`holds a ${baked.kind} avatar; this page draws MeshBound ones (gaussian_avatars)`);
-  const count = baked.face_index.length, coefficients = attributes.sh.length;
-  const inside = (indices: Int32Array, size: number) => indices instanceof Int32Array && indices.every((index) => index >= 0 && index < size);
+const isIndices = (indices: Int32Array, size: number): boolean => indices instanceof Int32Array && indices.every((index) => index >= 0 && index < size);
+
+/** Whether Gaussians fit their triangles, and a face. */
+const isBound = ({ rig, faces, face_index, means, changes }: MeshBound, neutral: Face, count: number): boolean =>
+  isIndices(faces, rig.template.length / 3) && isIndices(face_index, faces.length / 3) && face_index.length === count && means.length === 3 * count &&
+  isRig(rig, neutral) && (!changes || isChanges(changes, neutral, count));
+
+/** Whether points, and what changes their attributes, fit a face and `count` Gaussians. */
+function isFree(baked: BlendSkinned | Static, neutral: Face, count: number): boolean {
+  const { bases, network } = baked, { expression, joints } = neutral, inputs = expression.length + joints.length;
+  const placed =
+    baked.kind === "Static" ? fits(baked, { means: 3 * count })
+    : baked.rig.template.length === 3 * count && isRig(baked.rig, neutral) && (!baked.still_weights || fits(baked, { still_weights: count, still_pose: 16 }));
+  if (!placed) return false;
+  for (const name in WIDTHS)
+    if (bases?.[name as keyof LinearBases] && !fits(bases, { [name]: WIDTHS[name] * count * expression.length })) return false;
+  if (!network) return true;
+  const { base, weights, biases, outputs, along } = network, rank = along ? Math.round(along.directions.length / inputs) : 0;
+  const own = Math.round(base.length / Math.max(count, 1));
+  let before = own + (along ? 0 : 3);
+  return (
+    fits(network, { base: own * count }) && (!along || fits(along, { rest: inputs, directions: rank * inputs, basis: along.basis.length })) &&
+    biases.length > 0 && biases.every((bias, layer) => fits([weights[layer], bias], { 0: before * bias.length, 1: (before = bias.length) })) &&
+    before === outputs.reduce((sum, name) => sum + WIDTHS[name], 0)
+  );
+}
+
+/** Refuses what this runtime cannot draw, and arrays that do not fit together. */
+function checked(avatar: Avatar): Avatar {
+  const { baked, neutral, camera } = avatar, { attributes } = baked, count = attributes.opacity_logits.length;
+  const coefficients = attributes.sh.length / 3 / Math.max(count, 1);
   const whole =
-    inside(baked.faces, rig.template.length / 3) && inside(baked.face_index, baked.faces.length / 3) &&
-    [1, 4, 9, 16].includes(coefficients / 3 / Math.max(count, 1)) && fits(baked, { means: 3 * count }) &&
-    fits(attributes, { quats: 4 * count, log_scales: 3 * count, opacity_logits: count, sh: coefficients }) &&
+    [1, 4, 9, 16].includes(coefficients) && fits(attributes, { quats: 4 * count, log_scales: 3 * count, opacity_logits: count, sh: 3 * count * coefficients }) &&
     fits(camera, { K: 9, viewmat: 16 }) && camera.width > 0 && camera.height > 0 &&
-    fits(avatar, { expression_bounds: 2 * neutral.expression.length }) && isFace(neutral, neutral, 1) && isRig(rig, neutral) &&
-    (!changes || isChanges(changes, neutral, count));
+    fits(avatar, { expression_bounds: 2 * neutral.expression.length }) && isFace(neutral, neutral, 1) &&
+    (baked.kind === "MeshBound" ? isBound(baked, neutral, count) : isFree(baked, neutral, count));
   if (!whole) throw new AvatarError(APART);
   return avatar;
 }

@@ -1,5 +1,5 @@
 // Posing on the GPU: frames of triangles, changes with the expression, and the network of features. The rig's points and
-// the activations come from the CPU (rig.ts). Gaussians that are bound to no mesh are posed on the CPU (skinned.ts).
+// the activations come from the CPU (rig.ts). Gaussians that are bound to no mesh are posed on the CPU (points.ts).
 
 import type { ExpressionChanges, FeatureChanges, MeshBound } from "./avatar";
 import { ownPart, sizesOf } from "./features";

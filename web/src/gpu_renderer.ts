@@ -5,9 +5,9 @@ import { dispatch, Memory } from "./gpu_memory";
 import { GpuPoser, type Posed } from "./gpu_pose";
 import { DRAW, PROJECT, SCREEN, THREADS } from "./gpu_shaders";
 import { GpuSorter, SortPipelines } from "./gpu_sort";
+import type { PointPoser } from "./points";
 import { spread, type Color, type Drawer, type View } from "./renderer";
 import type { Poser } from "./rig";
-import type { SkinnedPoser } from "./skinned";
 
 // TypeScript has the types of WebGPU, but not this.
 declare const GPUTextureUsage: Record<"RENDER_ATTACHMENT" | "TEXTURE_BINDING", number>;
@@ -61,12 +61,12 @@ export class GpuRenderer implements Drawer {
   private screen: GPUBindGroup | null = null;
 
   constructor(private readonly pipelines: Pipelines, private readonly context: GPUCanvasContext, avatar: Avatar, private readonly poser: Poser) {
-    const { device } = pipelines, { baked } = avatar, { attributes, faces, face_index } = baked, memory = (this.memory = new Memory(device));
-    const count = (this.count = face_index.length);
+    const { device } = pipelines, { attributes } = avatar.baked, { bound, faceIndex } = poser, memory = (this.memory = new Memory(device));
+    const count = (this.count = faceIndex.length);
     this.shRest = attributes.sh.length / 3 / Math.max(count, 1) - 1;
     [this.means, this.colors, this.shapeValues] = [4, 4, 8].map((width) => new Float32Array(width * count));
-    face_index.forEach((face, i) => (this.means[4 * i + 3] = face));
-    spread(baked.means, this.means);
+    faceIndex.forEach((face, i) => (this.means[4 * i + 3] = face));
+    spread(poser.means, this.means);
     for (let i = 0; i < count; ++i) {
       const at = 3 * i * (1 + this.shRest);
       this.colors.set([...attributes.sh.subarray(at, at + 3), attributes.opacity_logits[i]], 4 * i);
@@ -76,7 +76,7 @@ export class GpuRenderer implements Drawer {
       const from = 3 * (i + Math.floor(i / this.shRest) + 1);
       rest.set(attributes.sh.subarray(from, from + 3), 4 * i);
     }
-    const posed = (this.posed = { frames: memory.storage(4 * faces.length), means: memory.storage(this.means), colors: memory.storage(this.colors) });
+    const posed = (this.posed = { frames: memory.storage(poser.frames.length), means: memory.storage(this.means), colors: memory.storage(this.colors) });
     this.shapes = memory.storage(8 * count);
     this.view = memory.uniform(VIEW_SIZE);
     this.state = memory.indirect(EMPTY_STATE);
@@ -86,14 +86,15 @@ export class GpuRenderer implements Drawer {
     this.project = memory.group(pipelines.project.getBindGroupLayout(0), [this.view, ...inputs, splats, sorted.keys, this.state]);
     this.splats = memory.group(pipelines.draw.getBindGroupLayout(0), [this.view, splats, sorted.order]);
     this.uploadShapes(attributes.quats, attributes.log_scales.map(Math.exp));
-    this.gpuPoser = baked.skinned ? null : new GpuPoser(memory, baked, posed, this.means, this.colors);
+    this.gpuPoser = bound && new GpuPoser(memory, bound, posed, this.means, this.colors);
     context.configure({ device, format: pipelines.format, alphaMode: "premultiplied" });
   }
 
   /** Takes over what the poser has computed for a new face, and poses the rest. */
   upload(): void {
-    if (this.gpuPoser) this.gpuPoser.run(this.poser);
-    else this.uploadPosed(this.poser, this.poser.skinned!);
+    const { gpuPoser, poser } = this;
+    gpuPoser?.run(poser);
+    if (poser.free) this.uploadPosed(poser, poser.free);
   }
 
   /** Draws the Gaussians over a background. The order is the GPU's own. */
@@ -144,7 +145,7 @@ export class GpuRenderer implements Drawer {
     return picture;
   }
 
-  private uploadPosed(poser: Poser, skinned: SkinnedPoser): void {
+  private uploadPosed(poser: Poser, free: PointPoser): void {
     const { memory, posed, means, colors } = this;
     spread(poser.means, means);
     spread(poser.colors, colors);
@@ -152,7 +153,7 @@ export class GpuRenderer implements Drawer {
     memory.write(posed.frames, poser.frames);
     memory.write(posed.means, means);
     memory.write(posed.colors, colors);
-    this.uploadShapes(skinned.quats, skinned.scales);
+    this.uploadShapes(free.quats, free.scales);
   }
 
   private uploadShapes(quats: Float32Array, scales: Float32Array): void {

@@ -1,6 +1,6 @@
 // What the package offers.
 export { copyFace, motionFace, motionLength } from "./avatar";
-export type { Avatar, Camera, Face, MeshBound, Motion, Rig } from "./avatar";
+export type { Avatar, Baked, BlendSkinned, Camera, Face, MeshBound, Motion, Rig, Static } from "./avatar";
 export { AvatarError, readAny, readMien, readPacked } from "./format";
 export { Poser } from "./rig";
 export { DepthSorter } from "./sort";

@@ -5,7 +5,6 @@ import { FeaturePass } from "./feature_pass";
 import { AvatarError } from "./format";
 import { Program } from "./program";
 import type { Poser } from "./rig";
-import type { SkinnedPoser } from "./skinned";
 import { SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, TEXTURE_WIDTH } from "./shaders";
 
 /** A view of the head frame. */
@@ -83,28 +82,25 @@ export class Renderer implements Drawer {
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false, premultipliedAlpha: true, powerPreference: "high-performance" });
     if (!gl) throw new AvatarError("needs WebGL2, which this browser lacks or has switched off");
     this.gl = gl;
-    const { baked } = avatar, { attributes } = baked;
-    this.count = baked.face_index.length;
+    const { attributes } = avatar.baked, { faceIndex } = poser;
+    this.count = faceIndex.length;
     this.shRest = attributes.sh.length / 3 / Math.max(this.count, 1) - 1;
     this.splats = new Program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.screen = new Program(gl, SCREEN_VERTEX, SCREEN_FRAGMENT);
     const of = (texels: number) => new ArrayTexture(gl, texels);
     this.arrays = {
-      frames: of(baked.faces.length), means: of(this.count), quats: of(this.count), scales: of(this.count),
+      frames: of(poser.frames.length / 4), means: of(this.count), quats: of(this.count), scales: of(this.count),
       colors: of(this.count), sh: of(this.count * this.shRest),
     };
-    const { quats, scales, means, sh } = this.arrays;
-    quats.values.set(attributes.quats);
-    spread(attributes.log_scales.map(Math.exp), scales.values);
-    baked.face_index.forEach((face, i) => (means.values[4 * i + 3] = face));
+    const { means, sh } = this.arrays;
+    this.uploadShapes(attributes.quats, attributes.log_scales.map(Math.exp));
+    faceIndex.forEach((face, i) => (means.values[4 * i + 3] = face));
     for (let i = 0; i < this.count * this.shRest; ++i) {
       const from = 3 * (i + Math.floor(i / this.shRest) + 1);
       sh.values.set(attributes.sh.subarray(from, from + 3), 4 * i);
     }
-    quats.upload();
-    scales.upload();
     sh.upload();
-    const { features } = baked.changes ?? {};
+    const features = poser.bound?.changes?.features;
     this.features = features ? FeaturePass.on(gl, features, this.count) : null;
     poser.runsNetwork = !this.features;
     this.uploadChanged();
@@ -167,12 +163,12 @@ export class Renderer implements Drawer {
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
 
-  private uploadShapes(posed: SkinnedPoser): void {
-    const { quats, scales } = this.arrays;
-    quats.values.set(posed.quats);
-    spread(posed.scales, scales.values);
-    quats.upload();
-    scales.upload();
+  private uploadShapes(quats: Float32Array, scales: Float32Array): void {
+    const { arrays } = this;
+    arrays.quats.values.set(quats);
+    spread(scales, arrays.scales.values);
+    arrays.quats.upload();
+    arrays.scales.upload();
   }
 
   private uploadChanged(): void {
@@ -184,7 +180,7 @@ export class Renderer implements Drawer {
     means.upload();
     colors.upload();
     features?.run((unit) => colors.bind(unit), poser.activations);
-    if (poser.skinned) this.uploadShapes(poser.skinned);
+    if (poser.free) this.uploadShapes(poser.free.quats, poser.free.scales);
   }
 }
 

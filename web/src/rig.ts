@@ -1,10 +1,10 @@
 // Posing on the CPU: points of the rig, frames of triangles, changes with the expression, depths. It follows
 // src/mien/runtime/posing.py, FaceModel.head_vertices_reference and triangle_frames.
 
-import type { ExpressionChanges, Face, MeshBound, Rig } from "./avatar";
+import type { Baked, ExpressionChanges, Face, FeatureDirections, MeshBound, Rig } from "./avatar";
 import { FeatureNetwork } from "./features";
+import { PointPoser } from "./points";
 import { chained, rigid, rotationMatrix } from "./rigid";
-import { SkinnedPoser } from "./skinned";
 
 /** Rows of a basis [rows, m, 3] without its zeros: most expressions move a small part of the face. */
 class SparseBasis {
@@ -147,14 +147,12 @@ export function triangleFrames(points: Float32Array, faces: Int32Array, out: Flo
 const MARGIN = 0.1;
 
 /** The r activations of a face. */
-export function activations(changes: ExpressionChanges, face: Face): Float64Array {
-  const inputs = [...face.expression, ...face.joints], rank = changes.directions.length / inputs.length;
-  const out = new Float64Array(rank);
+export function activations({ rest, directions }: FeatureDirections | ExpressionChanges, face: Face, reach = Infinity): Float64Array {
+  const inputs = [...face.expression, ...face.joints], rank = directions.length / inputs.length, out = new Float64Array(rank);
   inputs.forEach((input, i) => {
-    for (let k = 0; k < rank; ++k) out[k] += (input - changes.rest[i]) * changes.directions[i * rank + k];
+    for (let k = 0; k < rank; ++k) out[k] += (input - rest[i]) * directions[i * rank + k];
   });
-  const reach = changes.reach[0], length = Math.sqrt(Math.max(out.reduce((sum, x) => sum + x * x, 0), 1e-12));
-  const over = length - reach;
+  const length = Math.sqrt(Math.max(out.reduce((sum, x) => sum + x * x, 0), 1e-12)), over = length - reach;
   if (!(over > 0)) return out;
   const margin = MARGIN * reach, shorter = (reach + (margin * over) / Math.max(margin + over, 1e-6)) / length;
   return out.map((x) => x * shorter);
@@ -173,21 +171,27 @@ function changed(raw: Float32Array, basis: Float32Array | null, weights: Float64
 
 /** All that depends on the face: frames of triangles, and the values that change with the expression. */
 export class Poser {
+  /** The record if its Gaussians are bound to triangles, else null. */
+  readonly bound: MeshBound | null;
+  /** What poses Gaussians that are bound to none. */
+  readonly free: PointPoser | null = null;
+  /** The triangle of each Gaussian. Gaussians that are bound to none have one, whose frame is always the head's. */
+  readonly faceIndex: Int32Array;
   /** Rows of [k R | T] of each triangle, in the head frame. */
-  readonly frames: Float32Array;
+  readonly frames: Float32Array = Float32Array.of(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0);
   /** Centres in the frames of triangles. */
   readonly means: Float32Array;
   /** Raw opacities. */
   readonly opacityLogits: Float32Array;
   /** First colour coefficients [n, 3]. */
   readonly colors: Float32Array;
-  /** The rig's points in the head frame. */
+  /** Points of the head at rest. */
+  readonly rest: Float32Array;
+  /** The mesh's points in the head frame. */
   points: Float32Array = new Float32Array();
-  /** What moves Gaussians that are bound to no mesh. */
-  readonly skinned: SkinnedPoser | null;
-  private readonly rig: RigPoser;
+  private readonly rig: RigPoser | null = null;
   /** The activations of the changes at the last face. */
-  activations: Float64Array;
+  activations: Float64Array = new Float64Array();
   /** Whether the last face has changed means, colours or opacities. */
   changed = false;
   /** Whether posing runs the network of features. Not where the renderer runs it on the GPU. */
@@ -195,44 +199,53 @@ export class Poser {
   /** Whether posing goes beyond the rig's points and the activations. Not where the renderer does all else on the GPU. */
   binds = true;
   private readonly restColors: Float32Array;
-  private readonly network: FeatureNetwork | null;
+  private readonly network: FeatureNetwork | null = null;
   private posed = false;
 
-  constructor(private readonly baked: MeshBound) {
-    const { attributes, faces, means } = baked, count = baked.face_index.length;
-    this.skinned = baked.skinned ? new SkinnedPoser(baked.skinned) : null;
-    this.rig = this.skinned?.rig ?? new RigPoser(baked.rig);
-    this.frames = new Float32Array(4 * faces.length);
+  constructor(baked: Baked) {
+    const { sh, opacity_logits } = baked.attributes, count = opacity_logits.length, width = sh.length / Math.max(count, 1);
+    this.bound = baked.kind === "MeshBound" ? baked : null;
+    const means = baked.kind === "BlendSkinned" ? baked.rig.template : baked.means;
     this.means = means.slice();
-    this.opacityLogits = attributes.opacity_logits.slice();
-    const width = attributes.sh.length / Math.max(count, 1);
+    this.opacityLogits = opacity_logits.slice();
     this.restColors = new Float32Array(3 * count);
-    for (let i = 0; i < count; ++i) this.restColors.set(attributes.sh.subarray(i * width, i * width + 3), 3 * i);
+    for (let i = 0; i < count; ++i) this.restColors.set(sh.subarray(i * width, i * width + 3), 3 * i);
     this.colors = this.restColors.slice();
-    const { changes } = baked, features = changes?.features;
-    this.activations = new Float64Array(changes ? changes.directions.length / changes.rest.length : 0);
-    this.network = features ? new FeatureNetwork(features, count) : null;
+    this.rest = means;
+    if (baked.kind !== "MeshBound") {
+      this.faceIndex = new Int32Array(count);
+      this.free = new PointPoser(baked, this);
+      return;
+    }
+    const { faces, rig, changes } = baked, features = changes?.features;
+    this.faceIndex = baked.face_index;
+    this.frames = new Float32Array(4 * faces.length);
+    // A single triangle is not the head: it is the frame of Gaussians that do not move.
+    if (faces.length > 3) this.rest = rig.template;
+    this.rig = new RigPoser(rig);
+    if (changes) this.activations = new Float64Array(changes.directions.length / changes.rest.length);
+    if (features) this.network = new FeatureNetwork(features, count);
   }
 
   pose(face: Face): void {
-    if (this.skinned) {
-      this.frames.set([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]);
-      this.skinned.pose(face, this);
+    const { bound, free, rig } = this;
+    if (free) {
+      free.pose(face);
       this.changed = true;
-      return;
     }
-    this.points = this.rig.pose(face);
-    if (this.binds) triangleFrames(this.points, this.baked.faces, this.frames);
-    const { changes, attributes } = this.baked;
+    if (!bound || !rig) return;
+    this.points = rig.pose(face);
+    if (this.binds) triangleFrames(this.points, bound.faces, this.frames);
+    const { changes, attributes } = bound;
     if (!changes) return;
-    const weights = activations(changes, face), before = this.activations;
+    const weights = activations(changes, face, changes.reach[0]), before = this.activations;
     this.activations = weights;
     // Turns of the head alone change none of this.
     this.changed = !this.posed || weights.some((weight, k) => weight !== before[k]);
     if (!this.changed) return;
     this.posed = true;
     if (!this.binds) return;
-    changed(this.baked.means, changes.means, weights, this.means);
+    changed(bound.means, changes.means, weights, this.means);
     changed(attributes.opacity_logits, changes.opacity_logits, weights, this.opacityLogits);
     changed(this.restColors, changes.color, weights, this.colors);
     if (!this.network || !this.runsNetwork) return;
@@ -243,7 +256,7 @@ export class Poser {
 
   /** Depths of the centres along a row of a view of the head frame: x view[0] + y view[1] + z view[2] + view[3]. */
   depths(view: ArrayLike<number>, out: Float32Array): void {
-    const { frames, means } = this, { face_index } = this.baked, [x, y, z, w] = [view[0], view[1], view[2], view[3]];
+    const { frames, means, faceIndex } = this, [x, y, z, w] = [view[0], view[1], view[2], view[3]];
     const rows = new Float32Array(frames.length / 3);
     for (let f = 0, r = 0; f < frames.length; f += 12, r += 4) {
       rows[r] = x * frames[f] + y * frames[f + 4] + z * frames[f + 8];
@@ -252,16 +265,16 @@ export class Poser {
       rows[r + 3] = x * frames[f + 3] + y * frames[f + 7] + z * frames[f + 11] + w;
     }
     for (let i = 0, p = 0; i < out.length; ++i, p += 3) {
-      const r = 4 * face_index[i];
+      const r = 4 * faceIndex[i];
       out[i] = rows[r] * means[p] + rows[r + 1] * means[p + 1] + rows[r + 2] * means[p + 2] + rows[r + 3];
     }
   }
 
   /** Centres in the head frame [n, 3]. Drawing computes them on the GPU; this is for tests and other programs. */
   centres(): Float32Array {
-    const { frames, means } = this, { face_index } = this.baked, out = new Float32Array(means.length);
+    const { frames, means, faceIndex } = this, out = new Float32Array(means.length);
     for (let i = 0, p = 0; p < out.length; ++i, p += 3) {
-      const f = 12 * face_index[i];
+      const f = 12 * faceIndex[i];
       for (let row = 0; row < 3; ++row)
         out[p + row] = frames[f + 4 * row] * means[p] + frames[f + 4 * row + 1] * means[p + 1] + frames[f + 4 * row + 2] * means[p + 2] + frames[f + 4 * row + 3];
     }

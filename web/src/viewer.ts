@@ -50,12 +50,10 @@ export class Viewer {
   constructor(readonly canvas: HTMLCanvasElement, readonly avatar: Avatar, public motion: Motion | null = null, backend?: Backend) {
     this.face = copyFace(avatar.neutral);
     this.poser = new Poser(avatar.baked);
-    const count = avatar.baked.face_index.length;
+    const count = this.poser.faceIndex.length;
     this.sorter = new DepthSorter(count);
     this.depths = new Float32Array(count);
-    // A rig of one triangle holds Gaussians that follow no mesh.
-    const { rig, means } = avatar.baked;
-    this.middle = middleOf(rig.template.length > 9 ? rig.template : means);
+    this.middle = middleOf(this.poser.rest);
     this.renderer = backend?.(canvas, avatar, this.poser, () => this.change(), Renderer) ?? new Renderer(canvas, avatar, this.poser);
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
@@ -135,7 +133,7 @@ export class Viewer {
     turn[3] = pivot[0] - to[0];
     turn[7] = pivot[1] - to[1];
     turn[11] = pivot[2] - to[2];
-    const worldDirections = this.avatar.baked.sh_frame === "world";
+    const worldDirections = this.poser.bound?.sh_frame === "world";
     const p = pose;
     const directions = worldDirections ? [p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]] : [1, 0, 0, 0, 1, 0, 0, 0, 1];
     if (this.matrices) return { directions, width, height, ...fromOpenGL(this.matrices, width, height) };

@@ -1,6 +1,6 @@
 // Poses an avatar as a page does, for tests/test_web.py:
 //   node pose.mjs MIEN.JS AVATAR (.mien or packed) FACES.JSON OUT   writes float32 arrays, face by face:
-//     points of the rig, centres, raw opacities, first colours; then, of Gaussians on no mesh, rotations and scales
+//     points of the mesh, centres, raw opacities, first colours; then, of Gaussians on no mesh, rotations and scales
 //   node pose.mjs MIEN.JS AVATAR FACES.JSON   prints milliseconds: least of posing and sorting, over all faces
 import { readFileSync, writeFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
@@ -16,12 +16,12 @@ const poser = new Poser(avatar.baked);
 if (out) {
   const written = faces.flatMap((face) => {
     poser.pose(face);
-    const shapes = poser.skinned ? [poser.skinned.quats, poser.skinned.scales] : [];
+    const shapes = poser.free ? [poser.free.quats, poser.free.scales] : [];
     return [poser.points, poser.centres(), poser.opacityLogits, poser.colors, ...shapes].map((array) => Buffer.from(array.slice().buffer));
   });
   writeFileSync(out, Buffer.concat(written));
 } else {
-  const count = avatar.baked.face_index.length, depths = new Float32Array(count), sorter = new DepthSorter(count);
+  const count = poser.faceIndex.length, depths = new Float32Array(count), sorter = new DepthSorter(count);
   const times = Array.from({ length: 60 }, (_, i) => {
     const began = performance.now();
     poser.pose(faces[i % faces.length]);

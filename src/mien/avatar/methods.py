@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from mien.avatar.settings import MethodConfig
 from mien.errors import UserError
+from mien.lazy import named
 from mien.plugins import plugin, plugin_names, plugins
 
 if TYPE_CHECKING:
@@ -50,8 +51,7 @@ class Method:
     @property
     def avatar(self) -> "type[Avatar]":
         """The class of the method's avatars. Its arguments are (config, face_model, face)."""
-        module, name = self.avatar_class.split(":")
-        return getattr(importlib.import_module(module), name)
+        return named(self.avatar_class)
 
 
 METHODS = {

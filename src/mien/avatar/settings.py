@@ -4,7 +4,7 @@ Every number has its range beside it (`mien.ranges`), and every field a descript
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, final
 
 from mien.avatar.schedules import Rate
 from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
@@ -191,6 +191,7 @@ class MethodConfig:
     face_tuning: FaceTuning = field(default_factory=FaceTuning)
     """Whether and how fast training changes the tracked face parameters of each frame."""
 
+    @final
     def check(self) -> None:
         """Check that all numbers are in their ranges.
 

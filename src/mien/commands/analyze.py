@@ -1,15 +1,19 @@
 """`mien analyze`: the figures of a method's paper, measured on a run."""
 
 from dataclasses import dataclass
+from inspect import cleandoc
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts
 from mien.workspace import Workspace, open_workspace
 
-AnalysisName = Literal["gaussian-avatars", "headgas", "mono-gaussian-avatar"]
-"""The keys of `mien.lab.analysis.ANALYSES`, written out for options. A test compares them."""
+if TYPE_CHECKING:
+    AnalysisName = str
+else:
+    AnalysisName = Literal[tuple(ANALYSES)]
 
 
 @dataclass(frozen=True)
@@ -18,18 +22,6 @@ class Command:
 
     Writes analysis.html (one page), analysis.json and a .png for each chart and picture. A stopped command continues
     where it was, and what is measured is not measured again.
-
-    Parts of gaussian-avatars: growth (Gaussians and step time over training), speed (drawing at five sizes, and
-    memory), teeth (with and without the Gaussians on teeth), teeth-trained and scale (two short trainings each: without
-    the triangles of teeth, and without the threshold of the scale loss).
-
-    Parts of headgas: basis (one expression at a time, beside the mesh), layers (Gaussians removed from near to far),
-    beyond (an expression to 1.4 times its training maximum, and views beyond those of training), sizes (time of a frame
-    against the size of the picture), ablations (a short training for each variant of the paper).
-
-    Parts of mono-gaussian-avatar: times (of the training, and of a frame with networks and baked), convergence
-    (held-out pictures during a short training), resolutions (short trainings at full and at half resolution), diversity
-    (short trainings on all frames, on a frontal quarter and on a mixed half).
     """
 
     method: Annotated[AnalysisName, tyro.conf.Positional]
@@ -55,7 +47,6 @@ class Command:
         """Check options and paths without heavy libraries."""
         from mien.files import check_writable
         from mien.inside import check_subtrees
-        from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts
 
         AnalysisOptions(self.steps, self.seconds).check()
         chosen_parts(ANALYSES[self.method], self.parts, self.train)
@@ -68,7 +59,7 @@ class Command:
         import json
 
         from mien.commands.stages.evaluating import run_sequences
-        from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
+        from mien.lab.analysis import run_analysis
         from mien.progress import say
         from mien.terminal import show
 
@@ -88,3 +79,8 @@ class Command:
 
     def _folder(self, workspace: Workspace, run: str) -> Path:
         return self.out or workspace.root / "analysis" / run
+
+
+# The help names the parts of every analysis, which only the analyses know.
+_PARTS = (f"Parts of {name}: {analysis.about_parts}." for name, analysis in ANALYSES.items())
+Command.__doc__ = "\n\n".join((cleandoc(str(Command.__doc__)), *_PARTS))

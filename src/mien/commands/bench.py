@@ -13,6 +13,8 @@ from mien.avatar import DEFAULT_METHOD, METHODS
 from mien.commands.options import PresetName, check_method, listed_methods
 from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
+from mien.lab.benchmarking.registry import STEP_BENCHMARKS
+from mien.lazy import named
 from mien.terminal import show
 from mien.workspace import open_workspace
 
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
 
     from mien.lab.benchmarking.timing import BenchmarkRow, Machine
 
+    StepMethod = str
+else:
+    StepMethod = Literal[tuple(STEP_BENCHMARKS)]
 
 CaptureName = Literal[
     "mono-short", "mono-long", "ring-16", "ring-16-large", "beard", "long-hair", "glasses", "off-model", "mono-sides",
@@ -93,9 +98,9 @@ class Scaling:
 class TrainStep:
     """Measure a training step (no footage is needed), and posing together with drawing."""
 
-    method: Literal["gaussian_avatars", "headgas", "mono_gaussian_avatar"] = "gaussian_avatars"
-    """Method to measure. The other two are measured on the CPU at 512x512: headgas with the paper's features and
-    colours, mono_gaussian_avatar with the sizes of the preset standard."""
+    method: StepMethod = DEFAULT_METHOD
+    """Method to measure. All but the default are measured on the CPU at 512x512, with the sizes of their papers or of
+    the preset standard."""
 
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
@@ -108,26 +113,17 @@ class TrainStep:
         """Check that CUDA has gsplat and that there is time to measure."""
         check_device(self.device)
         _check_seconds(self.seconds)
-        if self.method != "gaussian_avatars" and self.device == "cuda":
+        if STEP_BENCHMARKS[self.method].on_gpu is None and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
 
     def run(self) -> None:
         """Measure and print the rows."""
-        from mien.lab.benchmarking.headgas_step import headgas_suite
-        from mien.lab.benchmarking.mono_step import mono_suite
-        from mien.lab.benchmarking.train_step import train_step_suite
-
-        suites = {"headgas": headgas_suite, "mono_gaussian_avatar": mono_suite}
-        if self.method in suites:
-            show_rows(suites[self.method](self.seconds), self.as_json)
-            return
-        like = _gpu(self.device)
-        if like is None:
-            show_rows(train_step_suite(self.seconds), self.as_json)
-            return
-        from mien.lab.benchmarking.device import train_step_rows
-
-        show_rows(train_step_rows(like, self.seconds), self.as_json, gpu=True)
+        benchmark = STEP_BENCHMARKS[self.method]
+        like = None if benchmark.on_gpu is None else _gpu(self.device)
+        if benchmark.on_gpu is None or like is None:
+            show_rows(named(benchmark.suite)(self.seconds), self.as_json)
+        else:
+            show_rows(named(benchmark.on_gpu)(like, self.seconds), self.as_json, gpu=True)
 
 
 @dataclass(frozen=True)

@@ -83,12 +83,10 @@ class Command:
             self._follow()
             return
         from mien.commands.stages.driving import DriveOptions, run_driving_stage
-        from mien.commands.stages.pictures import warn_of_white
 
         assert self.out is not None, "checked"
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        warn_of_white(self.picture, run_dir)
         options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps, self.unlimited, self.neutral)
         run_driving_stage(run_dir, Path(self.by), self.out, options, self.picture)
 

@@ -115,7 +115,7 @@ class Command:
         timesteps = None if motion is None else len(motion)
         cameras = self._given_cameras(workspace, timesteps)
         output = self.picture.plan(self.out, self._frames(timesteps) if cameras is None else len(cameras))
-        warn_of_white(self.picture, run_dir)
+        warn_of_white(self.picture, run_dir, avatar)
         subject = avatar.subject
         face = replace(
             motion or self._chosen_timestep(run_dir, avatar.face_model) or subject,

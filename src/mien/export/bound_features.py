@@ -1,8 +1,10 @@
-"""Gaussians of headgas in the form of bound ones, which web pages draw: features on one triangle that never moves."""
+"""Static Gaussians with a network of features, in the form of bound ones: features on one triangle that never moves.
+
+GPUs run such networks of bound Gaussians. Pages run those of others on the processor.
+"""
 
 import numpy as np
 
-from mien.errors import UserError
 from mien.runtime import MeshBound, PortableAvatar, Rig, Static
 from mien.runtime.baked import ExpressionChanges, FeatureChanges
 
@@ -12,29 +14,23 @@ _REACH = np.float32(1e6)
 """Length of activations that no face has, so that none is shortened."""
 
 
-def bound_features(avatar: PortableAvatar) -> MeshBound:
-    """The Gaussians of an avatar of headgas as features on one triangle. They look the same.
+def bound_features(avatar: PortableAvatar, baked: Static) -> MeshBound | None:
+    """The Gaussians of an avatar, whose record is `baked`, as features on one triangle. They look the same.
 
-    Raises:
-        UserError: the network is not that of headgas, or colours depend on the view.
+    None if their changes are not those of `FeatureChanges`: another network, linear bases, or colours that depend on
+    the view.
     """
-    baked = avatar.baked
-    assert isinstance(baked, Static)
-    network, name = baked.network, avatar.about.name
+    network = baked.network
     if (
         network is None
         or network.along is None
+        or baked.bases is not None
         or len(network.weights) != 2
+        or network.activation != "leaky_relu"
         or network.outputs != ("sh", "opacity_logits")
+        or baked.attributes.sh.shape[1] != 1
     ):
-        raise UserError(
-            f"{name}: a page draws avatars of headgas with --method.variant full; train one, or export a .mien"
-        )
-    if baked.attributes.sh.shape[1] != 1:
-        raise UserError(
-            f"{name}: colours depend on the view ({baked.attributes.sh.shape[1]} coefficients), and a page draws "
-            "avatars of headgas with one colour; train with --method.sh-degree 0, or export a .mien"
-        )
+        return None
     along = network.along
     width = along.basis.shape[2]
     changes = ExpressionChanges(

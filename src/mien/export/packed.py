@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from mien.errors import UserError
 from mien.export.bound_features import bound_features
-from mien.runtime import BlendSkinned, Face, PortableAvatar, Static
+from mien.runtime import BlendSkinned, Face, MeshBound, PortableAvatar, Static
 
 FORMAT, VERSION = "mien.packed", 1
 
@@ -69,7 +69,12 @@ _CODES = {
     "avatar.baked.changes.features.neutral": _Code(8, "columns"),
     "avatar.baked.changes.features.basis": _Code(8, "columns", signed=True, levels=31),
     "avatar.baked.changes.features.own": _Code(8, "columns"),
+    "avatar.baked.bases.means": _Code(16, "first", signed=True),
+    "avatar.baked.bases.log_scales": _Code(8, "columns", signed=True),
+    "avatar.baked.bases.opacity_logits": _Code(8, "columns", signed=True),
+    "avatar.baked.bases.sh": _Code(8, "columns", signed=True),
     "avatar.baked.network.base": _Code(16, "columns"),
+    "avatar.baked.network.along.basis": _Code(8, "columns", signed=True),
     "avatar.baked.still_weights": _Code(16, "columns", signed=True),
     "avatar.baked.rig.template": _Code(16, "columns"),
     "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True),
@@ -108,13 +113,19 @@ def unpacked(avatar: PortableAvatar) -> PortableAvatar:
 
 
 def _prepared(avatar: PortableAvatar) -> PortableAvatar:
-    """The same avatar in the order of its triangles, with unit rotations, and without invisible differences."""
-    baked = avatar.baked
-    if isinstance(baked, BlendSkinned):
-        _check_network(baked, avatar.about.name)
-        return avatar
-    if isinstance(baked, Static):
-        baked = bound_features(avatar)
+    """The same avatar as pages draw it: bound Gaussians in the order of their triangles, others as they are."""
+    match avatar.baked:
+        case MeshBound() as baked:
+            return replace(avatar, baked=_ordered(baked))
+        case Static() as baked if (bound := bound_features(avatar, baked)) is not None:
+            return replace(avatar, baked=_ordered(bound))
+        case BlendSkinned() | Static() as baked:
+            _check_colors(baked, avatar.about.name)
+            return avatar
+
+
+def _ordered(baked: MeshBound) -> MeshBound:
+    """The same Gaussians in the order of their triangles, with unit rotations, and without invisible differences."""
     order = np.argsort(baked.face_index, kind="stable")
     raw = baked.attributes
     lengths = np.maximum(np.linalg.norm(raw.quats, axis=1, keepdims=True), 1e-12)
@@ -136,17 +147,21 @@ def _prepared(avatar: PortableAvatar) -> PortableAvatar:
         if (features := changes.features) is not None:
             rows = {name: getattr(features, name)[order] for name in ("neutral", "basis", "own")}
             changes = replace(changes, features=replace(features, **rows))
-    baked = replace(
+    return replace(
         baked, face_index=baked.face_index[order], means=baked.means[order], attributes=attributes, changes=changes
     )
-    return replace(avatar, baked=baked)
 
 
-def _check_network(baked: BlendSkinned, name: str) -> None:
-    """Refuse what the runtime of pages does not pose: it knows the network of mono_gaussian_avatar."""
-    network = baked.network
-    if baked.bases is not None or network is None or (network.input, network.activation) != ("displacement", "relu"):
-        raise UserError(f"{name}: a page cannot draw Gaussians with another network or with bases; export a .mien")
+def _check_colors(baked: BlendSkinned | Static, name: str) -> None:
+    """Refuse colours that depend on face and view: pages change the first coefficient of colours with the face."""
+    count = baked.attributes.sh.shape[1]
+    bases, network = baked.bases, baked.network
+    vary = (bases is not None and bases.sh is not None) or (network is not None and "sh" in network.outputs)
+    if vary and count > 1:
+        raise UserError(
+            f"{name}: its colours depend on the face and on the view ({count} coefficients each), which a page cannot "
+            "draw; train it with colours of degree 0, or export a .mien"
+        )
 
 
 def _grouped(array: np.ndarray, code: _Code) -> np.ndarray:

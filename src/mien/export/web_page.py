@@ -56,7 +56,7 @@ def write_page(
         webgpu: Whether the page draws with WebGPU where the browser has it on a GPU. WebGL2 is the default.
 
     Raises:
-        UserError: pages cannot draw the avatar's network, a file cannot be read, or the path cannot be written.
+        UserError: pages cannot draw the avatar's colours, a file cannot be read, or the path cannot be written.
     """
     check_writable(path)
     packed = base64.b64encode(pack(avatar, motion)).decode()
@@ -81,7 +81,7 @@ def write_packed(path: Path, avatar: PortableAvatar, motion: Motion | None = Non
     """Write the packed form alone, for pages of one's own (`<mien-avatar src=...>`, docs/publishing.md).
 
     Raises:
-        UserError: pages cannot draw the avatar's network, or the path cannot be written.
+        UserError: pages cannot draw the avatar's colours, or the path cannot be written.
     """
     check_writable(path)
     content = pack(avatar, motion)

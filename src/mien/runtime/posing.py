@@ -99,7 +99,7 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
 
 
 def _has_native_activations(baked: BlendSkinned) -> bool:
-    """Whether all changes of attributes are those of one network of points, as mono_gaussian_avatar has it."""
+    """Whether all changes of attributes are those of one network of points, which the core activates."""
     network = baked.network
     return (
         network is not None
@@ -263,7 +263,7 @@ def _raw_values(
 
 
 def _has_native_layers(network: AttributeNetwork) -> bool:
-    """Whether this is a network of `_native.point_network`, as mono_gaussian_avatar has it."""
+    """Whether this is a network of `_native.point_network`: of the points' motion, with ReLU."""
     return network.input == "displacement" and network.activation == "relu" and len(network.weights) <= _MOST_LAYERS
 
 
@@ -282,7 +282,7 @@ def _run_layers(network: AttributeNetwork, displacement: Float32[np.ndarray, "n 
 
 
 def _has_native(network: AttributeNetwork) -> bool:
-    """Whether this is the network of `_native.feature_network`, as headgas has it: two layers on blended features."""
+    """Whether this is the network of `_native.feature_network`: two layers on blended features."""
     return (
         network.input == "features"
         and len(network.weights) == 2

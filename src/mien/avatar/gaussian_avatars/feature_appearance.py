@@ -18,7 +18,7 @@ from mien.avatar.store import GaussianStore
 from mien.runtime.baked import FeatureChanges
 
 _BANDS, _LENGTH = 4, 0.05
-"""Octaves of the encoding of a place, and its unit in metres, as in `headgas`."""
+"""Octaves of the encoding of a place, and its unit in metres, as in HeadGaS."""
 
 
 class FeatureAppearance(nn.Module):

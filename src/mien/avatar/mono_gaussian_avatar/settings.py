@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import GAUSSIAN_COUNT, FaceTuning, MethodConfig, PerceptualLoss, Photometric
-from mien.errors import UserError
-from mien.ranges import NOT_NEGATIVE, Range, ToLoad
+from mien.ranges import NOT_NEGATIVE, Above, Range, ToLoad
 
 LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
@@ -50,7 +49,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Radius of the initial sphere around the origin of the head frame, in metres."""
     max_points: Annotated[int, GAUSSIAN_COUNT] = 10_000
     """Largest number of Gaussians. Growth stops there (paper: 100,000)."""
-    epochs: Annotated[int, Range(1, 100_000)] = _EPOCHS
+    epochs: Annotated[int, Range(1, 100_000), Above("first_epoch")] = _EPOCHS
     """The paper's epoch with which the run ends. After each epoch, points are pruned and refilled; number of points,
     radii and the weight of the face model's terms follow the epochs."""
     first_epoch: Annotated[int, Range(0, 100_000)] = 0
@@ -90,19 +89,6 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Weight of the losses that keep the networks near the face model. It halves at epochs 20, 30, 50 and 70."""
     face_points: Annotated[int, GAUSSIAN_COUNT] = 256
     """Number of points that these losses use in each step, in turn."""
-
-    def check(self) -> None:
-        """Check the numbers' ranges, and that the run has epochs.
-
-        Raises:
-            UserError: a number is out of range, or `first_epoch` is not smaller than `epochs`.
-        """
-        super().check()
-        if self.first_epoch >= self.epochs:
-            raise UserError(
-                f"--method.first-epoch {self.first_epoch}: has to be smaller than --method.epochs {self.epochs}; "
-                "choose a smaller one, or more epochs"
-            )
 
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 120, 2_500

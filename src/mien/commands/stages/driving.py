@@ -13,7 +13,7 @@ from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.options import NEUTRALS, check_driver, check_neutral, is_tracked_sequence
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import run_capture_stage
-from mien.commands.stages.pictures import draw, view
+from mien.commands.stages.pictures import draw, view, warn_of_white
 from mien.commands.stages.tracking import run_tracking_stage
 from mien.driving import (
     Driver,
@@ -110,6 +110,7 @@ def run_driving_stage(
     # The number of frames is known only after tracking, but a video or numbered pictures take any number.
     output = picture.plan(out, 2)
     avatar = load_avatar(run_dir)
+    warn_of_white(picture, run_dir, avatar)
     driver = open_driver(by, options.sequence, avatar.face_model, options.fps, options.neutral)
     bounds, filmed_by = avatar.face_model.expression_bounds, run_camera(run_dir)
     person = rest_of(avatar.subject, avatar.face_model, facing(filmed_by.viewmat)).face

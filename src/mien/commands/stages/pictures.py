@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from mien.avatar import Avatar
 from mien.camera import Camera
 from mien.commands.picture import PictureOptions
 from mien.export.pictures import to_rgb, to_rgba
@@ -32,17 +33,17 @@ def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8
     return to_rgba(image, alpha) if options.background == "transparent" else to_rgb(image)
 
 
-def warn_of_white(options: PictureOptions, run_dir: Path) -> None:
+def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> None:
     """Warn if transparent pictures are asked for but the run was trained over white."""
-    if options.background == "transparent" and _trained_over_white(read_run_config(run_dir)):
+    if options.background == "transparent" and _trained_over_white(read_run_config(run_dir)["settings"], avatar):
         say(
             "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
             "`mien train --background random` avoids that"
         )
 
 
-def _trained_over_white(config: dict[str, Any]) -> bool:
-    """Whether a run had a white background. `auto` is random where method and settings can fill sides."""
-    background, unseen = (config["settings"].get(name) for name in ("background", "unseen"))
-    may_fill = config["method"]["kind"] == "gaussian_avatars" and unseen != "trained"
+def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:
+    """Whether a run had a white background. `auto` is random where avatar and settings can fill sides."""
+    background = settings.get("background")
+    may_fill = avatar.surface() is not None and settings.get("unseen") != "trained"
     return background == "white" or (background == "auto" and not may_fill)

@@ -1,11 +1,11 @@
 """An analysis has a method, and parts that can be chosen. No torch is needed, because the command line checks it."""
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from mien.errors import UserError
+from mien.lazy import named
 from mien.ranges import Range, check_ranges
 
 if TYPE_CHECKING:
@@ -49,8 +49,7 @@ class Part:
 
     def run(self, context: "Context") -> "PartResult":
         """Compute the part."""
-        module, name = self.function.split(":")
-        return getattr(importlib.import_module(module), name)(context)
+        return named(self.function)(context)
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,8 @@ class Analysis:
     paper: str
     """The paper whose figures stand beside the measured ones."""
     parts: tuple[Part, ...]
+    about_parts: str = ""
+    """What the parts measure, for `mien analyze --help`: each name, and a few words in brackets."""
 
 
 def chosen_parts(analysis: Analysis, names: Sequence[str], train: bool) -> list[Part]:

@@ -29,5 +29,8 @@ ANALYSIS = Analysis(
             trainings=2,
         ),
     ),
+    about_parts="growth (Gaussians and step time over training), speed (drawing at five sizes, and memory), teeth "
+    "(with and without the Gaussians on teeth), teeth-trained and scale (two short trainings each: without the "
+    "triangles of teeth, and without the threshold of the scale loss)",
 )
 """The parts, in the order of the page."""

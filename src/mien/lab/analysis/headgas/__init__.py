@@ -33,5 +33,8 @@ ANALYSIS = Analysis(
             trainings=6,
         ),
     ),
+    about_parts="basis (one expression at a time, beside the mesh), layers (Gaussians removed from near to far), "
+    "beyond (an expression to 1.4 times its training maximum, and views beyond those of training), sizes (time of a "
+    "frame against the size of the picture), ablations (a short training for each variant of the paper)",
 )
 """The parts, in the order of the page."""

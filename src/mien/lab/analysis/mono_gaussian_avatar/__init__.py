@@ -33,5 +33,8 @@ ANALYSIS = Analysis(
             trainings=3,
         ),
     ),
+    about_parts="times (of the training, and of a frame with networks and baked), convergence (held-out pictures "
+    "during a short training), resolutions (short trainings at full and at half resolution), diversity (short "
+    "trainings on all frames, on a frontal quarter and on a mixed half)",
 )
 """The parts, in the order of the page."""

@@ -1,0 +1,170 @@
+"""Two rules of CONTRIBUTING.md that no other tool checks: who may name a method, and what may be overridden.
+
+`make lint` runs this file in the repository's root. No file names a method but those of the method and those in
+`MAY_NAME`. No class in src/mien overrides a method that a base class in src/mien implements. What may be overridden:
+abstract methods, methods of protocols, methods with two underscores, and methods of other packages' classes, such as
+torch's `forward`.
+"""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+MAY_NAME = {
+    "src/mien/avatar/methods.py": "the list of methods",
+    "src/mien/avatar/__init__.py": "the door: programs build avatars of a method they choose",
+    "src/mien/lab/analysis/registry.py": "the list of analyses, one for the paper of each method",
+    "src/mien/lab/benchmarking/registry.py": "the list of benchmarks of training steps",
+    "src/mien/lab/benchmarking/train_step.py": "measures the step of one method",
+    "src/mien/lab/benchmarking/device.py": "measures the step of one method on a GPU",
+    "src/mien/lab/benchmarking/headgas_step.py": "measures the step of one method",
+    "src/mien/lab/benchmarking/mono_step.py": "measures the step of one method",
+    "src/mien/formats/registry.py": "the list of formats; one is named after the program whose files it reads",
+    "src/mien/datasets/registry.py": "the list of datasets; one is named after the program whose files it reads",
+    "src/mien/export/gaussian_avatars_folder.py": "the files of that method's own program become its avatars",
+}
+"""Files that may name a method although they are not its own, and why."""
+OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}/")
+"""Files of a method itself."""
+
+
+@dataclass(frozen=True)
+class MethodNames:
+    """The names of a method in code."""
+
+    name: str
+    classes: tuple[str, ...]
+    """Its class of avatars, and that of its settings."""
+
+
+def method_names() -> list[MethodNames]:
+    """Return the names of mien's methods."""
+    from mien.avatar.methods import METHODS
+
+    return [
+        MethodNames(name, (method.avatar_class.split(":")[1], method.config.__name__))
+        for name, method in METHODS.items()
+    ]
+
+
+def naming_faults(texts: Mapping[str, str], methods: list[MethodNames], may_name: Mapping[str, str]) -> Iterator[str]:
+    """Yield a message for each file that names a method and may not, and for each of `may_name` that names none.
+
+    A method's name counts anywhere in a file, also in comments. Its classes count in code alone, since papers that
+    docstrings cite are written like them.
+    """
+    idle = set(may_name)
+    for place, text in texts.items():
+        for method in methods:
+            line = _line_of(place, text, method)
+            if line is None or place.startswith(tuple(own.format(method.name) for own in OWN)):
+                continue
+            idle.discard(place)
+            if place not in may_name:
+                yield f"{place}:{line}: names the method {method.name}; ask what it is needed for of the avatar itself"
+    yield from (f"tests/seams.py: {place} names no method any more; take it out of MAY_NAME" for place in sorted(idle))
+
+
+def _line_of(place: str, text: str, method: MethodNames) -> int | None:
+    """The first line that names the method."""
+    found = re.search(rf"\b{method.name}\b", text)
+    if found is not None:
+        return text.count("\n", 0, found.start()) + 1
+    if not place.endswith(".py") or not any(one in text for one in method.classes):
+        return None
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return next(
+        (token.start[0] for token in tokens if token.type == tokenize.NAME and token.string in method.classes), None
+    )
+
+
+@dataclass
+class _Class:
+    """A class in the source."""
+
+    place: str
+    bases: tuple[str, ...]
+    """Full names, "mien.avatar.avatar.Avatar", of those bases that have one."""
+    is_protocol: bool
+    concrete: dict[str, int] = field(default_factory=dict)
+    """Line of each method that has a body of its own."""
+    abstract: dict[str, int] = field(default_factory=dict)
+    """Line of each abstract method."""
+
+
+def override_faults(texts: Mapping[str, str]) -> Iterator[str]:
+    """Yield a message for each method that a class overrides although a base class implements it.
+
+    Args:
+        texts: Sources by their places, such as "src/mien/avatar/avatar.py".
+    """
+    classes: dict[str, _Class] = {}
+    doors: dict[str, str] = {}
+    for place, text in texts.items():
+        _read_classes(place, text, classes, doors)
+
+    def found(name: str) -> str | None:
+        seen: set[str] = set()
+        while name not in classes and name in doors and name not in seen:
+            seen.add(name)
+            name = doors[name]
+        return name if name in classes else None
+
+    def ancestors(name: str) -> Iterator[str]:
+        for base in map(found, classes[name].bases):
+            if base is not None:
+                yield base
+                yield from ancestors(base)
+
+    for name, one in classes.items():
+        for method, line in {**one.abstract, **one.concrete}.items():
+            over = next((base for base in ancestors(name) if method in classes[base].concrete), None)
+            if over is not None and not classes[over].is_protocol:
+                yield f"{one.place}:{line}: {name}.{method} overrides that of {over}, which is not abstract"
+
+
+def _read_classes(place: str, text: str, classes: dict[str, _Class], doors: dict[str, str]) -> None:
+    """Add the classes of a file, and what its imports mean."""
+    path = Path(place).with_suffix("")
+    parts = path.parts[1 : -1 if path.name == "__init__" else None]
+    module = ".".join(parts)
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for name in node.names:
+                doors[f"{module}.{name.asname or name.name}"] = f"{node.module}.{name.name}"
+        if isinstance(node, ast.Import):
+            for name in node.names:
+                doors[f"{module}.{name.asname or name.name}"] = name.name
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.ClassDef):
+            continue
+        bases = []
+        for base in node.bases:
+            head, _, tail = ast.unparse(base.value if isinstance(base, ast.Subscript) else base).partition(".")
+            known = doors.get(f"{module}.{head}", f"{module}.{head}")
+            bases.append(f"{known}.{tail}" if tail else known)
+        one = _Class(place, tuple(bases), any(base.endswith("Protocol") for base in bases))
+        for item in node.body:
+            if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef) and not re.fullmatch("__.*__", item.name):
+                marks = {ast.unparse(mark).split(".")[-1] for mark in item.decorator_list}
+                (one.abstract if "abstractmethod" in marks else one.concrete)[item.name] = item.lineno
+        classes[f"{module}.{node.name}"] = one
+
+
+def main() -> int:
+    """Check every source file, and report what breaks a rule."""
+    python = {str(path): path.read_text() for path in sorted(Path("src/mien").rglob("*.py"))}
+    scripts = {str(path): path.read_text() for path in sorted(Path("web/src").glob("*.ts"))}
+    faults = [*naming_faults(python | scripts, method_names(), MAY_NAME), *override_faults(python)]
+    print("\n".join(faults) or f"Seams: {len(python) + len(scripts)} files checked; methods stay in their folders.")
+    return bool(faults)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
