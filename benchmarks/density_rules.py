@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from mien.avatar import Avatar, DensityRules, FaceTuning, GaussianAvatarsConfig, GradientSettings
+from mien.avatar.gaussian_avatars.settings import as_published
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit, evenly_spread
 from mien.face import FaceParams, load_face_model
@@ -26,7 +27,7 @@ from mien.lab.synthetic import Segment, SyntheticRecipe, synthesize
 from mien.render import rasterize
 from mien.storage import read_tensors
 from mien.tracking import Scoring, make_scoring
-from mien.training import PRESETS, Sequence, TrainSettings, held_out, read_curves, train
+from mien.training import PRESETS, Sequence, held_out, read_curves, train
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import composite
 
@@ -43,7 +44,7 @@ DENSITY = GradientSettings(prune_radius=20.0, max_gaussians=24_000)
 
 def configs() -> dict[str, GaussianAvatarsConfig]:
     """The rows of the table."""
-    base = GaussianAvatarsConfig(face_tuning=TUNED, density=DENSITY)
+    base = replace(as_published(), face_tuning=TUNED, density=DENSITY)
     rows = {"all rules on": base}
     for name in DensityRules.__dataclass_fields__:
         rules = replace(DensityRules(), **{name: False})
@@ -90,7 +91,8 @@ def main() -> None:
     face_model = load_face_model(tracking.face_model)
     scoring = make_scoring(capture, tracking, face_model)
     sequence = Sequence("rules", capture, tracking, scoring.masks)
-    settings = TrainSettings(steps=arguments.steps, held_out_cameras=(capture.camera_ids[HELD_OUT_CAMERA],))
+    plain, held = PRESETS["paper"].settings, (capture.camera_ids[HELD_OUT_CAMERA],)
+    settings = replace(plain, steps=arguments.steps, held_out_cameras=held)
     print("| rules | view | frames | Gaussians | step, ms | empty triangles |\n|---|---|---|---|---|---|", flush=True)
     for name, config in configs().items():
         run_dir = arguments.out / name.replace(",", "").replace(" ", "_")

@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.avatar import Avatar, GaussianAvatarsConfig, load_avatar
+from mien.avatar import Avatar, load_avatar
+from mien.avatar.gaussian_avatars.settings import as_published
 from mien.capture import Capture, read_capture, write_capture
 from mien.face import load_face_model
 from mien.lab.synthetic import RECIPES, synthesize
@@ -81,8 +82,10 @@ def measure(out: Path, name: str, steps: int) -> None:
     model = load_face_model(truth.face_model)
     tracked = track(capture, model)
     sequence = Sequence(capture.name, capture, truth, np.array(capture.mattes))
-    settings = TrainSettings(steps=steps, split="none", background="white")
-    own = train([sequence], model, GaussianAvatarsConfig(), settings, out / f"run-{name}")
+    settings = TrainSettings(
+        steps=steps, split="none", background="white", edges="filmed", inside="free", unseen="trained"
+    )
+    own = train([sequence], model, as_published(), settings, out / f"run-{name}")
     points = model(tracked.face)
     marks = model.landmark_positions(points, "mediapipe")
     np.savez(

@@ -4,11 +4,12 @@ python examples/05_train_and_evaluate.py out/examples/subject --steps 3000
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from mien.avatar import GaussianAvatarsConfig, GradientSettings
+from mien.avatar import GaussianAvatarsConfig
 from mien.evaluation import evaluate
 from mien.face import load_face_model
 from mien.training import TrainSettings, read_sequence, train
@@ -26,10 +27,12 @@ def main() -> None:
 
     torch.set_num_threads(1)
     workspace = open_workspace(options.workspace)
-    folders = [workspace.sequence_dir(name) for name in workspace.sequence_names()]
+    folders = [workspace.sequence_dir(name) for name in workspace.tracked_names()]
     sequences = [read_sequence(folder) for folder in folders]
-    method = GaussianAvatarsConfig(density=GradientSettings(max_gaussians=options.gaussians))
-    settings = TrainSettings(steps=options.steps, split="blocks", seed=0)
+    # The defaults are those of `mien train`. The same settings there give the same bytes.
+    method = GaussianAvatarsConfig()
+    method = replace(method, density=replace(method.density, max_gaussians=options.gaussians))
+    settings = TrainSettings(steps=options.steps)
     run_dir = workspace.run_dir(options.run)
     train(sequences, load_face_model(sequences[0].tracking.face_model), method, settings, run_dir)
 

@@ -17,6 +17,7 @@ from mien.tracking import Scoring, Tracking
 from mien.training import Split, held_out
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
+from plain_settings import plain_config
 from small_face_model import make_small_face_model
 
 SIZE = 72
@@ -27,7 +28,7 @@ def make_experiment(timesteps: int = 50, split: Split = "blocks", seed: int = 0)
     torch.manual_seed(seed)
     face_model = make_small_face_model()
     face = _motion(face_model.neutral(timesteps))
-    avatar = METHODS[DEFAULT_METHOD].avatar(METHODS[DEFAULT_METHOD].config(), face_model, face)
+    avatar = METHODS[DEFAULT_METHOD].avatar(plain_config(DEFAULT_METHOD), face_model, face)
     _paint(avatar)
     camera = camera_from_fov(0.6, SIZE, SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     sequence = drawn_sequence(avatar, face, camera)

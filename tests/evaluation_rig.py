@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning
+from mien.avatar import DEFAULT_METHOD, FaceTuning
 from mien.capture import read_capture_hash, write_capture
 from mien.evaluation.experiment import Experiment
 from mien.pictures import to_uint8
@@ -15,6 +15,7 @@ from mien.render.camera_paths import orbit
 from mien.tracking import write_scoring, write_tracking
 from mien.training import TrainSettings, read_sequence, train
 from mien.training.footage.sequence import Sequence
+from plain_settings import plain_config
 
 
 def two_cameras(experiment: Experiment, name: str) -> Sequence:
@@ -67,5 +68,5 @@ def write_sequence(root: Path, experiment: Experiment, sequence: Sequence) -> Pa
 
 def write_run(run_dir: Path, experiment: Experiment, folders: list[Path], settings: TrainSettings) -> None:
     """Train some sequences for a few steps."""
-    config = METHODS[DEFAULT_METHOD].config(face_tuning=FaceTuning(enabled=False))
+    config = plain_config(DEFAULT_METHOD, face_tuning=FaceTuning(enabled=False))
     train([read_sequence(folder) for folder in folders], experiment.avatar.face_model, config, settings, run_dir)

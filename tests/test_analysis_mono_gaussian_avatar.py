@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 import train_toy
-from mien.avatar import MonoGaussianAvatarConfig
 from mien.cli import main
 from mien.lab.analysis import ANALYSES
 from mien.lab.analysis.mono_gaussian_avatar import times
 from mien.lab.analysis.mono_gaussian_avatar.subsets import Measured, frontal_quarter, masks, measure, mixed_half, ranges
 from mien.training import TrainSettings
 from mien.training.footage.frames import training_frames
+from plain_settings import plain_mono_gaussian_avatar
 from toy_scene import toy_sequence
 from toy_workspace import write_toy_workspace
 
-CONFIG = MonoGaussianAvatarConfig(points=60, max_points=120, epochs=10)
+CONFIG = plain_mono_gaussian_avatar(points=60, max_points=120, epochs=10)
 
 
 @pytest.fixture(scope="module")

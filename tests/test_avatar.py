@@ -11,18 +11,19 @@ from damage import edit_json
 from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, FixedDensity, load_avatar, write_avatar
 from mien.errors import UserError
 from mien.face import FaceModel
+from plain_settings import plain_config
 from toy_scene import toy_face, toy_face_model
 
 
 def new_avatar(method: str = DEFAULT_METHOD, face_model: FaceModel | None = None) -> Avatar:
     torch.manual_seed(0)
-    return METHODS[method].avatar(METHODS[method].config(), face_model or toy_face_model(), toy_face(5))
+    return METHODS[method].avatar(plain_config(method), face_model or toy_face_model(), toy_face(5))
 
 
 def test_subject_keeps_identity_and_offsets() -> None:
     face = replace(toy_face(5), vertex_offsets=torch.full((len(toy_face_model().template), 3), 0.001))
     method = METHODS[DEFAULT_METHOD]
-    avatar = method.avatar(method.config(), toy_face_model(), face)
+    avatar = method.avatar(plain_config(DEFAULT_METHOD), toy_face_model(), face)
     assert len(avatar.subject) == 1
     assert torch.equal(avatar.subject.identity, face.identity)
     assert avatar.subject.vertex_offsets is not None

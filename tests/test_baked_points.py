@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from mien import _native, runtime
-from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig
+from mien.avatar import MonoGaussianAvatar
 from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, DeformationNet
 from mien.runtime import posing
 from mien.runtime.baked import BlendSkinned
+from plain_settings import plain_mono_gaussian_avatar
 from test_point_network import NETWORKS, Sizes, arguments, isa, layers_of, point_network
 from toy_scene import runtime_face, toy_face, toy_face_model
 
@@ -40,7 +41,7 @@ def test_zeros_of_joined_layers_cost_no_bit(isa: str) -> None:
 
 def baked_avatar(points: int = 3000) -> BlendSkinned:
     torch.manual_seed(0)
-    avatar = MonoGaussianAvatar(MonoGaussianAvatarConfig(points=points), toy_face_model(), toy_face(5))
+    avatar = MonoGaussianAvatar(plain_mono_gaussian_avatar(points=points), toy_face_model(), toy_face(5))
     with torch.no_grad():
         for network in (avatar.attributes, avatar.deformation, avatar.change):
             for parameter in network.parameters():

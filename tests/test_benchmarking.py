@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 import torch
 
 from mien import _native
-from mien.avatar.headgas.settings import PRESETS as HEADGAS_PRESETS
+from mien.avatar import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
 from mien.lab.benchmarking import device as device_benchmark
@@ -110,7 +109,7 @@ def test_a_training_case_trains() -> None:
 
 
 def test_a_headgas_case_trains() -> None:
-    config = replace(HEADGAS_PRESETS["standard"], features=4)
+    config = HeadGasConfig(features=4)
     state, data = headgas_step.headgas_case(load_face_model(), config, 500, (96, 80))
     before = state.avatar.gaussian_store()["bases"].detach().clone()
     assert 0.2 < (data.targets[0].target(0, 0, np.full(3, 255, np.uint8), False).matte > 127).float().mean() < 0.8

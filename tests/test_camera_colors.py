@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.schedules import Progress
 from mien.errors import UserError
 from mien.face import FaceModel
@@ -19,9 +18,10 @@ from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.trainer import start
+from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import toy_sequence
 
-SETTINGS = TrainSettings(steps=8, split="none", camera_colors="first", checkpoint_every=4, record_every=1)
+SETTINGS = plain_run(steps=8, split="none", camera_colors="first", checkpoint_every=4, record_every=1)
 GAINS = torch.tensor([[1.0, 1.0, 1.0], [0.8, 1.0, 1.1], [1.2, 0.9, 1.0]])
 
 
@@ -105,19 +105,19 @@ def test_each_camera_has_one_map_in_all_sequences(rig):
 def test_one_camera_is_refused_before_anything_is_written(rig, tmp_path: Path):
     settings = replace(SETTINGS, held_out_cameras=("b", "c"))
     with pytest.raises(UserError, match=r"--training.camera-colors first: compares cameras, .* on a alone"):
-        train([rig[1]], rig[0], GaussianAvatarsConfig(), settings, tmp_path / "run")
+        train([rig[1]], rig[0], plain_gaussian_avatars(), settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 def test_a_stopped_run_resumes_with_its_colors(rig, tmp_path: Path):
     """The same bytes result with and without a stop, and the colours have moved."""
     face_model, sequence = rig
-    train([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, tmp_path / "whole")
+    train([sequence], face_model, plain_gaussian_avatars(), SETTINGS, tmp_path / "whole")
     stopped = tmp_path / "stopped"
-    train([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, stopped)
+    train([sequence], face_model, plain_gaussian_avatars(), SETTINGS, stopped)
     checkpoint_files(stopped / "checkpoints")[-1].unlink()
     (stopped / "training.json").unlink()
-    train([sequence], face_model, GaussianAvatarsConfig(), SETTINGS, stopped)
+    train([sequence], face_model, plain_gaussian_avatars(), SETTINGS, stopped)
     last = [checkpoint_files(folder / "checkpoints")[-1].name for folder in (tmp_path / "whole", stopped)]
     assert last[0] == last[1] == "step_0000008.safetensors"
     first, second = (read_tensors(folder / "checkpoints" / last[0]) for folder in (tmp_path / "whole", stopped))
@@ -129,8 +129,8 @@ def test_a_stopped_run_resumes_with_its_colors(rig, tmp_path: Path):
 
 def test_without_the_option_nothing_is_stored(rig, tmp_path: Path):
     settings = replace(SETTINGS, camera_colors="none")
-    parts = start([rig[1]], rig[0], GaussianAvatarsConfig(), settings).parts
+    parts = start([rig[1]], rig[0], plain_gaussian_avatars(), settings).parts
     assert "colors" not in [part.name for part in parts]
-    train([rig[1]], rig[0], GaussianAvatarsConfig(), settings, tmp_path / "run")
+    train([rig[1]], rig[0], plain_gaussian_avatars(), settings, tmp_path / "run")
     names = read_tensors(checkpoint_files(tmp_path / "run" / "checkpoints")[-1]).keys()
     assert not [name for name in names if name.startswith("colors")]

@@ -12,7 +12,6 @@ from mien import runtime
 from mien.avatar import (
     METHODS,
     Avatar,
-    GaussianAvatarsConfig,
     GaussianStore,
     Photometric,
     Progress,
@@ -31,15 +30,16 @@ from mien.gaussians import rgb_from_sh
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
 from mien.runtime.baked import Filmed
-from mien.training import Sequence, TrainSettings, filmed_words, read_coverage, train
+from mien.training import Sequence, filmed_words, read_coverage, train
 from mien.training.density_control import density_strategy
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
 from mien.training.footage.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.whole_head.unseen import Unseen, spare_fills, unseen_of
+from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import surface_of, toy_face, toy_sequence
 
-SETTINGS = TrainSettings(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)
+SETTINGS = plain_run(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def known(toy: tuple[FaceModel, Sequence], avatar: Avatar) -> Unseen:
 def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     """Fills have no gradients but those that move them along their normal."""
     model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
     unseen = known(toy, avatar)
     surface_of(avatar).close(unseen.prior)
     filled_in = unseen.filled_in(avatar)
@@ -153,14 +153,14 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
 
 def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
     unseen = known(toy, avatar)
     surface_of(avatar).close(unseen.prior)
     before = avatar.gaussian_store()["opacity_logits"].sigmoid()
     control, fills = spare_fills(avatar, avatar.density(), unseen), unseen.filled_in(avatar)
     assert isinstance(control, GradientDensity)
     assert fills is not None
-    assert control.settings.max_gaussians == GaussianAvatarsConfig().density.max_gaussians + int(fills.sum())
+    assert control.settings.max_gaussians == plain_gaussian_avatars().density.max_gaussians + int(fills.sum())
     density = density_strategy(control, avatar.gaussian_store())
     posed = avatar.pose(sequence.tracking.face[0])
     density.adapt(avatar.gaussian_store(), posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
@@ -187,7 +187,7 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
 def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     """From behind, where nothing was seen, the head is opaque and has the colours of the fill."""
     model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
     filled_in = facing(model) <= 0
     colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(filled_in), 3)
     surface_of(avatar).close(SurfacePrior(torch.zeros(len(filled_in)), None, colors, filled_in.float(), filled_in))
@@ -207,7 +207,7 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
 
 def test_colors_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Sequence]) -> None:
     model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
     doubt = (facing(model) <= 0).float()
     before = avatar.gaussian_store()["sh_constant"].detach().clone()
     prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt)
@@ -224,7 +224,7 @@ def test_colors_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Sequen
 def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Sequence]) -> None:
     """Fills have limits to the surface, and hair that hangs beside a triangle widens them there alone."""
     model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
     count = len(model.faces)
     hanging = 0.05 * (torch.arange(count) % 2).float()
     with torch.no_grad():
@@ -232,7 +232,7 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Seque
     surface_of(avatar).keep_to(
         SurfacePrior(torch.zeros(count), hanging, None, None, torch.zeros(count, dtype=torch.bool))
     )
-    bound, limits = avatar.gaussian_store()["face_index"], GaussianAvatarsConfig().surface
+    bound, limits = avatar.gaussian_store()["face_index"], plain_gaussian_avatars().surface
     height = avatar.gaussian_store()["means"][:, 1] * surface_of(avatar).sizes[bound]
     torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
 
@@ -295,7 +295,7 @@ def test_ellipses_have_the_moments_of_their_triangles() -> None:
 
 def test_a_run_keeps_its_coverage_and_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
     model, sequence = toy
-    config = GaussianAvatarsConfig()
+    config = plain_gaussian_avatars()
     whole = train([sequence], model, config, SETTINGS, tmp_path / "whole")
     kept = read_coverage(tmp_path / "whole", model)
     assert kept is not None
@@ -317,7 +317,7 @@ def test_a_run_keeps_its_coverage_and_resumes_exactly(toy: tuple[FaceModel, Sequ
 def test_a_filled_avatar_is_exported_as_it_is_posed(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
     """Fills are Gaussians like all others in each format: .mien, .ply, .glb and .html."""
     model, sequence = toy
-    avatar = train([sequence], model, GaussianAvatarsConfig(), SETTINGS, tmp_path / "run")
+    avatar = train([sequence], model, plain_gaussian_avatars(), SETTINGS, tmp_path / "run")
     filled_in = known(toy, avatar).filled_in(avatar)
     assert filled_in is not None
     assert filled_in.any()

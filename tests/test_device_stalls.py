@@ -14,9 +14,10 @@ from mien.avatar import METHODS, MethodConfig, Moments
 from mien.camera import Camera
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
-from mien.training import TrainSettings, batch, trainer
+from mien.training import batch, trainer
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
+from plain_settings import plain_config, plain_run
 from toy_scene import toy_sequence
 
 META = torch.zeros((), device="meta")
@@ -31,8 +32,8 @@ def test_meta_tensors_show_who_asks_for_a_number() -> None:
 def configs() -> dict[str, MethodConfig]:
     """All methods, with every loss, and again with colours that depend on the view where a method has them."""
     found = {}
-    for name, method in METHODS.items():
-        config = method.config()
+    for name in METHODS:
+        config = plain_config(name)
         tuning = replace(config.face_tuning, keep_mean_pose=True, keep_turns=True)
         config = replace(config, face_tuning=tuning)
         found[name] = replace(config, photometric=replace(config.photometric, alpha_weight=0.1))
@@ -49,7 +50,7 @@ def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch
     """The trainer's own step reads no number, in a run whose pictures are composited in every step."""
     monkeypatch.setattr(batch, "rasterize", _rendered)
     face_model, sequence = toy_sequence(timesteps=3, size=32)
-    settings = TrainSettings(steps=1_000_000, split="none", background="random", record_every=1_000_000)
+    settings = plain_run(steps=1_000_000, split="none", background="random", record_every=1_000_000)
     state = trainer.start([sequence], face_model, config, settings, META)
     order = FrameOrder(training_frames([sequence], settings), settings.seed)
     data = trainer.TrainingData(order, (Targets(sequence, 0, like=META),))

@@ -20,7 +20,7 @@ from mien.evaluation.redetection import angle_degrees, measure_motion, similarit
 from mien.face import most_frontal_camera
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import write_tracking
-from mien.training import TrainSettings
+from plain_settings import plain_run
 
 
 def _face(seed: int = 0) -> np.ndarray:
@@ -93,7 +93,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("cross")
     experiment = make_experiment(timesteps=20)
     own = write_sequence(root / "anna", experiment, experiment.sequences[0])
-    settings = TrainSettings(steps=5, checkpoint_every=5, split="none")
+    settings = plain_run(steps=5, checkpoint_every=5, split="none")
     write_run(root / "anna" / "runs" / "first", experiment, [own], settings)
     other = make_experiment(timesteps=20, seed=1)
     return own, write_sequence(root / "bert", other, two_cameras(other, "talk"))

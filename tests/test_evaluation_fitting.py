@@ -19,6 +19,7 @@ from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, evaluate_frames, protocol_content
 from mien.evaluation.text import protocol_line
 from mien.tracking import Scoring
+from plain_settings import plain_config
 from toy_workspace import write_toy_workspace
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=0, baselines=False, threads=1)
@@ -43,7 +44,7 @@ def drawn_by(method: str) -> Experiment:
     """Return an experiment whose pictures a new avatar of that method drew."""
     base, chosen = make_experiment(5), METHODS[method]
     torch.manual_seed(0)
-    avatar = chosen.avatar(chosen.config(), base.avatar.face_model, base.faces[0])
+    avatar = chosen.avatar(plain_config(method), base.avatar.face_model, base.faces[0])
     sequence = drawn_sequence(avatar, base.faces[0], base.sequences[0].tracking.cameras[0])
     scorings = (Scoring(sequence.scoring, base.scorings[0].crops),)
     return replace(base, avatar=avatar, sequences=(sequence,), scorings=scorings)

@@ -17,7 +17,7 @@ from mien.evaluation.image_folders import ImageFolders, read_crops, score_folder
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import ScoreSettings
 from mien.storage import read_json
-from mien.training import TrainSettings
+from plain_settings import plain_run
 
 PLAIN = ScoreSettings(perceptual=False)
 
@@ -42,7 +42,7 @@ def folders(tmp_path: Path) -> ImageFolders:
 def test_the_same_pictures_get_the_same_figures_as_in_evaluate(tmp_path: Path) -> None:
     experiment = make_experiment()
     folder, run_dir = write_sequence(tmp_path, experiment, experiment.sequences[0]), tmp_path / "runs" / "first"
-    write_run(run_dir, experiment, [folder], TrainSettings(steps=10, checkpoint_every=10))
+    write_run(run_dir, experiment, [folder], plain_run(steps=10, checkpoint_every=10))
     settings = EvaluationSettings(perceptual_frames=3, pictures=True, baselines=False, video_frames=0)
     entry = evaluate(run_dir, [folder], settings)["protocols"]["self_reenactment"]
     pictures = run_dir / "pictures" / "self_reenactment"

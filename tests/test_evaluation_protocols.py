@@ -26,8 +26,8 @@ from mien.evaluation.text import comparison_text
 from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.pictures import to_uint8
 from mien.storage import write_json
-from mien.training import TrainSettings
 from mien.training.footage.frames import Frame, spread_frames
+from plain_settings import plain_run
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=40)
 STEPS = 12
@@ -39,7 +39,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("rig") / "anna"
     experiment = make_experiment()
     folders = [write_sequence(root, experiment, two_cameras(experiment, name)) for name in ("talk", "laugh")]
-    short = TrainSettings(steps=STEPS, record_every=1, checkpoint_every=STEPS)
+    short = plain_run(steps=STEPS, record_every=1, checkpoint_every=STEPS)
     held = replace(short, held_out_sequences=("laugh",), held_out_cameras=("side",))
     write_run(root / "runs" / "held", experiment, folders, held)
     write_run(root / "runs" / "longer", experiment, folders[:1], replace(short, steps=2 * STEPS))

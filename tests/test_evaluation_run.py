@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment
-from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning
+from mien.avatar import DEFAULT_METHOD, FaceTuning
 from mien.capture import read_capture_hash, write_capture
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, read_metrics
@@ -19,7 +19,8 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.scoring import METRICS
 from mien.storage import read_tensors, write_tensors
 from mien.tracking import write_scoring, write_tracking
-from mien.training import TrainSettings, read_sequence, train
+from mien.training import read_sequence, train
+from plain_settings import plain_config, plain_run
 
 STEPS = 30
 
@@ -34,8 +35,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     write_capture(folder / "capture", sequence.capture)
     write_tracking(folder / "tracking", sequence.tracking)
     write_scoring(folder / "scoring", experiment.scorings[0], read_capture_hash(folder / "capture"))
-    settings = TrainSettings(steps=STEPS, record_every=1, checkpoint_every=STEPS)
-    config = METHODS[DEFAULT_METHOD].config(face_tuning=FaceTuning(enabled=False))
+    settings = plain_run(steps=STEPS, record_every=1, checkpoint_every=STEPS)
+    config = plain_config(DEFAULT_METHOD, face_tuning=FaceTuning(enabled=False))
     train([read_sequence(folder)], experiment.avatar.face_model, config, settings, run_dir)
     return folder, run_dir
 

@@ -9,15 +9,16 @@ import torch
 
 from exact_guard import InexactError, exact_guard
 from mien import exact
-from mien.avatar import DEFAULT_METHOD, METHODS
+from mien.avatar import DEFAULT_METHOD
 from mien.files import file_digest, write_json
 from mien.gaussians import Gaussians
 from mien.lab.synthetic import RECIPES, SyntheticScene
 from mien.lab.synthetic.light import Visibility
 from mien.render import rasterize
-from mien.training import TrainSettings, trainer
+from mien.training import trainer
 from mien.training.footage.frames import FrameOrder, background_at, training_frames
 from mien.training.footage.sequence import Targets
+from plain_settings import plain_config, plain_run
 from rasterize_scenes import random_scene
 from toy_scene import toy_sequence
 
@@ -99,8 +100,8 @@ def test_a_step_of_training_adds_up_by_itself():
     The first step fills the caches.
     """
     face_model, sequence = toy_sequence(timesteps=3, size=32)
-    settings = TrainSettings(steps=100, split="none", background="random", record_every=100)
-    state = trainer.start([sequence], face_model, METHODS[DEFAULT_METHOD].config(), settings, torch.zeros(()))
+    settings = plain_run(steps=100, split="none", background="random", record_every=100)
+    state = trainer.start([sequence], face_model, plain_config(DEFAULT_METHOD), settings, torch.zeros(()))
     order = FrameOrder(training_frames([sequence], settings), settings.seed)
     data = trainer.TrainingData(order, (Targets(sequence, 0),))
     trainer.step(state, data, settings)
@@ -111,7 +112,7 @@ def test_a_step_of_training_adds_up_by_itself():
 def test_digests_and_splits_compute_with_integers(tmp_path):
     _, sequence = toy_sequence(timesteps=12, size=32)
     with exact_guard():
-        settings = TrainSettings(steps=100, split="blocks", background="random")
+        settings = plain_run(steps=100, split="blocks", background="random")
         frames = training_frames([sequence], settings)
         FrameOrder(frames, settings.seed)
         background_at(settings, 7)

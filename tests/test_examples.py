@@ -1,5 +1,6 @@
 """The scripts in examples/ and the code in docs/api.md run as they are, on little data."""
 
+import json
 import os
 import re
 import subprocess
@@ -72,6 +73,17 @@ def test_render_expressions(trained: Path) -> None:
 def test_drive(trained: Path) -> None:
     run_script(trained, example("07_drive.py"), SUBJECT, "--by", SUBJECT, "--run", "example", "--out", "driven.mp4")
     assert (trained / "driven.mp4").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_training_by_the_example_and_by_the_command_gives_the_same_bytes(trained: Path) -> None:
+    options = ("--run", "by_command", "--steps", "40", "--method.density.max-gaussians", "9000")
+    assert main(["train", str(trained / SUBJECT), *options]) == 0
+    by_example, by_command = (trained / SUBJECT / "runs" / name for name in ("example", "by_command"))
+    for name in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
+        assert (by_example / name).read_bytes() == (by_command / name).read_bytes(), name
+    configs = [json.loads((run / "config.json").read_text(encoding="utf-8")) for run in (by_example, by_command)]
+    assert all(configs[0][part] == configs[1][part] for part in ("method", "settings", "data"))
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from torch import Tensor
 import train_toy
 from instruction_sets import ISAS, each_isa
 from mien import _native, runtime
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, make_portable
+from mien.avatar import GaussianAvatars, Progress, Rate, make_portable
 from mien.avatar.gaussian_avatars.avatar import resting_opacities
 from mien.avatar.ops.expression_changes import (
     MARGIN,
@@ -30,6 +30,7 @@ from mien.errors import UserError
 from mien.progress import Advance
 from mien.render.rendering import Rendering
 from mien.training import train
+from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera, toy_face, toy_face_model, toy_sequence
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
@@ -49,7 +50,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 def new_avatar(rank: int = 2, filled: bool = True, **settings: object) -> GaussianAvatars:
     """Return an avatar whose bases are random, as after training, or zero."""
     torch.manual_seed(0)
-    config = replace(GaussianAvatarsConfig(expression_rank=rank), **settings)  # pyright: ignore[reportArgumentType]
+    config = replace(plain_gaussian_avatars(expression_rank=rank), **settings)  # pyright: ignore[reportArgumentType]
     avatar = GaussianAvatars(config, toy_face_model(), toy_face(5))
     for index, name in enumerate(BASES):
         if filled and name in avatar.store.names():

@@ -26,10 +26,11 @@ from mien.training import train
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
+from plain_settings import plain_gaussian_avatars
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
 
 RANK, DIRECTIONS = 3, 5
-CONFIG = GaussianAvatarsConfig(
+CONFIG = plain_gaussian_avatars(
     expression_rank=RANK,
     expression_color_rate=Rate(0.0),
     appearance="features",
@@ -55,7 +56,7 @@ def new_avatar(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True) -
 
 
 def test_starts_as_without_features() -> None:
-    plain = GaussianAvatarsConfig(expression_rank=RANK, expression_color_rate=Rate(0.0))
+    plain = plain_gaussian_avatars(expression_rank=RANK, expression_color_rate=Rate(0.0))
     torch.manual_seed(0)
     static = GaussianAvatars(plain, toy_face_model(), toy_face(5))
     ours, theirs = (avatar.pose(toy_face(5)).gaussians for avatar in (new_avatar(filled=False), static))

@@ -15,6 +15,7 @@ from mien.errors import UserError
 from mien.face import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
+from plain_settings import plain_config
 from toy_scene import toy_camera, toy_face_model, toy_sequence
 
 EYE = np.array([0.0, 0.0, 1.0])
@@ -104,7 +105,7 @@ def test_driving_with_its_own_training_frames_changes_nothing() -> None:
 
 def _avatar(face: FaceParams) -> Avatar:
     method = METHODS[DEFAULT_METHOD]
-    return method.avatar(method.config(), toy_face_model(), face)
+    return method.avatar(plain_config(DEFAULT_METHOD), toy_face_model(), face)
 
 
 def test_it_is_kept_in_a_run_and_in_a_mien_file(tmp_path: Path) -> None:
@@ -141,7 +142,7 @@ def test_a_mien_file_keeps_the_confidence_of_each_triangle(tmp_path: Path) -> No
 @pytest.mark.parametrize("method", METHODS)
 def test_a_confidence_that_does_not_fit_is_refused(method: str, tmp_path: Path) -> None:
     kind = METHODS[method]
-    avatar = kind.avatar(kind.config(), toy_face_model(), toy_sequence()[1].tracking.face)
+    avatar = kind.avatar(plain_config(method), toy_face_model(), toy_sequence()[1].tracking.face)
     plain = make_portable(avatar, toy_camera(32), "toy")
     good = np.full(len(toy_face_model().faces), 0.5, np.float32)
     wrong = [good + 1, good - 1, good * np.float32("nan")]

@@ -17,12 +17,13 @@ from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, world_means
 from mien.render import rasterize
 from mien.render.rendering import Rendering
+from plain_settings import plain_gaussian_avatars
 from toy_scene import surface_of, toy_camera, toy_face, toy_face_model
 
 
 def new_avatar(config: GaussianAvatarsConfig | None = None, face_model: FaceModel | None = None) -> GaussianAvatars:
     torch.manual_seed(0)
-    return GaussianAvatars(config or GaussianAvatarsConfig(), face_model or toy_face_model(), toy_face(5))
+    return GaussianAvatars(config or plain_gaussian_avatars(), face_model or toy_face_model(), toy_face(5))
 
 
 def rendering_of(radii: torch.Tensor) -> Rendering:
@@ -42,7 +43,7 @@ def test_starts_with_one_gray_faint_gaussian_a_triangle() -> None:
 
 def test_first_colors_are_the_means_of_the_triangles_corners() -> None:
     """Every Gaussian gets its own triangle's colour, also if the Gaussians are in another order than the triangles."""
-    avatar = new_avatar(GaussianAvatarsConfig(sh_degree=1, first_colors="pictures"))
+    avatar = new_avatar(plain_gaussian_avatars(sh_degree=1, first_colors="pictures"))
     assert surface_of(avatar).wants_first_colors
     assert not surface_of(new_avatar()).wants_first_colors
     avatar.store.select(torch.arange(len(avatar.store)).flip(0)[:20])
@@ -81,7 +82,7 @@ def test_losses_are_finite_when_nothing_is_in_view() -> None:
 
 
 def test_sh_degrees_are_switched_on_one_after_the_other() -> None:
-    avatar = new_avatar(GaussianAvatarsConfig(sh_degree=3, sh_warmup=0.4))
+    avatar = new_avatar(plain_gaussian_avatars(sh_degree=3, sh_warmup=0.4))
     counts = [
         avatar.pose(toy_face(5)[0], Progress(step, 100)).gaussians.sh.shape[-2] for step in (0, 9, 10, 20, 31, 99)
     ]
@@ -90,7 +91,7 @@ def test_sh_degrees_are_switched_on_one_after_the_other() -> None:
 
 
 def test_head_frame_sees_the_same_picture_but_for_the_light() -> None:
-    world, head = (new_avatar(GaussianAvatarsConfig(sh_frame=frame)) for frame in ("world", "head"))
+    world, head = (new_avatar(plain_gaussian_avatars(sh_frame=frame)) for frame in ("world", "head"))
     face = toy_face(5)[1]
     pictures = [
         rasterize(a.pose(face).gaussians.timestep(0), toy_camera(32), torch.ones(3)).image for a in (world, head)

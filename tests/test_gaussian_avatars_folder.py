@@ -19,6 +19,7 @@ from mien.export.flame_params import read_flame_params, write_flame_params
 from mien.face import FaceModel, FaceParams
 from mien.face.flame import flame_face_model, read_flame
 from mien.render import rasterize
+from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera, toy_face, toy_face_model
 
 SIZE = 64
@@ -28,7 +29,7 @@ EQUAL = 1e-4
 def new_avatar(face_model: FaceModel, face: FaceParams, **config: object) -> Avatar:
     """Return an avatar of GaussianAvatars with several Gaussians on some triangles, whose values are all random."""
     method = METHODS["gaussian_avatars"]
-    avatar = method.avatar(replace(method.config(), **config), face_model, face)  # type: ignore[arg-type]
+    avatar = method.avatar(plain_gaussian_avatars(**config), face_model, face)
     avatar.gaussian_store().append(torch.arange(0, len(face_model.faces), 3))
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, make_portable
+from mien.avatar import GaussianAvatars, make_portable
 from mien.cli import main
 from mien.driving.motion import ARKIT_NAMES, LOOK_ANGLE, within_lids
 from mien.errors import UserError
@@ -25,6 +25,7 @@ from mien.face import load_face_model
 from mien.runtime.posing import SH_C0, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 from needs import NO_VALIDATOR
+from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera
 from toy_workspace import write_toy_workspace
 from web_case import WEB, drawn_head, node
@@ -231,7 +232,7 @@ def test_the_same_avatar_gives_the_same_bytes(written: Path, portable: runtime.P
 def test_the_texture_has_the_colors_of_the_gaussians() -> None:
     """A head that is red on the left and blue on the right gets such a texture, also behind closed lips."""
     model = load_face_model("anny")
-    avatar = GaussianAvatars(GaussianAvatarsConfig(), model, model.neutral())
+    avatar = GaussianAvatars(plain_gaussian_avatars(), model, model.neutral())
     plain = make_portable(avatar, toy_camera(64), "two colours")
     baked = plain.baked
     assert isinstance(baked, runtime.MeshBound)

@@ -11,17 +11,18 @@ from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.face import FaceModel, load_face_model
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
-from mien.training import PRESETS, Sequence, TrainSettings, read_training_summary, train
+from mien.training import PRESETS, Sequence, read_training_summary, train
 from mien.training.footage.frames import training_frames
 from mien.training.parts import Preparation
 from mien.training.trainer import start
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.part import prepare_whole_head
+from plain_settings import plain_run
 from toy_scene import surface_of, toy_sequence
 
 _HAIR, _RATE = 0.02, 1e-3
 CONFIG = PRESETS["draft"].config("gaussian_avatars")
-SETTINGS = TrainSettings(steps=64, split="none", unseen="filled", checkpoint_every=12, record_every=8, side_weight=0.0)
+SETTINGS = plain_run(steps=64, split="none", unseen="filled", checkpoint_every=12, record_every=8, side_weight=0.0)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """HeadGaS follows its formulas."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -10,10 +11,10 @@ from mien.avatar import HeadGas, HeadGasConfig, Progress
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.avatar import input_directions, neighbor_distances, sample_surface, spread_out
-from mien.avatar.headgas.settings import PRESET_STEPS, PRESETS
 from mien.avatar.settings import Photometric
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.runtime import pose
+from mien.training import PRESETS
 from mien.training.density_control.gradient import _round_steps
 from toy_scene import runtime_face, toy_face, toy_face_model
 
@@ -126,7 +127,9 @@ def test_opacity_has_no_reset_and_counts_by_the_highest_seen() -> None:
     avatar = new_avatar()
     density = avatar.density()
     assert density.opacity_logits is None
-    assert all(preset.density.opacity_resets == () for preset in PRESETS.values())
+    for preset in PRESETS.values():
+        config: Any = preset.config("headgas")
+        assert config.density.opacity_resets == ()
     seen = torch.rand(40)
     assert torch.equal(density.judged_opacities(avatar.store, seen), seen)
 
@@ -166,7 +169,8 @@ def test_higher_degrees_learn_slower_and_begin_later() -> None:
 
 
 def test_the_papers_schedule() -> None:
-    config, steps = PRESETS["paper"], PRESET_STEPS["paper"]
+    config: Any = PRESETS["paper"].config("headgas")
+    steps = PRESETS["paper"].settings_of("headgas").steps
     density = config.density
     rounds = sorted(_round_steps(density.start, density.stop, density.rounds, steps))
     assert (steps, rounds) == (50_000, list(range(500, 15_001, 100)))

@@ -23,12 +23,13 @@ from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
+from plain_settings import plain_run
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
 
 ABLATIONS = [name for name in get_args(Variant) if name != "full"]
 DENSITY = GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-5, opacity_resets=(), max_gaussians=120)
 SMALL = HeadGasConfig(points=40, features=5, hidden=8, sh_degree=1, sh_warmup=0.0, density=DENSITY)
-SETTINGS = TrainSettings(steps=24, split="none", background="white", record_every=1, checkpoint_every=1000)
+SETTINGS = plain_run(steps=24, split="none", background="white", record_every=1, checkpoint_every=1000)
 ablation = pytest.mark.parametrize("variant", ABLATIONS)
 every = pytest.mark.parametrize("variant", get_args(Variant))
 

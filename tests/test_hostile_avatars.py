@@ -28,6 +28,7 @@ from mien.runtime import baked as portable
 from mien.storage import file_digest, read_tensors, write_tensors
 from mien.training.checkpoint import checkpoint_files, resume
 from mien.training.trainer import start
+from plain_settings import plain_config
 from toy_scene import toy_camera, toy_face_model, toy_sequence
 
 HUGE = 10**400
@@ -42,7 +43,7 @@ def avatars(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name, method in METHODS.items():
         torch.manual_seed(0)
         folders[name] = tmp_path_factory.mktemp(name) / "avatar"
-        write_avatar(folders[name], method.avatar(method.config(), face_model, sequence.tracking.face))
+        write_avatar(folders[name], method.avatar(plain_config(name), face_model, sequence.tracking.face))
     return folders
 
 
@@ -287,7 +288,7 @@ def test_checkpoints_that_cannot_be(name: str, run_dir: Path, tmp_path: Path) ->
 def new_portable(method: str) -> portable.PortableAvatar:
     face_model, sequence = toy_sequence(5, 32)
     torch.manual_seed(0)
-    avatar: Avatar = METHODS[method].avatar(METHODS[method].config(), face_model, sequence.tracking.face)
+    avatar: Avatar = METHODS[method].avatar(plain_config(method), face_model, sequence.tracking.face)
     return make_portable(avatar, toy_camera(32), "toy")
 
 

@@ -7,20 +7,21 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mien.avatar import METHODS, Avatar, GaussianAvatarsConfig, Progress
+from mien.avatar import METHODS, Avatar, Progress
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh, sh_from_rgb
 from mien.render import rasterize
-from mien.training import Sequence, TrainSettings, train
+from mien.training import Sequence, train
 from mien.training.density_control import density_strategy
 from mien.training.footage.frames import training_frames
 from mien.training.footage.hidden import hidden_triangles, inside_triangles
 from mien.training.footage.sequence import Targets
 from mien.training.whole_head.mouth_interior import Inside, cover_hidden, covered_reference
 from mien.training.whole_head.unseen import spare_fills, unseen_of
+from plain_settings import plain_config, plain_gaussian_avatars, plain_run
 from toy_scene import surface_of, toy_face, toy_sequence
 
-SETTINGS = TrainSettings(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)
+SETTINGS = plain_run(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,7 @@ def facing(model: FaceModel) -> torch.Tensor:
 
 
 def made(toy: tuple[FaceModel, Sequence], method: str = "gaussian_avatars") -> Avatar:
-    return METHODS[method].avatar(METHODS[method].config(), toy[0], toy[1].tracking.face)
+    return METHODS[method].avatar(plain_config(method), toy[0], toy[1].tracking.face)
 
 
 def test_what_a_closed_mouth_hides_is_hidden(toy: tuple[FaceModel, Sequence]) -> None:
@@ -103,7 +104,7 @@ def open_mouth(model: FaceModel) -> FaceModel:
 def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceModel, Sequence], opened: bool) -> None:
     """What pictures show of it is closed as well before the first step, but it is trained."""
     model, sequence = open_mouth(toy[0]) if opened else toy[0], toy[1]
-    avatar = METHODS["gaussian_avatars"].avatar(GaussianAvatarsConfig(), model, sequence.tracking.face)
+    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
     frames = training_frames([sequence], SETTINGS)
     unseen = unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
     prior, inside = unseen.prior, inside_triangles(model)
@@ -130,7 +131,7 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
 @pytest.mark.parametrize("degree", [0, 2])
 def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceModel, Sequence], degree: int) -> None:
     model, sequence = toy
-    config = GaussianAvatarsConfig(sh_degree=degree)
+    config = plain_gaussian_avatars(sh_degree=degree)
     avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
     hidden = model.face_regions == 1
     posed = avatar.pose(sequence.tracking.face[0])
@@ -149,8 +150,8 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
         assert gradient[~hidden].any(), name
 
 
-def test_the_fast_cover_is_the_reference(toy: tuple[FaceModel, Sequence]) -> None:
-    config = GaussianAvatarsConfig(sh_degree=1)
+def test_the_fast_disguise_is_the_reference(toy: tuple[FaceModel, Sequence]) -> None:
+    config = plain_gaussian_avatars(sh_degree=1)
     avatar = METHODS["gaussian_avatars"].avatar(config, toy[0], toy[1].tracking.face)
     posed = avatar.pose(toy[1].tracking.face[0])
     sh, opacities = (getattr(posed.gaussians, name).detach().requires_grad_() for name in ("sh", "opacities"))
@@ -210,7 +211,7 @@ def test_skin_is_painted_by_skin(toy: tuple[FaceModel, Sequence], tmp_path: Path
     model, sequence = toy
     shares = {}
     for inside in ("free", "covered"):
-        avatar = train([sequence], model, GaussianAvatarsConfig(), replace(SETTINGS, inside=inside), tmp_path / inside)
+        avatar = train([sequence], model, plain_gaussian_avatars(), replace(SETTINGS, inside=inside), tmp_path / inside)
         shares[inside] = inner_share(avatar, model, sequence)
     assert shares["free"] > 0.1
     assert shares["covered"] < 0.5 * shares["free"]
@@ -221,7 +222,7 @@ def test_a_run_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) 
     model, sequence = toy
     settings, config = (
         replace(SETTINGS, inside="filled", steps=6, checkpoint_every=2, record_every=1),
-        GaussianAvatarsConfig(),
+        plain_gaussian_avatars(),
     )
     whole = train([sequence], model, config, settings, tmp_path / "cut")
     means = whole.gaussian_store()["means"].clone()

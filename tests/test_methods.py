@@ -29,17 +29,17 @@ from mien.config import decode, encode
 from mien.export import MeshModel, pack, read_glb_avatar, write_glb, write_page
 from mien.progress import Advance
 from mien.render import rasterize
-from mien.training import TrainSettings
 from mien.training.checkpoint import resume, write_checkpoint
 from mien.training.density_control import density_strategy
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
+from plain_settings import plain_config, plain_run
 from toy_scene import runtime_face, toy_camera, toy_sequence
 
 SIZE = 32
 FIRST, LAST = slice(0, 5), slice(-5, None)
-SETTINGS = TrainSettings(steps=50, split="none", background="white", record_every=1, checkpoint_every=1000)
+SETTINGS = plain_run(steps=50, split="none", background="white", record_every=1, checkpoint_every=1000)
 method = pytest.mark.parametrize("method", METHODS)
 
 
@@ -49,7 +49,7 @@ def silence(title: str, total: int, completed: int) -> Iterator[Advance]:
 
 
 def config_of(method: str) -> MethodConfig:
-    return METHODS[method].config()
+    return plain_config(method)
 
 
 def new_avatar(method: str) -> Avatar:

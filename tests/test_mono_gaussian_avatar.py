@@ -15,15 +15,17 @@ from mien.avatar.mono_gaussian_avatar.avatar import (
 )
 from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
-from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, PRESETS
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.surface_places import at_places, random_places
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
+from mien.training import PRESETS
+from plain_settings import plain_mono_gaussian_avatar
 from toy_scene import toy_face, toy_face_model
 
-SMALL = MonoGaussianAvatarConfig(points=30, max_points=60, own_rate=Rate(1e-2))
+SMALL = plain_mono_gaussian_avatar(points=30, max_points=60, own_rate=Rate(1e-2))
 
 
 def new_avatar(
@@ -351,7 +353,7 @@ def test_the_end_of_a_run_changes_nothing() -> None:
 
 
 def test_rounds_grow_to_the_limit_and_no_further() -> None:
-    settings = new_avatar(MonoGaussianAvatarConfig(max_points=5000)).density().settings
+    settings = new_avatar(plain_mono_gaussian_avatar(max_points=5000)).density().settings
     targets = dict(zip(settings.times, settings.targets, strict=True))
     assert len(targets) == 99
     assert (targets[0.04], targets[0.05], targets[0.19], targets[0.2], targets[0.99]) == (400, 800, 3200, 5000, 5000)
@@ -382,7 +384,9 @@ def test_rates_halve_at_their_times() -> None:
 
 def test_points_without_attributes_of_their_own() -> None:
     """The preset `paper` has none."""
-    assert MonoGaussianAvatarConfig().own_rate == PRESETS["paper"].own_rate == Rate(0.0)
+    paper = PRESETS["paper"].config("mono_gaussian_avatar")
+    assert isinstance(paper, MonoGaussianAvatarConfig)
+    assert paper.own_rate == Rate(0.0)
     avatar = new_avatar(replace(SMALL, own_rate=Rate(0.0)))
     assert avatar.store.names() == ("means",)
     assert [group.name for group in avatar.parameter_groups()] == ["means", "attributes", "deformation", "change"]
@@ -436,7 +440,7 @@ def test_a_run_may_begin_at_a_later_epoch() -> None:
         assert late.points_at(fraction) == whole.points_at(at)
         assert late.face_decay(fraction) == whole.face_decay(at)
     with pytest.raises(UserError, match="--method.epochs 60: give more than --method.first-epoch 60"):
-        MonoGaussianAvatarConfig(epochs=60, first_epoch=60).check()
+        plain_mono_gaussian_avatar(epochs=60, first_epoch=60).check()
 
 
 def test_nearest_vertices() -> None:

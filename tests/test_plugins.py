@@ -74,7 +74,7 @@ def puppet_vertices() -> list[int]:
 
 
 def test_methods_of_packages_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    code = "from mien.avatar.methods import Method\nOWN = Method('nowhere:Toy')\nWRONG = 1\n"
+    code = "from mien.avatar.methods import Method\nOWN = Method('nowhere:Toy', 'nowhere:ToyConfig')\nWRONG = 1\n"
     points = "[mien.methods]\ntoy_a = mien_toys_a:OWN\nheadgas = mien_toys_a:OWN\nwrong = mien_toys_a:WRONG\n"
     install(tmp_path, "mien_toys_a", code, points)
     monkeypatch.syspath_prepend(tmp_path)
@@ -83,7 +83,7 @@ def test_methods_of_packages_are_found_by_name(tmp_path: Path, monkeypatch: pyte
         assert method_names() == [*METHODS, "toy_a", "wrong"]
         assert has_method("toy_a")
         assert not has_method("toy_b")
-        assert method_named("toy_a") == Method("nowhere:Toy")
+        assert method_named("toy_a") == Method("nowhere:Toy", "nowhere:ToyConfig")
         assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
         with pytest.raises(UserError, match="it is no Method; update or uninstall mien-toys-a"):
             method_named("wrong")

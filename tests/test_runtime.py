@@ -19,6 +19,7 @@ from mien.face import FaceParams
 from mien.render import rasterize
 from mien.runtime.checks import baked_fault
 from mien.runtime.posing import run_network
+from plain_settings import plain_config
 from toy_scene import runtime_face, toy_camera, toy_sequence
 
 SIZE = 64
@@ -30,7 +31,7 @@ def new_avatar(method: str, **config: object) -> Avatar:
     """Return an avatar of the toy head whose parameters all differ from their initial values."""
     face_model, sequence = toy_sequence(5, SIZE)
     torch.manual_seed(0)
-    settings = replace(METHODS[method].config(), **config)  # type: ignore[arg-type]
+    settings = replace(plain_config(method), **config)  # type: ignore[arg-type]
     avatar = METHODS[method].avatar(settings, face_model, sequence.tracking.face)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():

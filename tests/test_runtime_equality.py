@@ -16,6 +16,7 @@ from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render import rasterize
 from mien.runtime import Gaussians
+from plain_settings import plain_config
 
 EQUAL = 1e-5
 GAUSSIANS, SIZE, TIMESTEPS = 30_000, 512, 4
@@ -95,7 +96,7 @@ def test_every_pixel_equals_that_of_training(colors: dict[str, Any], tmp_path: P
     """Every pixel equals that of training: 30,000 Gaussians at 512x512, no pixel left out."""
     model, camera = load_face_model("anny"), view(SIZE)
     face = talking_face(model, TIMESTEPS)
-    avatar = grown_avatar(model, face, METHODS[DEFAULT_METHOD].config(**colors), GAUSSIANS)
+    avatar = grown_avatar(model, face, plain_config(DEFAULT_METHOD, **colors), GAUSSIANS)
     assert len(avatar.gaussian_store()) == GAUSSIANS
     expected = rasterize(avatar.pose(face).gaussians, [camera] * TIMESTEPS, torch.ones(3))
     found = rendered_without_torch(avatar, face, camera, tmp_path)
@@ -124,7 +125,7 @@ def test_networks_may_round_differently_and_nothing_more(method: str) -> None:
     model, camera = load_face_model("anny"), view(256)
     face = talking_face(model, TIMESTEPS)
     torch.manual_seed(0)
-    config: Any = METHODS[method].config()
+    config: Any = plain_config(method)
     if "points" in {field.name for field in fields(config)}:
         config = replace(config, points=POINTS)
     avatar = METHODS[method].avatar(config, model, face)

@@ -13,7 +13,6 @@ from mien import _native
 from mien.avatar import (
     METHODS,
     FaceTuning,
-    GaussianAvatarsConfig,
     GradientSettings,
     HeadGasConfig,
     Progress,
@@ -24,6 +23,7 @@ from mien.commands.help_text import field_docs
 from mien.errors import UserError
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges
 from mien.training import PRESETS, TrainSettings, train
+from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_sequence
 
 CONFIGS: list[Any] = [method.config() for method in METHODS.values()]
@@ -81,7 +81,11 @@ def test_every_number_has_a_range_that_is_checked(settings: Any) -> None:
 def test_what_is_in_range_passes() -> None:
     for settings in (*CONFIGS, *(preset.settings for preset in PRESETS.values())):
         settings.check()
-    GaussianAvatarsConfig(density=GradientSettings(start=0.5, stop=0.5, opacity_resets=())).check()
+    for name, method in METHODS.items():
+        for preset in method.presets:
+            PRESETS[preset].config(name).check()
+            PRESETS[preset].settings_of(name).check()
+    plain_gaussian_avatars(density=GradientSettings(start=0.5, stop=0.5, opacity_resets=())).check()
     TrainSettings(resolution=16).check()
 
 

@@ -1,11 +1,14 @@
 """Settings of methods and runs come from options and files in a known order, and wrong ones are refused before work."""
 
 import json
+import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import pytest
 
@@ -19,17 +22,18 @@ from mien.avatar import (
     MethodConfig,
     Rate,
 )
+from mien.avatar.mono_gaussian_avatar.settings import PRESETS as mono_gaussian_avatar_presets
 from mien.cli import main
 from mien.commands.settings_options import leaves
 from mien.commands.stages import training
-from mien.ranges import Range
+from mien.ranges import Range, shown
 from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
-RUN = TrainSettings(inside="covered", background="auto", edges="auto", unseen="auto")
-"""Settings of a run by the preset `standard`."""
-STANDARD = cast(GaussianAvatarsConfig, PRESETS["standard"].config("gaussian_avatars"))
+RUN, STANDARD = TrainSettings(), GaussianAvatarsConfig()
+OPEN = TrainSettings(background="white", edges="filmed", inside="free", unseen="trained")
+"""Settings of a run by the preset `paper`."""
 
 Choices = tuple[MethodConfig, TrainSettings]
 
@@ -74,29 +78,26 @@ def complaint(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
     return line
 
 
-def dict_of_presets(name: str) -> dict[str, Any]:
-    presets = METHODS[name].presets
-    assert isinstance(presets, dict)
-    return presets
-
-
 # -- options ----------------------------------------------------------------------------------------------------------
 
 
-def test_without_options_a_run_is_the_preset(choices: Any) -> None:
-    for name, method in METHODS.items():
-        assert choices(f"--method {name}") == (method.presets["standard"], RUN)
-        assert choices(f"--method {name} --preset draft") == (method.presets["draft"], replace(RUN, steps=8000))
+@pytest.mark.parametrize("method", METHODS)
+def test_without_options_a_run_has_the_defaults(method: str, choices: Any) -> None:
+    assert choices(f"--method {method}") == (METHODS[method].config(), TrainSettings())
+    assert choices(f"--method {method} --preset standard") == (METHODS[method].config(), TrainSettings())
+    draft = (PRESETS["draft"].config(method), replace(RUN, steps=8000))
+    assert choices(f"--method {method} --preset draft") == draft
 
 
 def test_a_preset_gives_the_settings_of_run_and_method(choices: Any) -> None:
-    paper = METHODS["gaussian_avatars"].presets["paper"]
-    assert paper != GaussianAvatarsConfig()
-    assert choices("--preset paper") == (paper, TrainSettings(steps=600_000))
+    paper = PRESETS["paper"].config("gaussian_avatars")
+    assert isinstance(paper, GaussianAvatarsConfig)
+    assert paper != STANDARD
+    assert choices("--preset paper") == (paper, replace(OPEN, steps=600_000))
     config, settings = choices("--preset paper --steps 3000 --method.sh-degree 1")
-    assert (config, settings) == (replace(paper, sh_degree=1), TrainSettings(steps=3000))
+    assert (config, settings) == (replace(paper, sh_degree=1), replace(OPEN, steps=3000))
     file = {"method": {"sh_degree": 2}, "settings": {"steps": 700}}
-    assert choices("--preset paper", file) == (replace(paper, sh_degree=2), TrainSettings(steps=700))
+    assert choices("--preset paper", file) == (replace(paper, sh_degree=2), replace(OPEN, steps=700))
 
 
 def test_a_preset_that_the_method_does_not_have_is_refused(
@@ -104,7 +105,7 @@ def test_a_preset_that_the_method_does_not_have_is_refused(
 ) -> None:
     """Every method here has `paper`; a new one may not."""
     name = "mono_gaussian_avatar"
-    monkeypatch.delitem(dict_of_presets(name), "paper")
+    monkeypatch.delitem(mono_gaussian_avatar_presets, "paper")
     words = f"--preset paper: {name} has no such preset; it has draft and standard"
     for command in (["train", str(workspace)], ["create", str(workspace), "--out", str(workspace / "new")]):
         assert words in complaint(capsys, [*command, "--method", name, "--preset", "paper"])
@@ -348,6 +349,50 @@ def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.
     assert all(f"--training.{name.replace('_', '-')} " in shown for name in rest)
 
 
+def about_options(help_text: str) -> dict[str, str]:
+    """What the help says of each option, in one line."""
+    about: dict[str, str] = {}
+    option = ""
+    for line in help_text.replace("│", " ").splitlines():
+        words = line.split()
+        if words and words[0].startswith("--"):
+            option = words[0]
+        about[option] = " ".join([about.get(option, ""), *words])
+    return about
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_help_all_shows_where_presets_differ(method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    about = about_options(help_of(capsys, "train", "--method", method, "--help-all"))
+    for prefix, default in (("method", METHODS[method].config()), ("training", TrainSettings())):
+        of_presets = {
+            name: (preset.config(method) if prefix == "method" else preset.settings_of(method))
+            for name, preset in PRESETS.items()
+            if name in METHODS[method].presets
+        }
+        for leaf in leaves(default, prefix):
+            option = leaf.option(prefix if leaf.name not in MAIN_SETTINGS else "").replace("--.", "--")
+            if option not in about:
+                assert option in ("--held-out-sequences", "--held-out-cameras")
+                continue
+            known = about[option].rpartition("(")[2]
+            for name, settings in of_presets.items():
+                value = attrgetter(leaf.name)(settings)
+                if value == leaf.value and leaf.name != "steps":
+                    assert f"{name}:" not in known, (option, name)
+                    assert f"{name}," not in known, (option, name)
+                else:
+                    text = re.escape("none" if value is None else shown(value))
+                    assert re.search(rf"\b{name}[a-z, ]*: {text}[;)]", known), (option, known)
+    assert ("paper" in about["--background"]) == ("paper" in METHODS[method].presets)
+
+
+def test_help_all_with_a_preset_shows_its_values(capsys: pytest.CaptureFixture[str]) -> None:
+    about = about_options(help_of(capsys, "create", "--preset", "paper", "--help-all"))
+    assert about["--method.sh-degree"].endswith("(from 0 to 3; default: 3; draft, standard: 0)")
+    assert about["--background"].endswith("(default: white; draft, standard: auto)")
+
+
 def test_help_all_shows_what_a_file_asks_for(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (workspace / "file.json").write_text('{"method": {"kind": "headgas", "features": 321}}')
     shown = help_of(capsys, "train", "--config", str(workspace / "file.json"), "--help-all")
@@ -361,17 +406,31 @@ def test_help_stays_short_and_says_how_to_see_more(capsys: pytest.CaptureFixture
     assert short.rstrip().endswith("mien train --method headgas --help-all")
 
 
+def differences(changes: dict[str, Any], settings: Any, place: str = "") -> Iterator[tuple[str, bool]]:
+    """Yield each setting that a preset names, and whether its value differs from the default."""
+    for name, value in changes.items():
+        default = getattr(settings, name)
+        if isinstance(value, dict):
+            yield from differences(value, default, f"{place}{name}.")
+        else:
+            yield place + name, default != (tuple(value) if isinstance(value, list) else value)
+
+
 @pytest.mark.parametrize("name", METHODS)
-def test_presets_are_the_same_for_all_methods(name: str) -> None:
+def test_presets_are_differences_to_the_defaults(name: str) -> None:
     method = METHODS[name]
     assert {"draft", "standard"} <= set(method.presets) <= set(PRESETS), f"PRESETS of {name}"
-    assert all(type(config) is method.config for config in method.presets.values())
-    assert set(method.preset_steps) <= set(method.presets)
-    losses = method.presets["draft"].photometric
-    for preset in ("draft", "standard"):
-        same_but_losses = replace(PRESETS[preset].config(name), photometric=losses)
-        assert same_but_losses == method.presets["draft"], f"{preset} of {name} differs in more than its losses"
-        assert PRESETS[preset].settings_of(name) == PRESETS[preset].settings
+    assert method.presets["standard"] == {}, f"standard of {name} is not its defaults"
+    assert set(method.presets["draft"].get("method", {})) <= {"photometric"}, f"draft of {name}: more than its losses"
+    assert "settings" not in method.presets["draft"]
+    for preset, changes in method.presets.items():
+        assert type(PRESETS[preset].config(name)) is method.config
+        for part, default in (("method", method.config()), ("settings", PRESETS[preset].settings)):
+            for setting, differs in differences(changes.get(part, {}), default):
+                assert differs, f"{preset} of {name} repeats the default of {setting}"
+    for preset in PRESETS.values():
+        assert all(differs for _, differs in differences(dict(preset.changes), TrainSettings()))
+    assert PRESETS["standard"].settings == TrainSettings()
 
 
 @dataclass(frozen=True)
@@ -397,11 +456,10 @@ class ToyConfig(MethodConfig):
 def test_settings_of_an_added_method_appear_by_themselves(
     choices: Any, workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    presets = {"draft": ToyConfig(dust=Dust(1)), "standard": ToyConfig()}
     module = ModuleType("toy_settings")
-    vars(module)["PRESETS"] = presets
+    vars(module).update(ToyConfig=ToyConfig, PRESETS={"draft": {"method": {"dust": {"grains": 1}}}})
     monkeypatch.setitem(sys.modules, "toy_settings", module)
-    monkeypatch.setitem(METHODS, "toy", Method("toy_module:Toy", "toy_settings"))
+    monkeypatch.setitem(METHODS, "toy", Method("toy_module:Toy", "toy_settings:ToyConfig"))
     shown = help_of(capsys, "train", "--method", "toy", "--help-all")
     assert "--method.dust.grains INT" in shown
     assert "Colour of the toy." in shown

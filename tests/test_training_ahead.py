@@ -17,10 +17,11 @@ from mien.training.ahead import _AHEAD, targets_ahead
 from mien.training.footage.frames import FrameOrder, background_at, training_frames
 from mien.training.footage.sequence import Sequence, Target, Targets, composite, composite_reference
 from mien.training.settings import TrainSettings
+from plain_settings import plain_run
 from test_training_resume import RESULTS
 from toy_scene import toy_sequence
 
-SETTINGS = TrainSettings(steps=40, split="none", background="random")
+SETTINGS = plain_run(steps=40, split="none", background="random")
 
 
 def workers() -> list[str]:

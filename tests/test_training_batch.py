@@ -23,14 +23,15 @@ from mien.training.checkpoint import TrainingState, checkpoint_files
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import passed, start, step
+from plain_settings import plain_mono_gaussian_avatar, plain_run
 from test_methods import new_avatar
 from test_training_resume import assert_same_results
 from toy_scene import toy_camera, toy_face, toy_sequence
 
-SMALL = MonoGaussianAvatarConfig(
+SMALL = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
 )
-SETTINGS = TrainSettings(steps=30, split="none", background="random", checkpoint_every=7, record_every=5)
+SETTINGS = plain_run(steps=30, split="none", background="random", checkpoint_every=7, record_every=5)
 
 
 @contextmanager

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mien.avatar import (
-    GaussianAvatarsConfig,
     GaussianStore,
     Moments,
     ParameterGroup,
@@ -22,7 +21,7 @@ from mien.avatar import (
 from mien.errors import UserError
 from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
-from mien.training import TrainSettings, held_out
+from mien.training import held_out
 from mien.training.adam import Adam
 from mien.training.footage.frames import (
     FrameOrder,
@@ -35,6 +34,7 @@ from mien.training.footage.sequence import Target, Targets, composite
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
 from mien.training.trainer import start
+from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import toy_sequence
 
 
@@ -59,19 +59,19 @@ def test_frames_leave_out_what_is_invalid_or_held_out() -> None:
     valid = np.ones((60, 1), dtype=bool)
     valid[3] = False
     second = replace(sequence, name="other", capture=replace(sequence.capture, valid=valid))
-    frames = training_frames([sequence, second], TrainSettings(split="blocks"))
+    frames = training_frames([sequence, second], plain_run(split="blocks"))
     assert len(frames) == 50 + 49
     assert {frame.timestep for frame in frames if frame.sequence == 1} == set(range(60)) - {3} - set(range(40, 50))
-    only = training_frames([sequence, second], TrainSettings(split="none", held_out_sequences=("toy",)))
+    only = training_frames([sequence, second], plain_run(split="none", held_out_sequences=("toy",)))
     assert {frame.sequence for frame in only} == {1}
 
 
 def test_what_is_held_out_has_to_be_there() -> None:
     _, sequence = toy_sequence(12, 16)
     for settings, words in (
-        (TrainSettings(held_out_sequences=("tyo",)), "--hold-out tyo: no such sequence in this run; there are: toy"),
-        (TrainSettings(held_out_cameras=("back",)), "--hold-out-cameras back: no such camera; there are: front"),
-        (TrainSettings(held_out_sequences=("toy",)), "leaves no sequence to train on"),
+        (plain_run(held_out_sequences=("tyo",)), "--hold-out tyo: no such sequence in this run; there are: toy"),
+        (plain_run(held_out_cameras=("back",)), "--hold-out-cameras back: no such camera; there are: front"),
+        (plain_run(held_out_sequences=("toy",)), "leaves no sequence to train on"),
     ):
         with pytest.raises(UserError, match=words):
             training_frames([sequence], settings)
@@ -87,21 +87,21 @@ def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
     )  # fmt: skip
     seen = replace(tracking, valid=torch.tensor([True] * 5 + [False]), cameras=tracking.cameras * 2)
     ring = replace(sequence, capture=both, tracking=seen, scoring=sequence.scoring.repeat(2, 1))
-    frames = training_frames([ring], TrainSettings(split="none"))
+    frames = training_frames([ring], plain_run(split="none"))
     assert [(frame.timestep, frame.camera) for frame in frames] == [(t, c) for t in range(5) for c in range(2)]
-    only = training_frames([ring], TrainSettings(split="none", held_out_cameras=("back",)))
+    only = training_frames([ring], plain_run(split="none", held_out_cameras=("back",)))
     assert {frame.camera for frame in only} == {0}
 
 
 def test_nothing_to_train_on_is_the_users_to_mend() -> None:
     _, sequence = toy_sequence(5, 16)
     with pytest.raises(UserError, match="no frame is left to train on"):
-        training_frames([sequence], TrainSettings(held_out_cameras=("front",)))
+        training_frames([sequence], plain_run(held_out_cameras=("front",)))
 
 
 def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> None:
     _, sequence = toy_sequence(12, 16)
-    frames = training_frames([sequence], TrainSettings(split="none"))
+    frames = training_frames([sequence], plain_run(split="none"))
     order = FrameOrder(frames, seed=5)
     passes = [[order.at(step)[0] for step in range(start, start + 12)] for start in (0, 12)]
     assert all(sorted(f.timestep for f in one) == list(range(12)) for one in passes)
@@ -111,10 +111,10 @@ def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> No
 
 
 def test_random_backgrounds_and_density_draws_depend_on_seed_and_step() -> None:
-    settings = TrainSettings(background="random", seed=1)
+    settings = plain_run(background="random", seed=1)
     assert background_at(settings, 3).tolist() == background_at(settings, 3).tolist()
     assert background_at(settings, 3).tolist() != background_at(settings, 4).tolist()
-    assert background_at(TrainSettings(background="white"), 3).tolist() == [255, 255, 255]
+    assert background_at(plain_run(background="white"), 3).tolist() == [255, 255, 255]
     draws = [torch.rand(4, generator=density_random(replace(settings, seed=seed), 3)) for seed in (1, 1, 2)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
@@ -247,7 +247,7 @@ def test_frames_with_rare_expressions_come_more_often() -> None:
     expression[90:] = torch.rand(10, 2, generator=torch.Generator().manual_seed(1))
     tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, expression=expression))
     sequence = replace(sequence, tracking=tracking)
-    frames = training_frames([sequence], TrainSettings(split="none"))
+    frames = training_frames([sequence], plain_run(split="none"))
     weights = expression_rarity([sequence], frames)
     assert float(weights.min()) >= 0.5
     assert float(weights[90:].min()) == float(weights.max()) == 2
@@ -267,17 +267,17 @@ def test_one_expression_only_gives_even_weights() -> None:
     _, sequence = toy_sequence(12, 16)
     still = replace(sequence.tracking.face, expression=torch.zeros(12, 2))
     sequence = replace(sequence, tracking=replace(sequence.tracking, face=still))
-    frames = training_frames([sequence], TrainSettings(split="none"))
+    frames = training_frames([sequence], plain_run(split="none"))
     assert len(set(expression_rarity([sequence], frames).tolist())) == 1
     assert expression_rarity([sequence], frames[:1]).isfinite().all()
 
 
 def test_first_colors_come_from_training_frames_only() -> None:
     face_model, sequence = toy_sequence(60, 48)
-    config, settings = GaussianAvatarsConfig(first_colors="pictures"), TrainSettings(split="blocks")
+    config, settings = plain_gaussian_avatars(first_colors="pictures"), plain_run(split="blocks")
     painted = start([sequence], face_model, config, settings).avatar.gaussian_store()["sh_constant"]
-    gray = start([sequence], face_model, GaussianAvatarsConfig(), settings).avatar.gaussian_store()["sh_constant"]
-    assert float((rgb_from_sh(gray.detach()) - 0.5).abs().max()) < 0.01
+    grey = start([sequence], face_model, plain_gaussian_avatars(), settings).avatar.gaussian_store()["sh_constant"]
+    assert float((rgb_from_sh(grey.detach()) - 0.5).abs().max()) < 0.01
     assert float((rgb_from_sh(painted.detach()) - 0.5).abs().mean()) > 0.05
     for timesteps, same in ((slice(40, 50), True), (slice(0, 10), False)):
         images = sequence.capture.images.copy()

@@ -24,6 +24,7 @@ from mien.storage import read_tensors, write_tensors
 from mien.training import read_curves, read_training_summary, train
 from mien.training.checkpoint import checkpoint_files
 from mien.training.trainer import step
+from plain_settings import plain_config
 from toy_scene import toy_sequence
 
 STEPS = train_toy.SETTINGS.steps
@@ -121,7 +122,7 @@ def test_a_stop_before_the_first_record(
     ("method", "number"), [*((name, signal.SIGTERM) for name in METHODS), ("headgas", signal.SIGHUP)]
 )
 def test_every_method_continues_after_a_termination(method: str, number: signal.Signals, tmp_path: Path) -> None:
-    config, settings = METHODS[method].config(), {"steps": 4, "record_every": 10, "checkpoint_every": 1000}
+    config, settings = plain_config(method), {"steps": 4, "record_every": 10, "checkpoint_every": 1000}
     with pytest.raises(Terminated):
         train_until_step(tmp_path, 1, partial(signal.raise_signal, number), config, **settings)
     begun = int(checkpoint_files(tmp_path / "checkpoints")[-1].stem.removeprefix("step_"))

@@ -21,6 +21,7 @@ from mien.runtime import load as load_portable
 from mien.storage import file_digest, write_json
 from mien.tracking import TrackingSettings, read_tracking, track
 from mien.tracking.settings import PaperSettings
+from plain_settings import plain_config
 from tracking_case import capture_of, still_camera
 
 
@@ -195,6 +196,6 @@ def test_the_papers_schedule_takes_it_too(added, capture):
 def test_a_model_that_may_not_be_copied_is_named_with_ways_out(added):
     model = replace(load_face_model("my_head"), shareable=False)
     method = METHODS[DEFAULT_METHOD]
-    avatar = method.avatar(method.config(), model, model.neutral())
+    avatar = method.avatar(plain_config(DEFAULT_METHOD), model, model.neutral())
     with pytest.raises(UserError, match=r"my_head.*\.ply.*--face-model.*--shareable"):
         make_portable(avatar, still_camera(), "someone")

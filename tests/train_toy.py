@@ -8,16 +8,18 @@ from pathlib import Path
 
 import torch
 
-from mien.avatar import DEFAULT_METHOD, METHODS, FaceTuning, GradientSettings
+from mien.avatar import DEFAULT_METHOD, FaceTuning, GradientSettings
 from mien.progress import Advance
-from mien.training import TrainSettings, train
+from mien.training import train
+from plain_settings import plain_config, plain_run
 from toy_scene import toy_sequence
 
-CONFIG = METHODS[DEFAULT_METHOD].config(
+CONFIG = plain_config(
+    DEFAULT_METHOD,
     density=GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400),
     face_tuning=FaceTuning(enabled=True),
 )
-SETTINGS = TrainSettings(steps=30, split="none", background="random", checkpoint_every=4, record_every=3)
+SETTINGS = plain_run(steps=30, split="none", background="random", checkpoint_every=4, record_every=3)
 
 
 @contextmanager

@@ -14,9 +14,10 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, HeadGas, HeadGasConfig, make_portable
+from mien.avatar import GaussianAvatars, HeadGas, HeadGasConfig, make_portable
 from mien.face import load_face_model
 from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES, NO_TASKS_VISION
+from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera
 
 WEB = Path(__file__).parent.parent / "web"
@@ -96,7 +97,9 @@ def drawn_head(
     Their changes have `rank` activations, of which the bases take the first `columns` (None: all).
     """
     model = load_face_model("anny")
-    portable = make_portable(GaussianAvatars(GaussianAvatarsConfig(), model, model.neutral()), toy_camera(512), "drawn")
+    portable = make_portable(
+        GaussianAvatars(plain_gaussian_avatars(), model, model.neutral()), toy_camera(512), "drawn"
+    )
     baked, random = portable.baked, np.random.default_rng(0)
     assert isinstance(baked, runtime.MeshBound)
 

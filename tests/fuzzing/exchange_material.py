@@ -20,6 +20,7 @@ from mien.export import MeshModel, in_world, pack, write_glb, write_sog, write_s
 from mien.gaussians import Gaussians
 from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, write_key
 from mien.lab.analysis.study.shuffling import shuffled
+from plain_settings import plain_config
 from recordings import LAYOUTS
 from test_runtime import new_avatar
 from toy_scene import toy_camera
@@ -127,7 +128,7 @@ def _write_configs(folder: Path, run: Path) -> None:
     """Write a run's own config.json, and one by hand for each method."""
     folder.mkdir()
     shutil.copy(run / "config.json", folder / "run.json")
-    for name, method in METHODS.items():
+    for name in METHODS:
         settings = {"steps": 10, "seed": 1, "background": "random"}
-        content = {"method": encode(method.config()), "settings": settings}
+        content = {"method": encode(plain_config(name)), "settings": settings}
         (folder / f"{name}.json").write_text(json.dumps(content))

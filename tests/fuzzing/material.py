@@ -26,6 +26,7 @@ from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analy
 from mien.runtime import write_portable
 from mien.storage import write_json
 from mien.training import read_face_track
+from plain_settings import plain_config
 from toy_scene import toy_camera, toy_face_model
 from toy_workspace import write_toy_workspace
 from what_users_give import write_what_users_give
@@ -150,7 +151,9 @@ def _write_avatar_on_flame(root: Path) -> None:
     model = flame_face_model(read_flame(root / "flame/tiny.npz"), "tiny")
     face = replace(model.neutral(3), head_translation=torch.tensor([0.0, 0.0, -0.6]).repeat(3, 1))
     method = METHODS["gaussian_avatars"]
-    write_gaussian_avatars_folder(root / "flame_avatars", method.avatar(method.config(), model, face), face)
+    write_gaussian_avatars_folder(
+        root / "flame_avatars", method.avatar(plain_config("gaussian_avatars"), model, face), face
+    )
 
 
 def _write_videos(folder: Path) -> None:

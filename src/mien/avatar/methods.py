@@ -8,10 +8,9 @@ This file needs no torch, because the command line lists the methods' settings a
 import importlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from types import ModuleType
 from typing import TYPE_CHECKING
 
-from mien.avatar.settings import MethodConfig
+from mien.avatar.settings import Differences, MethodConfig
 from mien.errors import UserError
 from mien.lazy import named
 from mien.plugins import plugin, plugin_names, plugins
@@ -26,27 +25,24 @@ class Method:
 
     avatar_class: str
     """"MODULE:CLASS"; see `avatar`."""
-    settings_module: str = ""
-    """The module that holds `PRESETS`. Default: the module of the class. A separate one that does not import torch
-    keeps `--help` and the checks of options fast."""
-
-    @property
-    def presets(self) -> Mapping[str, MethodConfig]:
-        """Settings for the presets of `mien.training.PRESETS` that the method has, all of one class."""
-        return self._settings().PRESETS
-
-    @property
-    def preset_steps(self) -> Mapping[str, int]:
-        """Number of steps of a run, for the presets for which the method has its own number (`PRESET_STEPS`)."""
-        return getattr(self._settings(), "PRESET_STEPS", {})
+    config_class: str
+    """"MODULE:CLASS"; see `config`. A module that does not import torch keeps `--help` and the checks of options fast.
+    It may hold `PRESETS`."""
 
     @property
     def config(self) -> type[MethodConfig]:
-        """The class of the method's settings."""
-        return type(self.presets["standard"])
+        """The class of the method's settings. Its defaults are the preset `standard`."""
+        return named(self.config_class)
 
-    def _settings(self) -> ModuleType:
-        return importlib.import_module(self.settings_module or self.avatar_class.split(":")[0])
+    @property
+    def presets(self) -> Mapping[str, Differences]:
+        """How each preset of `mien.training.PRESETS` that the method has differs from the defaults.
+
+        Every method has `draft` and `standard`. The module of its settings adds to the former, and adds others, by
+        `PRESETS`.
+        """
+        own = getattr(importlib.import_module(self.config_class.split(":")[0]), "PRESETS", {})
+        return {"draft": {}, "standard": {}, **own}
 
     @property
     def avatar(self) -> "type[Avatar]":
@@ -56,11 +52,13 @@ class Method:
 
 METHODS = {
     "gaussian_avatars": Method(
-        "mien.avatar.gaussian_avatars.avatar:GaussianAvatars", "mien.avatar.gaussian_avatars.settings"
+        "mien.avatar.gaussian_avatars.avatar:GaussianAvatars",
+        "mien.avatar.gaussian_avatars.settings:GaussianAvatarsConfig",
     ),
-    "headgas": Method("mien.avatar.headgas.avatar:HeadGas", "mien.avatar.headgas.settings"),
+    "headgas": Method("mien.avatar.headgas.avatar:HeadGas", "mien.avatar.headgas.settings:HeadGasConfig"),
     "mono_gaussian_avatar": Method(
-        "mien.avatar.mono_gaussian_avatar.avatar:MonoGaussianAvatar", "mien.avatar.mono_gaussian_avatar.settings"
+        "mien.avatar.mono_gaussian_avatar.avatar:MonoGaussianAvatar",
+        "mien.avatar.mono_gaussian_avatar.settings:MonoGaussianAvatarConfig",
     ),
 }
 """Mien's own methods by name. A method whose settings import torch comes last: looking for the method of a config goes

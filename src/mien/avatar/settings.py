@@ -4,13 +4,22 @@ Every number has its range beside it (`mien.ranges`), and every field a descript
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal, final
+from typing import Annotated, Any, Literal, TypedDict, final
 
 from mien.avatar.schedules import Rate
 from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
 
 GAUSSIAN_COUNT = Range(1, 10_000_000)
 """Range of a number of Gaussians. Tens of millions would not fit into memory."""
+
+
+class Differences(TypedDict, total=False):
+    """What a preset changes, in the form of a file of settings (docs/settings.md). All else stays at its default."""
+
+    settings: dict[str, Any]
+    """Settings of a run (`mien.training.TrainSettings`) by name."""
+    method: dict[str, Any]
+    """Settings of the method by name. A group of settings is a dict again."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +193,12 @@ class RefillSettings:
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """Settings that every method has. Each method adds its own fields."""
+    """Settings that every method has. Each method adds its own fields.
+
+    The defaults of a method's own class are its preset `standard`. Groups of settings that methods share (losses, face
+    tuning, density control) have neutral defaults of their own, and a method says which values it takes. To change one
+    setting of a group, change the method's: `replace(config, density=replace(config.density, rounds=8))`.
+    """
 
     photometric: Photometric = field(default_factory=Photometric)
     """Weights of the losses that compare a rendering with its target."""

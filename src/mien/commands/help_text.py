@@ -4,9 +4,9 @@ import ast
 import inspect
 import textwrap
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 _COMMON = {
@@ -21,6 +21,13 @@ class Described:
     """Mark of an option whose description is made when help is shown, because it lists what is registered."""
 
     text: Callable[[], str]
+
+
+@dataclass(frozen=True)
+class OtherValues:
+    """A mark beside an option: the values that presets give it, such as "paper: white", for the help."""
+
+    texts: tuple[str, ...]
 
 
 def without_details(command: type) -> tuple[type, list[str]]:
@@ -78,7 +85,8 @@ def readable(options: Any) -> Any:
         elif one.name in about:
             text = " ".join(about[one.name].split())
             is_silent = kind is bool or "(default:" in text
-            shown = tyro.conf.arg(help=text, help_behavior_hint="" if is_silent else _shown_default)
+            others = [text for mark in marks if isinstance(mark, OtherValues) for text in mark.texts]
+            shown = tyro.conf.arg(help=text, help_behavior_hint=partial(_about_value, is_silent, others))
             changed[one.name] = Annotated[(kind, *marks, shown)]
             if one.default is not MISSING or one.default_factory is not MISSING:
                 defaults[one.name] = _default_of(one)
@@ -104,8 +112,9 @@ def field_docs(kind: type) -> Mapping[str, str]:
     return found
 
 
-def _shown_default(default: str) -> str:
-    return "" if default in ("None", "") else f"(default: {default})"
+def _about_value(is_silent: bool, others: Sequence[str], default: str) -> str:
+    known = [] if is_silent or default in ("None", "") else [f"default: {default}"]
+    return f"({'; '.join([*known, *others])})" if known or others else ""
 
 
 def _unwrapped(hint: Any) -> tuple[Any, ...]:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 
 import tyro
 
-from mien.avatar import DEFAULT_METHOD, MethodConfig, has_method, method_names
+from mien.avatar import DEFAULT_METHOD, MethodConfig, has_method, method_named, method_names
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.config_file import ConfigFile, read_config_file
-from mien.commands.help_text import Described, subclass_with
-from mien.commands.settings_options import apply_options, check_names, leaves, options_type
+from mien.commands.help_text import Described, OtherValues, subclass_with
+from mien.commands.settings_options import apply_options, check_names, leaves, options_type, other_values
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
@@ -46,8 +46,9 @@ class TrainOptions:
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""
     preset: PresetName = "standard"
-    """How thorough the training is. draft takes minutes; standard gives the figures of docs/results.md; paper repeats
-    the method's paper, if the method has it (docs/paper_preset.md), and takes days on a processor."""
+    """How thorough the training is. draft takes minutes; standard has the defaults, and gives the figures of
+    docs/results.md; paper repeats the method's paper, if the method has it (docs/paper_preset.md), and takes days on a
+    processor."""
     split: Split = "blocks"
     """Frames held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing (none).
     gaussian-avatars: the sequence and the camera that the paper holds out, for its subjects (docs/using.md)."""
@@ -188,16 +189,24 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
     own = leaves(config, "method")
     check_names(arguments, "method", own, name)
     rest = [one.name for one in fields(settings) if one.name not in MAIN_SETTINGS]
+    presets = method_named(name).presets
+    runs = {preset: PRESETS[preset].settings_of(name) for preset in presets}
+    configs = {preset: PRESETS[preset].config(name) for preset in presets}
     in_detail = {
-        "training": options_type(leaves(settings, "training", rest), "training"),
-        "method_settings": options_type(own, "method"),
+        "training": options_type(leaves(settings, "training", rest), "training", runs),
+        "method_settings": options_type(own, "method", configs),
     }
     dials = {dial: getattr(settings, dial) for dial in ("split", "background", "seed", "device")}
     dials |= {"hold_out": settings.held_out_sequences, "hold_out_cameras": settings.held_out_cameras}
     dials |= {"method": name, "face_tuning": config.face_tuning.enabled}
-    if file and "steps" in file.settings_changes:
-        dials["steps"] = settings.steps
+    dials["steps"] = settings.steps if file and "steps" in file.settings_changes else 0
     hints = get_type_hints(TrainOptions, include_extras=True)
+    others = {
+        "steps": other_values(runs, "steps", dials["steps"]),
+        "background": other_values(runs, "background", dials["background"]),
+        "face_tuning": other_values(configs, "face_tuning.enabled", dials["face_tuning"]),
+    }
+    hints |= {dial: Annotated[hints[dial], OtherValues(tuple(texts))] for dial, texts in others.items()}
     defaults = {dial: field(default=value) for dial, value in dials.items()}
     defaults |= {group: field(default_factory=kind) for group, kind in in_detail.items()}
     return subclass_with(TrainOptions, {dial: hints[dial] for dial in dials} | in_detail, defaults)

@@ -10,13 +10,14 @@ import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import partial
+from operator import attrgetter
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from mien.avatar import Rate
 from mien.commands.help_text import field_docs
 from mien.config import no_such_setting
 from mien.errors import UserError
-from mien.ranges import Range, range_of
+from mien.ranges import Range, range_of, shown
 
 Settings = TypeVar("Settings")
 _RATES = "Learning rates over the run: constant, or log-linear from start to end."
@@ -71,8 +72,14 @@ def _leaves_of(settings: Any, name: str, path: str, heading: str, about_heading:
     return found
 
 
-def options_type(listed: Sequence[Leaf], prefix: str) -> type:
-    """A dataclass that tyro turns into these options. It has a field for each heading, which has one for each leaf."""
+def options_type(listed: Sequence[Leaf], prefix: str, presets: Mapping[str, Any]) -> type:
+    """A dataclass that tyro turns into these options. It has a field for each heading, which has one for each leaf.
+
+    Args:
+        listed: The fields that become options.
+        prefix: Start of these options.
+        presets: Such settings by the name of their preset. The help shows their values where they differ.
+    """
     import tyro
 
     # Options that belong to no group come first.
@@ -82,7 +89,7 @@ def options_type(listed: Sequence[Leaf], prefix: str) -> type:
             name=leaf.option(prefix).removeprefix("--"),
             prefix_name=False,
             help=leaf.about.replace("\n", " "),
-            help_behavior_hint=partial(_range_and_default, leaf.allowed),
+            help_behavior_hint=partial(_about_value, leaf, presets),
         )
         hint: Any = Annotated[leaf.kind, tyro.conf.FlagConversionOff, marks]
         headings.setdefault(leaf.heading, []).append((_identifier(leaf.name), hint, field(default=leaf.value)))
@@ -97,9 +104,22 @@ def options_type(listed: Sequence[Leaf], prefix: str) -> type:
     return make_dataclass(f"{prefix}_options", groups, frozen=True)
 
 
-def _range_and_default(allowed: Range | None, default: str) -> str:
-    shown = ([] if allowed is None else [str(allowed)]) + ([] if default == "None" else [f"default: {default}"])
-    return f"({'; '.join(shown)})" if shown else ""
+def _about_value(leaf: Leaf, presets: Mapping[str, Any], default: str) -> str:
+    known = ([] if leaf.allowed is None else [str(leaf.allowed)]) + (
+        [] if default == "None" else [f"default: {default}"]
+    )
+    known += other_values(presets, leaf.name, leaf.value)
+    return f"({'; '.join(known)})" if known else ""
+
+
+def other_values(presets: Mapping[str, Any], name: str, value: Any) -> list[str]:
+    """The values of a setting that differ from `value`, each after the names of its presets: "draft, paper: 0"."""
+    found: dict[str, list[str]] = {}
+    for preset, settings in presets.items():
+        other = attrgetter(name)(settings)
+        if other != value:
+            found.setdefault("none" if other is None else shown(other), []).append(preset)
+    return [f"{', '.join(names)}: {text}" for text, names in found.items()]
 
 
 def apply_options(settings: Settings, options: Any) -> Settings:

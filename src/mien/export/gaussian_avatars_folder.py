@@ -19,6 +19,7 @@ from torch import Tensor
 
 from mien.avatar import METHODS, Avatar
 from mien.avatar.files import overwrite
+from mien.avatar.gaussian_avatars.settings import as_published
 from mien.errors import UserError
 from mien.export.flame_params import read_flame_params, write_flame_params
 from mien.export.ply import BINDING, property_names, read_columns, stacked, stacked_sh
@@ -108,7 +109,7 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
     face = read_flame_params(folder / PARAMETERS, face_model)
     method = METHODS[_METHOD]
     frame = "head" if _HEAD_COMMENT in lines else "world"
-    config = replace(method.config(), sh_degree=int(sh.shape[1] ** 0.5) - 1, sh_frame=frame)  # type: ignore[call-arg]
+    config = replace(as_published(), sh_degree=int(sh.shape[1] ** 0.5) - 1, sh_frame=frame)
     with torch.random.fork_rng(devices=[]):
         avatar = method.avatar(config, face_model, face)
     state = {

@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Mapping
 from collections.abc import Sequence as Items
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from mien.storage import expect_whole, read_json, read_tensors, write_json, writ
 from mien.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
 from mien.training.footage import Coverage, Sequence, write_coverage
-from mien.training.settings import TrainSettings
+from mien.training.settings import PRESETS, TrainSettings
 
 _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
@@ -179,7 +180,7 @@ def write_imported_run(run_dir: Path, avatar: Avatar, face: FaceParams, camera: 
         source: The place that it was imported from, for people.
     """
     content = {
-        **_choices(avatar.config, TrainSettings(steps=0)),
+        **_choices(avatar.config, replace(PRESETS["paper"].settings, steps=0)),
         "data": [{"sequence": _IMPORTED, "timesteps": len(face), "camera": _camera_entry(camera)}],
         "imported_from": str(source.absolute()),
         "mien": mien.__version__,

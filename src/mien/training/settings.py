@@ -1,12 +1,13 @@
 """TrainSettings, the settings of a run that do not depend on the method, and presets of them. Needs no torch."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
-from mien.avatar.methods import Method, method_named
-from mien.avatar.settings import MethodConfig
+from mien.avatar.methods import method_named
+from mien.avatar.settings import Differences, MethodConfig
 from mien.bounded import MAX_SIDE
+from mien.config import overlay
 from mien.devices import DeviceName
 from mien.errors import UserError
 from mien.ranges import NOT_NEGATIVE, POSITIVE, Range, check_ranges
@@ -18,7 +19,10 @@ camera instead (`mien.training.footage.named_split`)."""
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of a training run. Losses, rates and density control are settings of the method."""
+    """Settings of a training run. Losses, rates and density control are settings of the method.
+
+    The defaults are the preset `standard`.
+    """
 
     steps: Annotated[int, Range(1, 1_000_000_000)] = 12_000
     """Number of training frames, one for each optimiser step. All schedules stretch with it. A method may use several
@@ -26,11 +30,11 @@ class TrainSettings:
     split: Split = "blocks"
     """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
     gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08."""
-    background: Literal["white", "random", "auto"] = "white"
+    background: Literal["white", "random", "auto"] = "auto"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white needles in new poses. It costs 0.1 to 0.4 dB compared with white. Auto: random where sides
     are filled (`--training.unseen`), where white ears would show from the side, else white."""
-    edges: Literal["filmed", "cleaned", "auto"] = "filmed"
+    edges: Literal["filmed", "cleaned", "auto"] = "auto"
     """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
     avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
     backgrounds. Cleaned: the colours of the person alone, as estimated from what is solid nearby. Auto: cleaned where
@@ -45,7 +49,7 @@ class TrainSettings:
     cameras (mean). A step takes longer with it."""
     camera_color_rate: Annotated[float, POSITIVE] = 1e-3
     """Learning rate of these changes, per step. It ends at a tenth."""
-    unseen: Literal["trained", "filled", "auto"] = "trained"
+    unseen: Literal["trained", "filled", "auto"] = "auto"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
     broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
     no picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes;
@@ -58,7 +62,7 @@ class TrainSettings:
     """Largest distance in metres by which the surface of the hair of a filled head rises or sinks in one correction,
     where that lowers the loss. There is one after every 8 steps from 3 to 60 % of the run, and they get smaller. 0
     keeps the hair at the height that was measured on mattes or guessed from it."""
-    inside: Literal["free", "covered", "filled"] = "free"
+    inside: Literal["free", "covered", "filled"] = "covered"
     """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
     them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
     each step, so that lids and lips become opaque. Filled: also, a mouth that is hardly ever seen gets a surface in
@@ -124,11 +128,19 @@ def doubly_held_out(settings: TrainSettings) -> str | None:
 
 @dataclass(frozen=True)
 class Preset:
-    """The settings of a run, and of each method. Those of a method, and steps of its own, are in the method's file."""
+    """A named choice of settings of a run and its method, given as what differs from their defaults.
+
+    The differences of each method are in the method's file.
+    """
 
     name: str
-    settings: TrainSettings
-    """Settings of a run, for methods that have no number of steps of their own."""
+    changes: Mapping[str, Any]
+    """Settings of a run that differ from the defaults, by name, whatever the method is."""
+
+    @property
+    def settings(self) -> TrainSettings:
+        """The settings of a run, for methods that change none of them."""
+        return overlay(TrainSettings(), self.changes, f"preset {self.name}: settings", "a run")
 
     def settings_of(self, method: str) -> TrainSettings:
         """The settings of a method's run.
@@ -136,8 +148,8 @@ class Preset:
         Raises:
             UserError: there is no method of that name, or it does not have this preset.
         """
-        own = self._method(method).preset_steps
-        return replace(self.settings, steps=own.get(self.name, self.settings.steps))
+        own = self._differences(method).get("settings", {})
+        return overlay(self.settings, own, f"preset {self.name} of {method}: settings", "a run")
 
     def config(self, method: str) -> MethodConfig:
         """The settings of a method.
@@ -145,21 +157,23 @@ class Preset:
         Raises:
             UserError: there is no method of that name, or it does not have this preset.
         """
-        return self._method(method).presets[self.name]
+        own = self._differences(method).get("method", {})
+        return overlay(method_named(method).config(), own, f"preset {self.name} of {method}: method", method)
 
-    def _method(self, name: str) -> Method:
-        method = method_named(name)
-        if self.name not in method.presets:
-            raise UserError(f"--preset {self.name}: {name} has no such preset; it has {' and '.join(method.presets)}")
-        return method
+    def _differences(self, method: str) -> Differences:
+        presets = method_named(method).presets
+        if self.name not in presets:
+            raise UserError(f"--preset {self.name}: {method} has no such preset; it has {' and '.join(presets)}")
+        return presets[self.name]
 
 
 PRESETS = {
     preset.name: preset
     for preset in (
-        Preset("draft", TrainSettings(steps=8_000, background="auto", edges="auto", inside="covered", unseen="auto")),
-        Preset("standard", TrainSettings(background="auto", edges="auto", inside="covered", unseen="auto")),
-        Preset("paper", TrainSettings()),
+        Preset("draft", {"steps": 8_000}),
+        Preset("standard", {}),
+        Preset("paper", {"background": "white", "edges": "filmed", "inside": "free", "unseen": "trained"}),
     )
 }
-"""Presets by name, from quick to good. `paper` repeats the method's paper; not every method has it."""
+"""Presets by name, from quick to good. `standard` is the defaults. `paper` repeats the method's paper; not every method
+has it."""

@@ -1,10 +1,18 @@
 """The settings of GaussianAvatars."""
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, PerceptualLoss, Photometric
+from mien.avatar.settings import (
+    Differences,
+    FaceTuning,
+    GradientSettings,
+    MethodConfig,
+    PerceptualLoss,
+    Photometric,
+)
+from mien.config import overlay
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range
 
 
@@ -41,9 +49,17 @@ class SurfaceLimits:
 class GaussianAvatarsConfig(MethodConfig):
     """Settings of GaussianAvatars. The defaults suit one fixed camera and runs of some thousand steps.
 
-    The presets `draft` and `standard` add changes of place with the expression (`expression_rank`).
+    They add to the paper: places that change with the expression (`expression_rank`), a loss of alpha, more weight and
+    a perceptual loss for eyes and mouth, and tuned poses that stay where they are on average.
     """
 
+    photometric: Photometric = Photometric(
+        alpha_weight=0.2, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
+    )
+    """Weights of the losses that compare a rendering with its target. Without the loss of alpha, a pale face is a thin
+    one before a white background. The weight of eyes and mouth and the perceptual loss take a third more time."""
+    face_tuning: FaceTuning = FaceTuning(keep_mean_pose=True, keep_turns=True)
+    """Whether and how fast training changes the tracked face parameters of each frame."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics for view-dependent colour. Keep 0 with a single camera, because view-dependent
     colours then absorb the head's pose."""
@@ -69,13 +85,13 @@ class GaussianAvatarsConfig(MethodConfig):
     color_rate: Rate = Rate(2.5e-3)
     """Learning rate of the constant colour coefficients, per step. Coefficients of higher degrees have a constant rate:
     a twentieth of the start of this rate."""
-    expression_rank: Annotated[int, Range(0, 8)] = 0
+    expression_rank: Annotated[int, Range(0, 8)] = 4
     """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say: wrinkles, or
     shoulders that stay while the head turns. 0 is the paper's method, without such changes."""
-    expression_color_rate: Rate = Rate(1e-3)
+    expression_color_rate: Rate = Rate(0.0)
     """Learning rate of the changes of colour with the expression, in colour coefficients per unit of an activation and
     step. If its start is 0, colours do not change."""
-    expression_opacity_rate: Rate = Rate(0.01)
+    expression_opacity_rate: Rate = Rate(0.0)
     """Learning rate of the changes of opacity (logits) with the expression, per unit of an activation and step. If its
     start is 0, opacities do not change."""
     expression_offset_rate: Rate = Rate(1e-3, 1e-5)
@@ -116,10 +132,6 @@ class GaussianAvatarsConfig(MethodConfig):
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
 """The paper's schedule, in steps: the run, between rounds of density control, to the first round, between resets."""
 _SH_DEGREE, _DEGREE_STEPS = 3, 1_000
-_RANK = 4
-"""Rank of the changes with the expression in the presets `draft` and `standard`, where only places change."""
-_ALPHA_WEIGHT = 0.2
-"""Weight of the loss of alpha in these presets, without which a pale face is a thin one before a white background."""
 _VISIT = 30
 """How much further the paper's optimiser moves a frame between two visits than its learning rate says.
 
@@ -131,55 +143,48 @@ frame, by about the rate. The paper's subjects have nine sequences, so some 1,00
 """
 
 
-def _paper() -> GaussianAvatarsConfig:
-    """The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
-    resets = (_FIRST, *range(_RESET, _STEPS, _RESET))
-    return GaussianAvatarsConfig(
-        sh_degree=_SH_DEGREE,
-        sh_warmup=(_SH_DEGREE + 1) * _DEGREE_STEPS / _STEPS,
-        means_times_extent=True,
-        face_tuning=FaceTuning(
-            expression=Rate(_VISIT * 1e-3),
-            joints=Rate(_VISIT * 1e-5),
-            head_rotation=Rate(_VISIT * 1e-5),
-            head_translation=Rate(_VISIT * 1e-6),
-        ),
-        density=GradientSettings(
-            start=_FIRST / _STEPS,
-            stop=(_STEPS - _ROUND) / _STEPS,
-            rounds=(_STEPS - _ROUND - _FIRST) // _ROUND + 1,
-            size_unit="extent",
-            split_size=0.01,
-            prune_size=0.1,
-            prune_radius=20.0,
-            opacity_resets=tuple(step / _STEPS for step in resets),
-            max_gaussians=200_000,
-        ),
-    )
+_PUBLISHED: dict[str, Any] = {
+    "photometric": {"alpha_weight": 0.0, "part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}},
+    "expression_rank": 0,
+    "expression_color_rate": {"start": 1e-3},
+    "expression_opacity_rate": {"start": 0.01},
+    "face_tuning": {"keep_mean_pose": False, "keep_turns": False},
+}
+"""Takes away what the defaults add to the paper."""
+_PAPER: dict[str, Any] = _PUBLISHED | {
+    "sh_degree": _SH_DEGREE,
+    "sh_warmup": (_SH_DEGREE + 1) * _DEGREE_STEPS / _STEPS,
+    "means_times_extent": True,
+    "face_tuning": _PUBLISHED["face_tuning"]
+    | {
+        "expression": {"start": _VISIT * 1e-3},
+        "joints": {"start": _VISIT * 1e-5},
+        "head_rotation": {"start": _VISIT * 1e-5},
+        "head_translation": {"start": _VISIT * 1e-6},
+    },
+    "density": {
+        "start": _FIRST / _STEPS,
+        "stop": (_STEPS - _ROUND) / _STEPS,
+        "rounds": (_STEPS - _ROUND - _FIRST) // _ROUND + 1,
+        "size_unit": "extent",
+        "split_size": 0.01,
+        "prune_radius": 20.0,
+        "opacity_resets": [step / _STEPS for step in (_FIRST, *range(_RESET, _STEPS, _RESET))],
+        "max_gaussians": 200_000,
+    },
+}
+"""The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
+
+PRESETS: dict[str, Differences] = {
+    "draft": {"method": {"photometric": {"part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}}}},
+    "paper": {"method": _PAPER, "settings": {"steps": _STEPS}},
+}
+"""How presets differ from the defaults. `draft` lacks some losses, and is a shorter run."""
 
 
-def _draft() -> GaussianAvatarsConfig:
-    """The defaults, with places that change with the expression, and a head that is opaque where the matte is."""
-    return GaussianAvatarsConfig(
-        photometric=Photometric(alpha_weight=_ALPHA_WEIGHT),
-        expression_rank=_RANK,
-        expression_color_rate=Rate(0.0),
-        expression_opacity_rate=Rate(0.0),
-        face_tuning=FaceTuning(keep_mean_pose=True, keep_turns=True),
-    )
+def as_published() -> GaussianAvatarsConfig:
+    """The settings without what the defaults add to the paper, for runs of some thousand steps.
 
-
-def _standard() -> GaussianAvatarsConfig:
-    """A draft with eyes and mouth weighed more and a perceptual loss, which take a third more time."""
-    return replace(
-        _draft(),
-        photometric=Photometric(
-            alpha_weight=_ALPHA_WEIGHT, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
-        ),
-    )
-
-
-PRESETS = {"draft": _draft(), "standard": _standard(), "paper": _paper()}
-"""Settings of this method for each preset. `draft` lacks some losses of `standard`, and is a shorter run."""
-PRESET_STEPS = {"paper": _STEPS}
-"""Number of steps of the presets for which the method has its own."""
+    Avatars that the paper's own code trained have these settings, and benchmarks of the method use them.
+    """
+    return overlay(GaussianAvatarsConfig(), _PUBLISHED, "as published", "gaussian_avatars")

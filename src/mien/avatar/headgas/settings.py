@@ -1,22 +1,14 @@
 """The settings of HeadGaS."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import Differences, FaceTuning, GradientSettings, MethodConfig
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range, ToLoad
 
 Variant = Literal["full", "no_mlp", "delta", "change_all", "no_blending"]
 """The method and its ablations (supplement, section 2), as `mien.avatar.headgas.variants` makes them."""
-
-
-def _density() -> GradientSettings:
-    return GradientSettings(opacity_resets=(), size_start=0.1, prune_size=0.03, max_gaussians=20_000)
-
-
-def _face_tuning() -> FaceTuning:
-    return FaceTuning(within_bounds=True)
 
 
 @dataclass(frozen=True)
@@ -30,7 +22,7 @@ class HeadGasConfig(MethodConfig):
     shift_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the mean absolute shift of the centres, in metres, which only `delta` and `change_all` have. The paper
     has this term, but not its weight."""
-    face_tuning: FaceTuning = field(default_factory=_face_tuning)
+    face_tuning: FaceTuning = FaceTuning(within_bounds=True)
     """Whether and how fast training changes the tracked face parameters of each frame."""
     points: Annotated[int, Range(4, 1_000_000), ToLoad(4)] = 2500
     """Number of Gaussians at the start, sampled on the subject's mesh."""
@@ -47,7 +39,7 @@ class HeadGasConfig(MethodConfig):
     encoding_length: Annotated[float, Range(1e-4, 1e4)] = 0.05
     """Length of one unit in the positional encoding, in metres."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
-    """Degree of the spherical harmonics for view-dependent colour (paper: 3). Keep 0 with a single camera, because
+    """Degree of the spherical harmonics for view-dependent colour. Keep 0 with a single camera, because
     view-dependent colours then absorb the head's pose."""
     sh_warmup: Annotated[float, FRACTION] = 0.3
     """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
@@ -70,7 +62,9 @@ class HeadGasConfig(MethodConfig):
     judged_expressions: Annotated[int, Range(0, 10_000)] = 64
     """Number of training expressions, as different as possible, at which each round of density control computes the
     opacities to prune by. With 0, only the opacities in the steps since the last round count."""
-    density: GradientSettings = field(default_factory=_density)
+    density: GradientSettings = GradientSettings(
+        opacity_resets=(), size_start=0.1, prune_size=0.03, max_gaussians=20_000
+    )
     """Density control: when and where Gaussians are added and removed. Opacities come from the network and are never
     reset, so `size_start` sets when large Gaussians are removed."""
 
@@ -78,31 +72,28 @@ class HeadGasConfig(MethodConfig):
 _STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS = 50_000, 100, 500, 15_000, 1_000
 """The paper's run, in steps. The schedule of density control and of degrees is that of 3D Gaussian Splatting."""
 
-
-def _paper() -> HeadGasConfig:
-    """The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
-    return HeadGasConfig(
-        face_tuning=FaceTuning(enabled=False),
-        directions=0,
-        sh_degree=3,
-        sh_warmup=4 * _DEGREE_STEPS / _STEPS,
-        means_rate=Rate(1.6e-4, 1.6e-6),
-        means_times_extent=True,
-        density=GradientSettings(
-            start=_FIRST / _STEPS,
-            stop=_LAST / _STEPS,
-            rounds=(_LAST - _FIRST) // _ROUND + 1,
-            size_unit="extent",
-            split_size=0.01,
-            prune_size=0.1,
-            size_start=_FIRST / _STEPS,
-            opacity_resets=(),
-            max_gaussians=45_000,
-        ),
-    )
-
-
-PRESETS = {"draft": HeadGasConfig(), "standard": HeadGasConfig(), "paper": _paper()}
-"""Settings of this method for each preset. `draft` and `standard` are equal: a draft is only a shorter run."""
-PRESET_STEPS = {"paper": _STEPS}
-"""Number of steps of the presets for which the method has its own."""
+PRESETS: dict[str, Differences] = {
+    "paper": {
+        "method": {
+            "face_tuning": {"enabled": False, "within_bounds": False},
+            "directions": 0,
+            "sh_degree": 3,
+            "sh_warmup": 4 * _DEGREE_STEPS / _STEPS,
+            "means_rate": {"start": 1.6e-4, "end": 1.6e-6},
+            "means_times_extent": True,
+            "density": {
+                "start": _FIRST / _STEPS,
+                "stop": _LAST / _STEPS,
+                "rounds": (_LAST - _FIRST) // _ROUND + 1,
+                "size_unit": "extent",
+                "split_size": 0.01,
+                "prune_size": 0.1,
+                "size_start": _FIRST / _STEPS,
+                "max_gaussians": 45_000,
+            },
+        },
+        "settings": {"steps": _STEPS},
+    },
+}
+"""How presets differ from the defaults (docs/paper_preset.md). Times are fractions, so that they fit runs of any
+length. A draft is only a shorter run."""

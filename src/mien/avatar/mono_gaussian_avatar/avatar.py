@@ -11,9 +11,9 @@ predicts its own attribute, while the published code mixes up columns of scales 
 the motion within the head frame, so that a turn of the head alone changes none of the head's; schedules are fractions
 of the run, which spans epochs `first_epoch` to `epochs` of the paper; the optimiser's moments survive rounds.
 
-Options beyond the paper, which the presets `draft` and `standard` use: points start on the face model (`start`), the
-deformation network learns the face model's motion before the first picture (`pretraining`), and each point adds
-attributes of its own to those that the network gives to its position (`own_rate`).
+Options beyond the paper, which are the defaults: points start on the face model (`start`), the deformation network
+learns the face model's motion before the first picture (`pretraining`), and each point adds attributes of its own to
+those that the network gives to its position (`own_rate`).
 """
 
 from collections.abc import Iterator

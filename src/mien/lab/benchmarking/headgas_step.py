@@ -11,7 +11,7 @@ import torch
 
 from mien import _native, runtime
 from mien.avatar import HeadGas, make_portable
-from mien.avatar.headgas.settings import PRESETS, HeadGasConfig
+from mien.avatar.headgas.settings import HeadGasConfig
 from mien.face import FaceModel, load_face_model
 from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
@@ -40,7 +40,7 @@ def headgas_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
     Frames are posed by the avatar itself (`headgas_frame`) and by the runtime (`headgas_runtime_frame`); each frame has
     another expression.
     """
-    config = replace(PRESETS["standard"], features=32, sh_degree=3)
+    config = HeadGasConfig(features=32, sh_degree=3)
     face_model = load_face_model()
     for name, directions in (("headgas_step", config.directions), ("headgas_step_all", 0)):
         state, data = headgas_case(face_model, replace(config, directions=directions), COUNT, SIZE)

@@ -4,14 +4,12 @@ Run as `mien bench train-step --method mono_gaussian_avatar`.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import count as counting
 
 import torch
 
 from mien import _native, runtime
-from mien.avatar import MonoGaussianAvatar, make_portable
-from mien.avatar.mono_gaussian_avatar.settings import PRESETS
+from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, make_portable
 from mien.face import FaceModel, load_face_model
 from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
@@ -60,7 +58,7 @@ def mono_case(
     Steps use `frames` frames.
     """
     sequence = benchmark_sequence(face_model, *size)
-    config = replace(PRESETS["standard"], points=len(face_model.template), frames_per_step=frames)
+    config = MonoGaussianAvatarConfig(points=len(face_model.template), frames_per_step=frames)
     state = start([sequence], face_model, config, SETTINGS)
     assert isinstance(state.avatar, MonoGaussianAvatar)
     _fill(state.avatar, count)
