@@ -61,7 +61,7 @@ const read = async (buffer) => {
   for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
   return btoa(text);
 };
-return { frames: await read(posed.frames), means: await read(posed.means), colours: await read(posed.colours),
+return { frames: await read(posed.frames), means: await read(posed.means), colors: await read(posed.colors),
   keys: await read(sorter.keys), order: await read(sorter.order), state: await read(state) };
 """
 """Reads back what the compute passes have written, in base64."""
