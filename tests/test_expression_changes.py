@@ -239,7 +239,7 @@ def test_impossible_changes_are_refused(tmp_path: Path) -> None:
     fixed = {name: getattr(changes, name) for name in ("rest", "directions", "reach")}
     none = {name: array[..., :0] for name, array in (parts | fixed).items() if name not in ("rest", "reach")}
     for wrong, part in (
-        (replace(changes, **{name: array[:3] for name, array in parts.items()}), "the shape of colour of its changes"),
+        (replace(changes, **{name: array[:3] for name, array in parts.items()}), "the shape of color of its changes"),
         (replace(changes, rest=fixed["rest"][:1], directions=fixed["directions"][:1]), "the shape of rest of its"),
         (replace(changes, reach=-changes.reach), "is negative"),
         (replace(changes, **none), "0 activations"),

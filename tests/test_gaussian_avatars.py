@@ -48,7 +48,7 @@ def test_first_colors_are_the_means_of_the_triangles_corners() -> None:
     assert not surface_of(new_avatar()).wants_first_colors
     avatar.store.select(torch.arange(len(avatar.store)).flip(0)[:20])
     colors = torch.rand(len(avatar.face_model.template), 3)
-    surface_of(avatar).paint(colors)
+    surface_of(avatar).set_first_colors(colors)
     expected = colors[avatar.face_model.faces.flip(0)[:20]].mean(1)
     torch.testing.assert_close(rgb_from_sh(avatar.store["sh_constant"][:, 0]), expected)
     assert not avatar.store["sh_rest"].any()

@@ -145,13 +145,13 @@ def test_limits_and_side_views_follow_the_hair():
     assert make is not None
     head = make()
     assert head.hair is not None
-    assert head.aside is not None
-    height = head.aside.height
+    assert head.side_views is not None
+    height = head.side_views.height
     state = head.part().state()
     head.part().load_state(state | {"shift": state["shift"] + 0.01})
     scalp = head_parts(model).scalp
     torch.testing.assert_close(head.unseen.prior.hair[scalp], head.hair.start.hair[scalp] + 0.01)
-    assert float(head.aside.height.max()) > float(height.max())
+    assert float(head.side_views.height.max()) > float(height.max())
 
 
 def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:

@@ -90,6 +90,7 @@ def run_all(workspace: Path, out: Path, capsys: pytest.CaptureFixture[str], told
     out.mkdir(exist_ok=True)
     (out / "clip.mp4").write_bytes(b"no video")
     (out / "avatar").mkdir(exist_ok=True)
+    (out / "avatar" / "flame_param.npz").touch()  # so that `mien import` knows what it is
     for command in COMMANDS:
         arguments = [word.replace("W", str(workspace)) if word == "W" else word.replace("OUT", str(out))
                      for word in command.split()]  # fmt: skip
