@@ -12,7 +12,7 @@ namespace {
 // Raw attributes of n points and their changes.
 struct RawArrays {
   static constexpr char kName[] = "RawPoints";
-  static constexpr const char* kFields[] = {"changes", "log_scales", "quats", "opacity_logits", "colours"};
+  static constexpr const char* kFields[] = {"changes", "log_scales", "quats", "opacity_logits", "colors"};
   In<-1, mien::kPointAttributes> changes;
   In<-1, 3> log_scales;
   In<-1, 4> quats;

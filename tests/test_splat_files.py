@@ -78,7 +78,7 @@ def expect_near(found: Gaussians, expected: Gaussians, loss: Loss) -> None:
     same = [multiply_quaternions(wanted, half.expand_as(wanted)) for half in torch.eye(4, dtype=torch.float64)]
     cosines = torch.stack([(turns * one).sum(-1).abs() for one in same]).amax(0)
     differences = {
-        "metres": found.means - expected.means,
+        "meters": found.means - expected.means,
         "radians": 2 * torch.arccos(cosines.clamp(max=1)),
         "log_scale": found.scales.log() - expected.scales.log(),
         "opacity": found.opacities - expected.opacities,
