@@ -1,4 +1,4 @@
-"""What other packages add to the registries: entry points (`importlib.metadata`) of groups such as `mien.formats`.
+"""Additions of other packages to the registries: entry points (`importlib.metadata`) of groups such as `mien.formats`.
 
 Entry points are read at their first use, because that takes 30 ms, which most commands do not need.
 """

@@ -14,7 +14,7 @@ GAUSSIAN_COUNT = Range(1, 10_000_000)
 
 
 class Differences(TypedDict, total=False):
-    """What a preset changes, in the form of a file of settings (docs/settings.md). All else stays at its default."""
+    """Changes by a preset, in the form of a file of settings (docs/settings.md). All else stays at its default."""
 
     settings: dict[str, Any]
     """Settings of a run (`mien.training.TrainSettings`) by name."""

@@ -1,4 +1,4 @@
-"""What a dataset is: how its files are recognised, and what they are read as.
+"""A dataset: how its files are recognised, and what they are read as.
 
 This file needs no torch, because the command line recognises datasets before any work.
 """
@@ -51,7 +51,7 @@ class Dataset:
     name: str
     """Name for `mien import --dataset`."""
     about: str
-    """What the files are, in a few words, for messages."""
+    """The files in a few words, for messages."""
     holds: Literal["sequences", "avatar"]
     recognises: Callable[[Path], str | None]
     read: "Callable[[Path, mien.face.FaceModel | None], Iterable[TrackedSequence] | TrainedAvatar]"

@@ -1,4 +1,4 @@
-"""What a reader of sequences returns, made from the parts that datasets have: pictures, cameras, face parameters."""
+"""Sequences made from the parts that datasets have: pictures, cameras, face parameters."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -36,7 +36,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Largest number of points, summed over the frames of an optimiser step. With more points, steps have fewer
     frames, but at least one."""
     start: Literal["sphere", "face"] = "face"
-    """Where points start: on a sphere around the head, or on the surface of the face model."""
+    """Points start on a sphere around the head, or on the surface of the face model."""
     pretraining: Annotated[int, Range(0, 1_000_000)] = 1_000
     """Number of steps before the first picture, in which the deformation network learns how the face model
     moves."""

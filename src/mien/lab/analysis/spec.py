@@ -62,7 +62,7 @@ class Analysis:
     """The paper whose figures stand beside the measured ones."""
     parts: tuple[Part, ...]
     about_parts: str = ""
-    """What the parts measure, for `mien analyze --help`: each name, and a few words in brackets."""
+    """The parts, for `mien analyze --help`: each name, and in brackets what it measures."""
 
 
 def chosen_parts(analysis: Analysis, names: Sequence[str], train: bool) -> list[Part]:

@@ -106,7 +106,7 @@ class Target:
     parts: tuple[Box, ...] = ()
     """Boxes around eyes and mouth, as far as they are seen. Empty if no loss needs them."""
     hidden: Bool[Tensor, " f"] | None = None
-    """Which triangles inside the head the mesh hides (`mien.training.footage.hidden`). None if nothing needs them."""
+    """Whether the mesh hides each triangle inside the head (`hidden_triangles`). None if nothing needs it."""
 
     def pinned(self) -> "Target":
         """This target in pinned memory, which a GPU can read asynchronously."""

@@ -1,4 +1,4 @@
-"""What makes heads whole: sides, hair and the inside of the mouth, where training pictures show too little of them."""
+"""Heads become whole here: sides, hair and the mouth interior, where training pictures show too little of them."""
 
 from typing import TYPE_CHECKING
 
