@@ -11,7 +11,7 @@ from mien.camera import camera_from_fov
 from mien.driving import drive
 from mien.errors import UserError
 from mien.face import FaceParams
-from mien.render.camera_paths import aside, orbit, turntable
+from mien.render.camera_paths import orbit, turned_camera, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 
@@ -125,14 +125,14 @@ def test_a_camera_aside_looks_at_the_same_place() -> None:
     """A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit."""
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     center = torch.tensor([0.0, 0.0, -0.6])
-    left = aside(camera, center, math.pi / 2, 0.0).position - center
+    left = turned_camera(camera, center, math.pi / 2, 0.0).position - center
     torch.testing.assert_close(left, torch.tensor([0.6, 0.0, 0.0]), atol=1e-6, rtol=0)
-    above = aside(camera, center, 0.0, math.pi / 6).position - center
+    above = turned_camera(camera, center, 0.0, math.pi / 6).position - center
     torch.testing.assert_close(above, torch.tensor([0.0, 0.3, 0.6 * math.sqrt(0.75)]), atol=1e-6, rtol=0)
-    both = aside(camera, center, math.pi / 2, math.pi / 6)
+    both = turned_camera(camera, center, math.pi / 2, math.pi / 6)
     torch.testing.assert_close(
         both.position - center, torch.tensor([0.6 * math.sqrt(0.75), 0.3, 0.0]), atol=1e-6, rtol=0
     )
     pixel, _ = both.project(center)
     torch.testing.assert_close(pixel, camera.project(center)[0], atol=1e-3, rtol=0)
-    assert aside(camera, center, 0.0, 0.0).viewmat.equal(camera.viewmat)
+    assert turned_camera(camera, center, 0.0, 0.0).viewmat.equal(camera.viewmat)
