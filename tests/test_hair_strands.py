@@ -80,16 +80,17 @@ def test_strands_differ_in_brightness_and_not_in_tint_or_between_calls(anny):
 def test_a_closed_head_has_strands_that_keep_their_colors(anny):
     face, count = anny.neutral(1), len(anny.faces)
     avatar = method_named("gaussian_avatars").avatar(PRESETS["standard"].config("gaussian_avatars"), anny, face)
-    bald = len(avatar.store)
+    store = avatar.gaussian_store()
+    bald = len(store)
     chosen, color = _back(anny), torch.full((count, 3), 0.4)
     hair, doubt = torch.full((count,), _HEIGHT), chosen.float()
     surface_of(avatar).close(SurfacePrior(hair, colors=color, doubt=doubt, filled_in=chosen, strands=chosen))
     own = len(_strands(anny)["means"])
-    assert len(avatar.store) == bald + own
-    before = avatar.store["sh_constant"][bald:].detach().clone()
+    assert len(store) == bald + own
+    before = store["sh_constant"][bald:].detach().clone()
     for _ in range(20):
         surface_of(avatar).keep_to(SurfacePrior(hair, colors=color, doubt=doubt, filled_in=chosen, strands=chosen))
-    assert avatar.store["sh_constant"][bald:].equal(before)
+    assert store["sh_constant"][bald:].equal(before)
 
 
 def test_no_chosen_triangle_gives_no_strand(anny):

@@ -50,7 +50,7 @@ def puppet() -> dict[str, np.ndarray]:
     return {
         "images": sequence.capture.images[:, 0], "mattes": sequence.capture.mattes[:, 0], "K": K,
         "viewmat": camera.viewmat.numpy(), "expression": face.expression.numpy(),
-        "head_rotation": face.head_rotation.numpy() + np.float32([0.1, 0.3, -0.2]),
+        "head_rotation": face.head_rotation.numpy() + np.array([0.1, 0.3, -0.2], np.float32),
         "head_translation": face.head_translation.numpy(),
     }  # fmt: skip
 

@@ -154,6 +154,7 @@ def encode(
         container.metadata.update({} if title is None else {"title": title})
         audio = container.add_stream("pcm_s16le", rate=8000, layout="mono") if sound else None
         stream = container.add_stream(codec, rate=25)
+        assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = *size, pixels
         if audio is not None:
             samples = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")

@@ -125,7 +125,9 @@ def test_docs_name_every_setting_that_differs_from_the_default(method: str, sect
     rows = re.split(r"^## ", PAGE.read_text(), flags=re.MULTILINE)
     (own,) = [text for text in rows if text.startswith(f"{section}\n")]
     named = set(re.findall(r"`([a-z_.]+)`", "\n".join(line for line in own.splitlines() if line.startswith("| "))))
-    for setting in names_in(METHODS[method].presets["paper"]["method"]):
+    paper = METHODS[method].presets["paper"]
+    assert "method" in paper
+    for setting in names_in(paper["method"]):
         parts = setting.split(".")
         written = {".".join(parts[:end]) for end in range(1, len(parts) + 1)} | {parts[-1]}
         assert named & written, setting

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mien.avatar import Progress, method_named
+from mien.avatar import GaussianAvatars, Progress, method_named
 from mien.camera import camera_from_fov
 from mien.commands.picture import PictureOptions
 from mien.commands.stages import pictures
@@ -50,10 +50,11 @@ def _random(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def _opaque_avatar(model: FaceModel, color: float):
+def _opaque_avatar(model: FaceModel, color: float) -> GaussianAvatars:
     """One flat opaque Gaussian of one colour on each triangle."""
     torch.manual_seed(0)
     avatar = method_named("gaussian_avatars").avatar(PRESETS["paper"].config("gaussian_avatars"), model, _face(model))
+    assert isinstance(avatar, GaussianAvatars)
     surface_of(avatar).fill_interior(
         torch.ones(len(model.faces), dtype=torch.bool), 0.97, torch.full((len(model.faces), 3), color)
     )
@@ -92,7 +93,9 @@ def test_gradients_reach_gaussians_and_not_the_face(anny):
     avatar, face = _opaque_avatar(anny, 0.9), _face(anny)
     face = replace(face, head_translation=face.head_translation.requires_grad_())
     _views(anny).loss(avatar, face, _camera(), _PROGRESS, 0, _random()).backward()
-    assert float(avatar.store["sh_constant"].grad.abs().sum()) > 0
+    gradient = avatar.store["sh_constant"].grad
+    assert gradient is not None
+    assert float(gradient.abs().sum()) > 0
     assert face.head_translation.grad is None
 
 

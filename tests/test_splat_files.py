@@ -194,8 +194,9 @@ def test_usd_keeps_a_pose(tmp_path: Path, ending: str, coefficients: int) -> Non
 @needs_usd
 def test_usd_follows_its_schema(tmp_path: Path) -> None:
     """USD's own checker finds nothing; the stage states frame, unit and time; values are those at each sample."""
-    from pxr import Usd, UsdGeom, UsdValidation, UsdVol
-
+    Usd, UsdGeom, UsdValidation, UsdVol = (
+        importlib.import_module(f"pxr.{n}") for n in ("Usd", "UsdGeom", "UsdValidation", "UsdVol")
+    )
     poses = [some(100, 4, seed) for seed in range(3)]
     for path in (tmp_path / "a.usda", tmp_path / "a.usdz"):
         assert write_usd(path, iter(poses), 25.0) == 3

@@ -218,7 +218,9 @@ def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
         reference.zero_grad()
     for ours, theirs in zip((store["means"], *network.parameters()), twins, strict=True):
         torch.testing.assert_close(ours, theirs)
-    assert store.moments["means"].step == 5
+    moments = store.moments["means"]
+    assert isinstance(moments, Moments)
+    assert moments.step == 5
     assert set(adam.state()) == {"network/weight", "network/bias"}
     assert store["means"].grad is None
 

@@ -127,7 +127,7 @@ def test_every_method_continues_after_a_termination(method: str, number: signal.
         train_until_step(tmp_path, 1, partial(signal.raise_signal, number), config, **settings)
     begun = int(checkpoint_files(tmp_path / "checkpoints")[-1].stem.removeprefix("step_"))
     assert 1 <= begun < 4
-    train_until_step(tmp_path, 99, list, config, **settings)
+    train_until_step(tmp_path, 99, lambda: None, config, **settings)
     assert read_training_summary(tmp_path)["steps"] == read_curves(tmp_path)["step"].tolist()[0] == 4
 
 
@@ -213,6 +213,6 @@ def test_other_settings_are_refused(undisturbed: Path) -> None:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     with pytest.raises(UserError, match="settings.steps"):
         train_toy.main(undisturbed, STEPS + 1)
-    other = train_toy.CONFIG.__class__(sh_degree=1)
+    other = replace(train_toy.CONFIG, sh_degree=1)
     with pytest.raises(UserError, match="method"):
         train([sequence], face_model, other, train_toy.SETTINGS, undisturbed)

@@ -18,9 +18,9 @@ import pytest
 pytest.importorskip("viser")
 
 import msgspec
-import viser
 import websockets
 import zstandard
+from viser import _messages
 
 from mien import runtime
 from mien.viewer import panel
@@ -122,7 +122,7 @@ def test_only_values_of_controls_pass(serving: Serving) -> None:
         b"\xdd\xff\xff\xff\xff", b"\x81\xa4type\xa4none", b"\xa3\xff\xfe\xfd",
     ):  # fmt: skip
         assert gate.checked(message) is None, message[:40]
-    for kind in viser._messages.Message._subclass_from_type_string():
+    for kind in _messages.Message._subclass_from_type_string():
         message = {**strange, **CAMERA, "uuid": control(serving, "Play")._impl.uuid, "type": kind}
         known = kind in ("GuiUpdateMessage", "ViewerCameraMessage")
         assert (gate.checked(msgspec.msgpack.encode(message)) is not None) is known, kind

@@ -5,6 +5,7 @@ import subprocess
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -118,7 +119,9 @@ def points(n: int = 600) -> dict[str, runtime.PortableAvatar]:
     def some(spread: float, *shape: int) -> np.ndarray:
         return (spread * random.standard_normal(shape)).astype(np.float32)
 
-    def network(activation: str, along: FeatureDirections | None, outputs: dict[str, int]) -> AttributeNetwork:
+    def network(
+        activation: Literal["relu", "leaky_relu", "softplus"], along: FeatureDirections | None, outputs: dict[str, int]
+    ) -> AttributeNetwork:
         sizes = (5 + (0 if along else 3), 8, 7, sum(outputs.values()))
         return AttributeNetwork(
             "features" if along else "displacement", some(1, n, 5),
