@@ -14,7 +14,7 @@ TESTS = Path(__file__).parent
 PAGE = TESTS.parent / "CONTRIBUTING.md"
 SUITE = (
     "test_methods.py", "test_runtime.py", "test_runtime_equality.py", "test_hostile_avatars.py",
-    "test_device_stalls.py", "test_settings.py",
+    "test_device_stalls.py", "test_settings.py", "test_settings_help.py",
 )  # fmt: skip
 """Files with tests of every method."""
 REGISTER = """

@@ -1,11 +1,8 @@
 """Settings of methods and runs come from options and files in a known order, and wrong ones are refused before work."""
 
 import json
-import re
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
-from operator import attrgetter
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal
@@ -24,10 +21,9 @@ from mien.avatar import (
 )
 from mien.avatar.mono_gaussian_avatar.settings import PRESETS as mono_gaussian_avatar_presets
 from mien.cli import main
-from mien.commands.settings_options import leaves
 from mien.commands.stages import training
-from mien.ranges import Range, shown
-from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings
+from mien.ranges import Range
+from mien.training import PRESETS, TrainSettings
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
@@ -61,14 +57,18 @@ def choices(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(training, "run_training_stage", remember)
 
     def choose(line: str, file: object = None) -> Choices:
-        words = ["train", str(workspace), *line.split()]
-        if file is not None:
-            (workspace / "file.json").write_text(json.dumps(file))
-            words += ["--config", str(workspace / "file.json")]
-        assert main(words) == 0
+        words = ["train", str(workspace)] if file is None else with_file(workspace, json.dumps(file))
+        assert main([*words, *line.split()]) == 0
         return asked.pop()
 
     return choose
+
+
+def with_file(workspace: Path, content: str) -> list[str]:
+    """Return the words of a training with a file of settings that has this content."""
+    path = workspace / "file.json"
+    path.write_text(content)
+    return ["train", str(workspace), "--config", str(path)]
 
 
 def complaint(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
@@ -76,6 +76,13 @@ def complaint(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
     assert main(words) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
     return line
+
+
+def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 0
+    return capsys.readouterr().out
 
 
 # -- options ----------------------------------------------------------------------------------------------------------
@@ -109,9 +116,8 @@ def test_a_preset_that_the_method_does_not_have_is_refused(
     words = f"--preset paper: {name} has no such preset; it has draft and standard"
     for command in (["train", str(workspace)], ["create", str(workspace), "--out", str(workspace / "new")]):
         assert words in complaint(capsys, [*command, "--method", name, "--preset", "paper"])
-    (workspace / "file.json").write_text(json.dumps({"method": {"kind": name}}))
-    line = ["train", str(workspace), "--preset", "paper", "--config", str(workspace / "file.json")]
-    assert words in complaint(capsys, line)
+    line = with_file(workspace, json.dumps({"method": {"kind": name}}))
+    assert words in complaint(capsys, [*line, "--preset", "paper"])
 
 
 def test_options_reach_every_depth(choices: Any) -> None:
@@ -214,9 +220,8 @@ def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) ->
     assert choices("", {}) == choices("")
 
 
-def test_what_is_held_out_follows_the_file(workspace: Path, choices: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    (workspace / "file.json").write_text('{"settings": {"held_out_sequences": ["nobody"]}}')
-    words = ["train", str(workspace), "--config", str(workspace / "file.json")]
+def test_what_is_held_out_follows_the_file(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = with_file(workspace, '{"settings": {"held_out_sequences": ["nobody"]}}')
     assert "--hold-out nobody: no such sequence" in complaint(capsys, words)
 
 
@@ -273,8 +278,7 @@ def test_what_is_held_out_follows_the_file(workspace: Path, choices: Any, capsys
 def test_files_that_make_no_sense_are_refused_before_any_work(
     content: str, words: str, workspace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (workspace / "file.json").write_text(content)
-    line = complaint(capsys, ["train", str(workspace), "--config", str(workspace / "file.json")])
+    line = complaint(capsys, with_file(workspace, content))
     assert words in line
     assert len(line) < 1000
     assert not (workspace / "runs").exists()
@@ -296,9 +300,9 @@ def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.Capt
 def test_a_file_of_another_method_than_asked_for_is_refused(
     workspace: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (workspace / "file.json").write_text('{"method": {"kind": "headgas"}}')
-    words = ["train", str(workspace), "--config", str(workspace / "file.json"), "--method", "gaussian_avatars"]
-    assert "has settings of headgas, but --method asks for gaussian_avatars" in complaint(capsys, words)
+    words = with_file(workspace, '{"method": {"kind": "headgas"}}')
+    told = complaint(capsys, [*words, "--method", "gaussian_avatars"])
+    assert "has settings of headgas, but --method asks for gaussian_avatars" in told
 
 
 def test_a_run_is_repeated_from_its_config_to_the_same_bytes(
@@ -326,111 +330,7 @@ def test_a_run_is_repeated_from_its_config_to_the_same_bytes(
     assert "damaged or edited" in complaint(capsys, ["evaluate", str(tmp_path), "--run", "again"])
 
 
-# -- help and presets -------------------------------------------------------------------------------------------------
-
-
-def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(words)
-    assert stop.value.code == 0
-    return capsys.readouterr().out
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = help_of(capsys, "train", "--method", method, "--help-all")
-    listed = leaves(METHODS[method].config(), "method")
-    for leaf in listed:
-        assert f" {leaf.option('method')} " in shown
-    for heading in {leaf.heading for leaf in listed}:
-        assert f" {heading} options " in shown
-    rest = [field.name for field in fields(TrainSettings) if field.name not in MAIN_SETTINGS]
-    assert rest
-    assert all(f"--training.{name.replace('_', '-')} " in shown for name in rest)
-
-
-def about_options(help_text: str) -> dict[str, str]:
-    """What the help says of each option, in one line."""
-    about: dict[str, str] = {}
-    option = ""
-    for line in help_text.replace("│", " ").splitlines():
-        words = line.split()
-        if words and words[0].startswith("--"):
-            option = words[0]
-        about[option] = " ".join([about.get(option, ""), *words])
-    return about
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_help_all_shows_where_presets_differ(method: str, capsys: pytest.CaptureFixture[str]) -> None:
-    about = about_options(help_of(capsys, "train", "--method", method, "--help-all"))
-    for prefix, default in (("method", METHODS[method].config()), ("training", TrainSettings())):
-        of_presets = {
-            name: (preset.config(method) if prefix == "method" else preset.settings_of(method))
-            for name, preset in PRESETS.items()
-            if name in METHODS[method].presets
-        }
-        for leaf in leaves(default, prefix):
-            option = leaf.option(prefix if leaf.name not in MAIN_SETTINGS else "").replace("--.", "--")
-            if option not in about:
-                assert option in ("--held-out-sequences", "--held-out-cameras")
-                continue
-            known = about[option].rpartition("(")[2]
-            for name, settings in of_presets.items():
-                value = attrgetter(leaf.name)(settings)
-                if value == leaf.value and leaf.name != "steps":
-                    assert f"{name}:" not in known, (option, name)
-                    assert f"{name}," not in known, (option, name)
-                else:
-                    text = re.escape("none" if value is None else shown(value))
-                    assert re.search(rf"\b{name}[a-z, ]*: {text}[;)]", known), (option, known)
-    assert ("paper" in about["--background"]) == ("paper" in METHODS[method].presets)
-
-
-def test_help_all_with_a_preset_shows_its_values(capsys: pytest.CaptureFixture[str]) -> None:
-    about = about_options(help_of(capsys, "create", "--preset", "paper", "--help-all"))
-    assert about["--method.sh-degree"].endswith("(from 0 to 3; default: 3; draft, standard: 0)")
-    assert about["--background"].endswith("(default: white; draft, standard: auto)")
-
-
-def test_help_all_shows_what_a_file_asks_for(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (workspace / "file.json").write_text('{"method": {"kind": "headgas", "features": 321}}')
-    shown = help_of(capsys, "train", "--config", str(workspace / "file.json"), "--help-all")
-    assert "default: 321" in " ".join(shown.split())
-
-
-def test_help_stays_short_and_says_how_to_see_more(capsys: pytest.CaptureFixture[str]) -> None:
-    short = help_of(capsys, "train", "--method", "headgas", "--help")
-    assert len(short.splitlines()) < 60
-    assert "--method.features" not in short
-    assert short.rstrip().endswith("mien train --method headgas --help-all")
-
-
-def differences(changes: dict[str, Any], settings: Any, place: str = "") -> Iterator[tuple[str, bool]]:
-    """Yield each setting that a preset names, and whether its value differs from the default."""
-    for name, value in changes.items():
-        default = getattr(settings, name)
-        if isinstance(value, dict):
-            yield from differences(value, default, f"{place}{name}.")
-        else:
-            yield place + name, default != (tuple(value) if isinstance(value, list) else value)
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_presets_are_differences_to_the_defaults(name: str) -> None:
-    method = METHODS[name]
-    assert {"draft", "standard"} <= set(method.presets) <= set(PRESETS), f"PRESETS of {name}"
-    assert method.presets["standard"] == {}, f"standard of {name} is not its defaults"
-    assert set(method.presets["draft"].get("method", {})) <= {"photometric"}, f"draft of {name}: more than its losses"
-    assert "settings" not in method.presets["draft"]
-    for preset, changes in method.presets.items():
-        assert type(PRESETS[preset].config(name)) is method.config
-        for part, default in (("method", method.config()), ("settings", PRESETS[preset].settings)):
-            for setting, differs in differences(changes.get(part, {}), default):
-                assert differs, f"{preset} of {name} repeats the default of {setting}"
-    for preset in PRESETS.values():
-        assert all(differs for _, differs in differences(dict(preset.changes), TrainSettings()))
-    assert PRESETS["standard"].settings == TrainSettings()
+# -- a method that is added -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -468,5 +368,5 @@ def test_settings_of_an_added_method_appear_by_themselves(
     config, _ = choices(line)
     expected = ToyConfig(color="blue", shines=True, dust=Dust(1))
     assert config == replace(expected, photometric=replace(expected.photometric, ssim_weight=0.5))
-    told = complaint(capsys, ["train", str(workspace), *["--method", "toy", "--method.dust.grains", "11"]])
+    told = complaint(capsys, ["train", str(workspace), "--method", "toy", "--method.dust.grains", "11"])
     assert "--method.dust.grains 11: give a number from 1 to 10" in told

@@ -1,12 +1,8 @@
-"""The viewer without a browser: its session, its loop, its pictures, its door, and its command."""
+"""The viewer without a browser: its faces, its session, its pictures and videos, and its command."""
 
 import itertools
-import threading
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from urllib.parse import urljoin
 
 import cv2
 import numpy as np
@@ -20,7 +16,6 @@ from mien.export import Motion
 from mien.export.pictures import to_rgb
 from mien.face import load_face_model
 from mien.runtime.posing import rig_points
-from mien.viewer.access import Door, is_loopback
 from mien.viewer.drawing import Look, Mesh, View, beside, draw, words_about_view
 from mien.viewer.faces import (
     PRESETS,
@@ -34,9 +29,7 @@ from mien.viewer.faces import (
     readable,
 )
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
-from mien.viewer.loop import STILL_SECONDS, DrawingLoop
 from mien.viewer.session import Clip, Session, center_of
-from mien.viewer.work import Worker
 from toy_workspace import write_toy_workspace
 from web_case import drawn_head, faces_of
 
@@ -112,212 +105,6 @@ def test_random_faces_differ_and_are_alike_on_both_sides() -> None:
         }
         assert 0 < len(moved) <= RANDOM_EXPRESSIONS
         assert face[NAMES.index("mouthSmileLeft")] == face[NAMES.index("mouthSmileRight")]
-
-
-# The loop.
-
-
-class Stage:
-    """A loop with a clock that stands still, and drawings that take as long as one wants."""
-
-    def __init__(self, seconds: float = 0.1, advance: Callable[[float], float | None] | None = None) -> None:
-        self.now, self.seconds = 100.0, seconds
-        self.drawn: list[tuple[int, bool]] = []
-        self.shown: list[tuple[int, int, bool]] = []
-        self.loop = DrawingLoop(self.draw, advance, lambda: self.now)
-
-    def draw(self, view: View, full: bool) -> int:
-        self.now += self.seconds
-        self.drawn.append((view.width, full))
-        return view.width
-
-    def add(self, client: int) -> None:
-        self.loop.add(client, lambda picture, full: self.shown.append((client, picture, full)))
-
-    def look(self, client: int, width: int) -> None:
-        self.loop.look(client, View(np.eye(4), 0.5, width, 10))
-
-
-def test_the_newest_request_wins() -> None:
-    stage = Stage()
-    stage.add(1)
-    assert stage.loop.step() is None
-    for width in (11, 12, 13):
-        stage.look(1, width)
-    assert stage.loop.step() == 0
-    assert stage.shown == [(1, 13, False)]
-
-
-def test_pictures_are_full_when_nothing_moves() -> None:
-    stage = Stage()
-    stage.add(1)
-    stage.look(1, 11)
-    stage.loop.step()
-    rest = stage.loop.step()
-    assert rest == pytest.approx(STILL_SECONDS - stage.seconds)
-    stage.now += rest
-    stage.loop.step()
-    assert stage.shown == [(1, 11, False), (1, 11, True)]
-    assert stage.loop.step() is None
-    stage.loop.change()
-    stage.loop.step()
-    assert stage.shown[2:] == [(1, 11, False)]
-
-
-def test_quick_pictures_are_always_full() -> None:
-    stage = Stage(seconds=0.004)
-    stage.add(1)
-    sizes = []
-    for seconds in (0.004, 0.016, 0.016, 0.03, 0.03, 0.03, 0.09, 0.0225, 0.0075, *[0.0035] * 6):
-        stage.seconds = seconds
-        stage.look(1, 11)
-        stage.loop.step()
-        sizes.append(stage.drawn[-1][1])
-    # It starts with half size; 30 ms do not change it, 90 ms do, and back only far below.
-    assert sizes[:9] == [False, *[True] * 6, False, False]
-    assert sizes[-1]
-
-
-def test_two_clients_take_turns() -> None:
-    stage = Stage()
-    stage.add(1)
-    stage.add(2)
-    for width in range(11, 17):
-        stage.look(1, width)
-        stage.look(2, width)
-        stage.loop.step()
-    counts = [sum(client == shown for shown, _, _ in stage.shown) for client in (1, 2)]
-    assert counts == [3, 3]
-
-
-def test_a_client_that_vanished_is_not_shown() -> None:
-    stage = Stage()
-    stage.add(1)
-    stage.add(2)
-    stage.look(1, 11)
-    stage.look(2, 12)
-    stage.loop.remove(1)
-    stage.loop.remove(7)
-    stage.look(1, 13)
-    while stage.loop.step() == 0:
-        pass
-    assert {client for client, _, _ in stage.shown} == {2}
-    original = stage.draw
-
-    def vanish(view: View, full: bool) -> int:
-        stage.loop.remove(2)
-        return original(view, full)
-
-    stage.loop._draw = vanish
-    stage.look(2, 14)
-    stage.loop.step()
-    assert all(picture != 14 for _, picture, _ in stage.shown)
-
-
-def test_the_loop_wakes_for_what_plays() -> None:
-    times = iter((None, 100.7))
-    stage = Stage(advance=lambda now: next(times))
-    assert stage.loop.step() is None
-    assert stage.loop.step() == pytest.approx(0.7)
-
-
-def test_a_picture_that_fails_concerns_its_client_alone() -> None:
-    failures: list[Exception] = []
-
-    def draw(view: View, full: bool) -> int:
-        if view.width == 13:
-            raise ArithmeticError("a bug")
-        return view.width
-
-    stage = Stage()
-    stage.loop = DrawingLoop(draw, clock=lambda: stage.now, failed=failures.append)
-    stage.add(1)
-    stage.add(2)
-    stage.look(1, 13)
-    stage.look(2, 14)
-    assert [stage.loop.step() for _ in range(2)] == [0, 0]
-    assert stage.shown == [(2, 14, False)]
-    assert [str(failure) for failure in failures] == ["a bug"]
-    stage.now += STILL_SECONDS
-    assert [stage.loop.step() for _ in range(2)] == [0, None], "what failed is not tried again"
-    stage.look(1, 15)
-    assert stage.loop.step() == 0
-    assert stage.shown[-1][:2] == (1, 15)
-
-
-def test_a_picture_that_cannot_be_shown_concerns_its_client_alone() -> None:
-    def show(picture: int, full: bool) -> None:
-        raise ConnectionError("the browser is gone")
-
-    failures: list[Exception] = []
-    stage = Stage()
-    stage.loop = DrawingLoop(stage.draw, failed=failures.append)
-    stage.loop.add(1, show)
-    stage.look(1, 13)
-    assert stage.loop.step() == 0
-    assert len(failures) == 1
-
-
-def test_a_failure_that_concerns_all_ends_the_loop_and_is_kept() -> None:
-    def fail(now: float) -> float:
-        raise ArithmeticError("a bug")
-
-    loop = DrawingLoop(lambda view, full: 0, fail)
-    loop.start()
-    loop.wait(10.0)
-    assert not loop.running
-    assert isinstance(loop.error, ArithmeticError)
-    loop.stop()
-
-
-def test_the_loop_stops() -> None:
-    loop = DrawingLoop(lambda view, full: 0, lambda now: now + 1000)
-    loop.start()
-    loop.stop()
-    assert not loop.running
-    assert loop.error is None
-
-
-# Slow work.
-
-
-def test_a_worker_bounds_what_waits() -> None:
-    begun, go_on, done, failures = threading.Event(), threading.Event(), [], []
-
-    def slow() -> None:
-        begun.set()
-        go_on.wait()
-        done.append("slow")
-
-    worker = Worker("test", failures.append, most=2)
-    assert worker.ask("a", slow)
-    assert begun.wait(10)
-    assert worker.ask("b", lambda: done.append("old"))
-    assert worker.ask("b", lambda: done.append("new")), "the newest of a kind wins"
-    assert worker.ask("c", lambda: done.append(1 // 0))
-    assert not worker.ask("d", lambda: done.append("too much"))
-    go_on.set()
-    while len(failures) < 1:
-        time.sleep(0.001)
-    assert done == ["slow", "new"]
-    assert isinstance(failures[0], ZeroDivisionError)
-    worker.stop()
-    assert not worker.ask("e", lambda: done.append("stopped"))
-
-
-def test_a_worker_without_a_queue_takes_nothing_while_it_works() -> None:
-    begun, go_on = threading.Event(), threading.Event()
-
-    def slow() -> None:
-        begun.set()
-        go_on.wait()
-
-    worker = Worker("test", print, most=0)
-    assert worker.ask(1, slow)
-    assert begun.wait(10)
-    assert not worker.ask(2, slow)
-    go_on.set()
-    worker.stop()
 
 
 # The session.
@@ -527,96 +314,6 @@ def test_a_turntable_keeps_its_distance(session: Session) -> None:
     np.testing.assert_allclose(around(half, center, np.pi).viewmat, view.viewmat, atol=1e-6)
 
 
-# The door.
-
-
-@pytest.mark.parametrize(
-    ("host", "is_one"),
-    [
-        ("127.0.0.1", True),
-        ("::1", True),
-        ("localhost", True),
-        ("0.0.0.0", False),
-        ("example.org", False),
-        ("192.168.1.2", False),
-    ],
-)
-def test_loopback(host: str, is_one: bool) -> None:
-    assert is_loopback(host) is is_one
-    assert Door.of(host).token is not None
-    if is_one:
-        assert Door.of(host, with_token=False).token is None
-    else:
-        with pytest.raises(UserError, match=f"--no-token: other machines can reach --host {host}"):
-            Door.of(host, with_token=False)
-
-
-def test_without_a_token_strange_hosts_and_origins_are_refused() -> None:
-    door = Door.of("127.0.0.1", with_token=False)
-    assert door.answer("/", {"Host": "127.0.0.1:80"}) is None
-    assert door.answer("/", {"Host": "localhost:80", "Origin": "http://localhost:80"}) is None
-    for headers in (
-        {},
-        {"Host": "rebound.example:80"},
-        {"Host": "127.0.0.1:80", "Origin": "http://evil.example"},
-        {"Host": "127.0.0.1:80", "Origin": "http://127.0.0.1:81"},
-        {"Host": "127.0.0.1:80", "Origin": "null"},
-        {"Host": "127.0.0.1:80", "Origin": "http://["},
-        {"Host": "127.0.0.1:80", "Origin": "http://[v1.\udc80]"},
-        {"Host": "[::1"},
-    ):
-        answer = door.answer("/", headers)
-        assert answer is not None, headers
-        assert answer.status == 403
-        assert answer.body.isascii() or "\udc80" not in answer.body
-
-
-def test_a_proxy_with_a_path_of_its_own() -> None:
-    """The redirect and the cookie stay below that path, and other hosts are fine with the token."""
-    door = Door.of("127.0.0.1")
-    there = {"Host": "me.example", "Origin": "https://me.example"}
-    first = door.answer(f"/?token={door.token}", there)
-    assert first is not None
-    assert (
-        urljoin("https://me.example/mien/?token=x", first.headers["Location"]) == "https://me.example/mien/index.html"
-    )
-    assert "Path" not in first.headers["Set-Cookie"]
-    assert door.answer("/index.html", {**there, "Cookie": door.cookie}) is None
-    lost = door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie})
-    assert lost is not None
-    assert "page of https://me.example, and its Host is 127.0.0.1:80" in lost.body
-    assert "let the proxy pass on the browser's Host header" in lost.body
-
-
-def test_a_token_becomes_a_cookie() -> None:
-    door = Door.of("0.0.0.0")
-    assert door.token is not None
-    assert len(door.token) >= 20
-    assert door.token != Door.of("0.0.0.0").token
-    here = {"Host": "me.example:80"}
-    first = door.answer(f"/?token={door.token}", here)
-    assert first is not None
-    assert (first.status, first.headers["Location"]) == (303, "index.html")
-    cookie = first.headers["Set-Cookie"]
-    assert "HttpOnly" in cookie
-    assert "SameSite=Strict" in cookie
-    given = cookie.partition(";")[0]
-    assert door.answer("/", {**here, "Cookie": f"a=b; {given}"}) is None
-    assert door.answer("/", {**here, "cookie": given, "origin": "http://me.example:80"}) is None
-    for path, headers in (
-        ("/", {}),
-        ("/?token=", {}),
-        ("/?token=wrong", {"Cookie": given}),
-        ("/", {"Cookie": given[:-1]}),
-        ("/", {"Cookie": given, "Origin": "http://evil.example"}),
-        ("/", {"Cookie": "é=[,"}),
-    ):
-        answer = door.answer(path, {**here, **headers})
-        assert answer is not None, (path, headers)
-        assert answer.status == 403
-    assert door.address("::1", 7).startswith("http://[::1]:7/?token=")
-
-
 # The command.
 
 
@@ -634,19 +331,18 @@ def test_mistakes_are_told_in_one_line(
     workspace, file = str(tmp_path / "W"), tmp_path / "a.mien"
     runtime.write_portable(file, drawn_head(10))
     capsys.readouterr()
-    assert "no such file" in complaint(capsys, str(tmp_path / "gone.mien"))
-    assert "no such folder" in complaint(capsys, str(tmp_path / "gone"))
-    assert "is no .mien file" in complaint(capsys, str(Path(__file__)))
-    assert "leave --run out" in complaint(capsys, str(file), "--run", "toy")
-    assert "no run 'x'" in complaint(capsys, workspace, "--run", "x")
-    assert "from 1 to 65535" in complaint(capsys, workspace, "--port", "65536")
-    assert "gone.csv: no such file" in complaint(capsys, workspace, "--play", "gone.csv")
-    assert "--no-token: other machines can reach --host 0.0.0.0" in complaint(
-        capsys, str(file), "--host", "0.0.0.0", "--no-token"
-    )
-    assert "--host nowhere.invalid: is no address of this machine" in complaint(
-        capsys, workspace, "--host", "nowhere.invalid"
-    )
+    for words, *arguments in (
+        ("no such file", str(tmp_path / "gone.mien")),
+        ("no such folder", str(tmp_path / "gone")),
+        ("is no .mien file", str(Path(__file__))),
+        ("leave --run out", str(file), "--run", "toy"),
+        ("no run 'x'", workspace, "--run", "x"),
+        ("from 1 to 65535", workspace, "--port", "65536"),
+        ("gone.csv: no such file", workspace, "--play", "gone.csv"),
+        ("--no-token: other machines can reach --host 0.0.0.0", str(file), "--host", "0.0.0.0", "--no-token"),
+        ("--host nowhere.invalid: is no address of this machine", workspace, "--host", "nowhere.invalid"),
+    ):
+        assert words in complaint(capsys, *arguments)
     file.write_bytes(file.read_bytes()[:5000])
     assert "a.mien: is damaged" in complaint(capsys, str(file))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
