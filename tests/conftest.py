@@ -5,12 +5,20 @@ import signal
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from hypothesis import settings
 
-from needs import NO_GPU, NO_TEST_DATA, find_test_data, is_strict, skipped_lines, unexpected
+from instruction_sets import ISAS
+from mien import _native
+from needs import NO_GPU, NO_TEST_DATA, find_test_data, is_strict, skipped_lines, unexpected, use_instructions
+
+# jaxtyping checks only modules that are imported after pytest has read this file, so fixtures import them at use.
+if TYPE_CHECKING:
+    from mien.face import FaceModel
+    from other_process import Holder
 
 torch.set_num_threads(1)
 # The same examples on every machine, however busy it is.
@@ -40,6 +48,50 @@ def test_data() -> Path:
     if folder is None:
         pytest.skip(NO_TEST_DATA)
     return folder
+
+
+@pytest.fixture(params=ISAS)
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Set an instruction set of the native core during a test, and restore the previous one afterwards."""
+    before = _native.rasterize_isa()
+    use_instructions(request.param)
+    yield request.param
+    assert _native.set_rasterize_isa(before)
+
+
+@pytest.fixture(scope="module")
+def anny() -> "FaceModel":
+    from mien.face import load_face_model
+
+    return load_face_model("anny")
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a fresh build of the web runtime, for reading."""
+    from web_case import build
+
+    return build(tmp_path_factory.mktemp("built"))
+
+
+@pytest.fixture(scope="module")
+def other() -> "Iterator[Holder]":
+    """Return another process that holds locks."""
+    yield from _holder()
+
+
+@pytest.fixture
+def mortal() -> "Iterator[Holder]":
+    """Return a process that holds locks, for a test that kills it."""
+    yield from _holder()
+
+
+def _holder() -> "Iterator[Holder]":
+    from other_process import Holder
+
+    holder = Holder()
+    yield holder
+    holder.kill()
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -1,18 +1,10 @@
 """The native sigmoid agrees with torch's."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 
-from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar.ops.activation import sigmoid
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 17, 40_001])

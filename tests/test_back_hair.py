@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mien.camera import camera_from_fov
-from mien.face import FaceModel, load_face_model
+from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.tracking import NeckParts, fit_neck_cut
@@ -12,11 +12,6 @@ from mien.tracking.neck_cut import above_neck_cut
 from mien.training.whole_head.back_hair import back_hair
 
 _HAIR = 0.02
-
-
-@pytest.fixture(scope="module")
-def anny() -> FaceModel:
-    return load_face_model("anny")
 
 
 def _beside(model: FaceModel, *, low: float = -1.0, left: float = 0.05, right: float = 0.05) -> torch.Tensor:

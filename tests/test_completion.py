@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from flame_like import exact_landmarks, flame_like, write_npz
-from mien.face import FaceModel, load_face_model, mirror_triangles
+from mien.face import FaceModel, mirror_triangles
 from mien.face.flame import flame_face_model, read_flame
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
@@ -15,11 +15,6 @@ from mien.tracking.landmarks import with_regions_by_landmarks
 from mien.training.whole_head.completion import complete_colors, vertex_means
 
 _SKIN, _HAIR, _SHIRT = (0.8, 0.6, 0.5), (0.2, 0.12, 0.08), (0.1, 0.7, 0.2)
-
-
-@pytest.fixture(scope="module")
-def anny() -> FaceModel:
-    return load_face_model("anny")
 
 
 @pytest.fixture(scope="module")

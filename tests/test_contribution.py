@@ -9,7 +9,7 @@ from mien.avatar import GaussianStore, SurfacePrior, method_named
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.camera import Camera, camera_from_fov
-from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
 from mien.gaussians import rgb_from_sh, sh_from_rgb
 from mien.render import rasterize
@@ -20,11 +20,6 @@ from mien.training.whole_head.unseen import Unseen
 from toy_scene import surface_of
 
 _COLOR = 0.3
-
-
-@pytest.fixture(scope="module")
-def anny() -> FaceModel:
-    return load_face_model("anny")
 
 
 def _view(model: FaceModel) -> tuple[FaceParams, Camera]:

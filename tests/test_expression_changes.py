@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 import train_toy
-from instruction_sets import ISAS, each_isa
 from mien import _native, runtime
 from mien.avatar import GaussianAvatars, Progress, Rate, make_portable
 from mien.avatar.gaussian_avatars.avatar import resting_opacities
@@ -35,11 +34,6 @@ from toy_scene import toy_camera, toy_face, toy_face_model, toy_sequence
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
 PARTS = ("means", "quats", "scales", "opacities", "sh")
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

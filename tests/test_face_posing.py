@@ -1,12 +1,10 @@
 """The native way from face parameters to vertices agrees with the plain PyTorch one."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 import torch
 
-from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.face import FaceModel, FaceParams, head_poses, load_face_model
 from small_face_model import make_small_face_model
@@ -36,11 +34,6 @@ def random_face(model: FaceModel, timesteps: int, joint_scale: float = 0.5) -> F
         noise(*neutral.joints.shape, scale=joint_scale), noise(timesteps, 3), noise(timesteps, 3),
         noise(*model.template.shape, scale=0.001),
     )  # fmt: skip
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 @pytest.mark.parametrize("in_world", [True, False])

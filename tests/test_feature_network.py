@@ -1,12 +1,9 @@
 """The network of blended features, and the update of its bases: native against PyTorch, finite differences."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 
-from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.adam import FactoredGradient, FactoredMoments
 from mien.avatar.ops.feature_network import Layers, feature_network, feature_network_reference
@@ -17,11 +14,6 @@ Sizes = tuple[int, int, int, int, int, int]
 SIZES: list[Sizes] = [
     (100, 20, 32, 27, 64, 49), (1, 1, 1, 0, 1, 1), (0, 3, 4, 5, 6, 7), (2000, 5, 17, 3, 70, 5), (97, 3, 8, 27, 33, 4),
 ]  # fmt: skip
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

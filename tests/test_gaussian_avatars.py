@@ -1,12 +1,9 @@
 """GaussianAvatars' formulas."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 
-from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, GaussianStore, Progress
 from mien.avatar.gaussian_avatars.avatar import (
@@ -105,11 +102,6 @@ def test_no_triangle_is_emptied() -> None:
     prune = torch.tensor([True, True, True, False, True])
     assert never_empty_a_triangle(store, prune).tolist() == [False, False, True, False, True]
     assert new_avatar().density().may_prune is never_empty_a_triangle
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 
 from mien.camera import camera_from_fov
 from mien.capture import Capture
-from mien.face import FaceModel, load_face_model
+from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.tracking import Tracking
@@ -15,11 +15,6 @@ from mien.training.footage.frames import Frame
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
 
 _SIZE, _TIMESTEPS = 160, 7
-
-
-@pytest.fixture(scope="module")
-def anny() -> FaceModel:
-    return load_face_model("anny")
 
 
 def _sequence(model: FaceModel, height: float, grows: torch.Tensor | None = None) -> Sequence:

@@ -1,12 +1,11 @@
 """Strands of hair on the back of a head that no picture shows."""
 
-import pytest
 import torch
 
 from mien.avatar import SurfacePrior, method_named
 from mien.avatar.gaussian_avatars.hair_strands import strand_gaussians
 from mien.avatar.ops.triangle_frames import frames_to_world, triangle_frames
-from mien.face import FaceModel, load_face_model
+from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.gaussians import rgb_from_sh
 from mien.rotation import matrix_from_quaternion
@@ -14,11 +13,6 @@ from mien.training import PRESETS
 from toy_scene import surface_of
 
 _HEIGHT = 0.02
-
-
-@pytest.fixture(scope="module")
-def anny() -> FaceModel:
-    return load_face_model("anny")
 
 
 def _back(model: FaceModel) -> torch.Tensor:

@@ -8,7 +8,7 @@ import torch
 
 from mien.avatar import SurfacePrior, method_named
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
-from mien.face import FaceModel, load_face_model
+from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.training import PRESETS, Sequence, read_training_summary, train
@@ -23,11 +23,6 @@ from toy_scene import surface_of, toy_sequence
 _HAIR, _RATE = 0.02, 1e-3
 CONFIG = PRESETS["draft"].config("gaussian_avatars")
 SETTINGS = plain_run(steps=64, split="none", unseen="filled", checkpoint_every=12, record_every=8, side_weight=0.0)
-
-
-@pytest.fixture(scope="module")
-def anny() -> FaceModel:
-    return load_face_model("anny")
 
 
 def _avatar(model: FaceModel) -> GaussianAvatars:

@@ -15,15 +15,10 @@ from mien import runtime
 from mien.errors import UserError
 from mien.export import pack, write_page
 from mien.export.web_page import TEMPLATE
-from web_case import WEB, build, drawn_head, node
+from web_case import WEB, drawn_head, node
 
 MOST_BYTES, SECONDS = 1 << 30, 20
 AN_ARRAY = "avatar.baked.means"
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("built"))
 
 
 def read_by_node(built: Path, content: bytes, tmp_path: Path) -> str:

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +19,6 @@ from mien import locks
 from mien.errors import CannotWriteError, UserError
 from mien.locks import BeingWrittenError, check_free, hold, holder_of, lock_file, read_holder
 from other_process import Holder
-
-
-@pytest.fixture(scope="module")
-def other() -> Iterator[Holder]:
-    holder = Holder()
-    yield holder
-    holder.kill()
-
-
-@pytest.fixture
-def mortal() -> Iterator[Holder]:
-    """Return a process that holds locks, for a test that kills it."""
-    holder = Holder()
-    yield holder
-    holder.kill()
 
 
 def test_one_holds_and_the_other_is_told(other: Holder, tmp_path: Path) -> None:

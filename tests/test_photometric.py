@@ -1,13 +1,10 @@
 """The fused L1 + SSIM loss agrees with its plain PyTorch reference."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate
 
-from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.pictures import Box
 from mien.training.photometric import differentiable_ssim_map, photometric_loss, photometric_loss_reference
@@ -23,11 +20,6 @@ WHOLE_AND_PARTS = [
     (3, 300, None),
     (5, 3, None),  # too narrow for the native path
 ]
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 def smooth_picture(height: int, width: int, seed: int) -> Tensor:

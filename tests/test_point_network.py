@@ -1,12 +1,9 @@
 """The network of points: native against PyTorch, finite differences, and independence of the number of threads."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 
-from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
 
@@ -19,11 +16,6 @@ NETWORKS: list[Sizes] = [
     (2000, 39, ((64, "softplus", None), (70, "relu", None), (17, "softplus", 1), (33, "none", 2))),
     (97, 3, ((16, "relu", None), (16, "softplus", 0), (5, "none", 0))),
 ]
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

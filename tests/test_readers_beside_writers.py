@@ -2,7 +2,6 @@
 
 import shutil
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,6 @@ from mien.tracking import read_tracking, write_tracking
 from mien.tracking.files import _TENSORS
 from other_process import Holder
 from toy_scene import toy_face_model, toy_tracking
-
-
-@pytest.fixture(scope="module")
-def other() -> Iterator[Holder]:
-    holder = Holder()
-    yield holder
-    holder.kill()
 
 
 def test_a_reader_of_damage_asks_who_writes(other: Holder, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from mien.avatar import GaussianAvatars, Progress, method_named
 from mien.camera import camera_from_fov
 from mien.commands.picture import PictureOptions
 from mien.commands.stages import pictures
-from mien.face import FaceModel, load_face_model
+from mien.face import FaceModel
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import NeckParts, head_cutter
@@ -24,11 +24,6 @@ from toy_scene import surface_of
 
 _PROGRESS = Progress(0, 100, 0, 1.0, 1)
 _HAIR = 0.02
-
-
-@pytest.fixture(scope="module")
-def anny() -> FaceModel:
-    return load_face_model("anny")
 
 
 def _camera():

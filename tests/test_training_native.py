@@ -1,23 +1,15 @@
 """The native parts of a training step agree with their plain PyTorch twins."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 
-from instruction_sets import ISAS, each_isa
 from mien import _native
 from mien.avatar import Moments
 from mien.training.adam import Update, update_all, update_reference
 from mien.training.density_control.gradient import observe_reference
 
 COUNTS = (0, 1, 15, 16, 4097)
-
-
-@pytest.fixture(params=ISAS)
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from each_isa(request)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

@@ -21,21 +21,6 @@ MEETINGS = ROUNDS // 4  # a pair that meets less often goes on, up to four times
 
 
 @pytest.fixture(scope="module")
-def other() -> Iterator[Holder]:
-    holder = Holder()
-    yield holder
-    holder.kill()
-
-
-@pytest.fixture
-def mortal() -> Iterator[Holder]:
-    """Return a process that holds locks, for a test that kills it."""
-    holder = Holder()
-    yield holder
-    holder.kill()
-
-
-@pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patched:
         folder = tmp_path_factory.mktemp("cache")

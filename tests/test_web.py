@@ -23,15 +23,10 @@ from mien.runtime.posing import expression_changes, rig_points
 from test_runtime import new_avatar
 from toy_scene import toy_camera
 from toy_workspace import write_toy_workspace
-from web_case import WEB, as_json, browse, build, chromium, drawn_head, faces_of, node, painted_head
+from web_case import WEB, as_json, browse, chromium, drawn_head, faces_of, node, painted_head
 
 SIDE = 512
 EQUAL = 1e-5
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("built"))
 
 
 def test_the_committed_page_is_that_of_a_fresh_build(built: Path) -> None:

@@ -16,14 +16,9 @@ from mien.driving.sides import PAIRS
 from mien.export import write_page
 from mien.face import FaceParams, load_face_model
 from recordings import COLUMNS, LAYOUTS, row, write_csv, write_json
-from web_case import WEB, browse, build, chromium, drawn_head, node
+from web_case import WEB, browse, chromium, drawn_head, node
 
 EQUAL = 1e-4
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("built"))
 
 
 def read_by_node(built: Path, folder: Path, recording: Path) -> dict[str, Any]:

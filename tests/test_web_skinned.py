@@ -18,12 +18,7 @@ from mien.runtime.baked import AttributeNetwork, FeatureDirections, LinearBases
 from test_runtime import new_avatar
 from test_web import POSE, SIDE, picture, psnr
 from toy_scene import toy_camera
-from web_case import WEB, as_json, browse, build, drawn_head, faces_of, node
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("built"))
+from web_case import WEB, as_json, browse, drawn_head, faces_of, node
 
 
 def skinned_head(still: bool = True) -> runtime.PortableAvatar:

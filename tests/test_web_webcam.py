@@ -17,7 +17,7 @@ from mien.errors import UserError
 from mien.export import find_webcam_files, write_packed, write_page
 from mien.export.webcam import POLICY, TEMPLATE, VERSION
 from test_web_element import served
-from web_case import WEB, browse, build, chromium, drawn_head, node, tasks_vision
+from web_case import WEB, browse, chromium, drawn_head, node, tasks_vision
 from webcam_case import CELL, STILL, TRUE, Clip, write_clip
 
 FAKE = "--use-fake-device-for-media-stream"
@@ -25,11 +25,6 @@ ALLOWED = "--use-fake-ui-for-media-stream"
 DENIED = "--deny-permission-prompts"
 WINDOW = (640, 320)
 CORRELATION = 0.9
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("built"))
 
 
 @pytest.fixture(scope="module")
