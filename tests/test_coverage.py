@@ -1,6 +1,5 @@
 """Train only what is seen: coverage of triangles, what training draws, the fill, and what views say about it."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from mien import runtime
 from mien.avatar import (
     METHODS,
     Avatar,
-    GaussianStore,
     Photometric,
     Progress,
     SurfacePrior,
@@ -20,15 +18,11 @@ from mien.avatar import (
     make_portable,
 )
 from mien.avatar.density import GradientDensity
-from mien.avatar.gaussian_avatars.settings import SurfaceLimits
-from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface
-from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.errors import UserError
 from mien.export import MeshModel, read_glb, read_ply, write_glb, write_page, write_ply
 from mien.face import FaceModel
 from mien.gaussians import rgb_from_sh
 from mien.render import rasterize
-from mien.rotation import matrix_from_quaternion
 from mien.runtime.baked import Filmed
 from mien.training import Sequence, filmed_words, read_coverage, train
 from mien.training.density_control import density_strategy
@@ -45,6 +39,11 @@ SETTINGS = plain_run(steps=6, split="none", unseen="filled", checkpoint_every=3,
 @pytest.fixture(scope="module")
 def toy() -> tuple[FaceModel, Sequence]:
     return toy_sequence(timesteps=5, size=48)
+
+
+def bare_avatar(toy: tuple[FaceModel, Sequence]) -> Avatar:
+    model, sequence = toy
+    return METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
 
 
 def covered(toy: tuple[FaceModel, Sequence]) -> Coverage:
@@ -123,8 +122,8 @@ def known(toy: tuple[FaceModel, Sequence], avatar: Avatar) -> Unseen:
 
 def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     """Fills have no gradients but those that move them along their normal."""
-    model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
+    sequence = toy[1]
+    avatar = bare_avatar(toy)
     unseen = known(toy, avatar)
     surface_of(avatar).close(unseen.prior)
     filled_in = unseen.filled_in(avatar)
@@ -152,8 +151,8 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
 
 
 def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> None:
-    model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
+    sequence = toy[1]
+    avatar = bare_avatar(toy)
     unseen = known(toy, avatar)
     surface_of(avatar).close(unseen.prior)
     before = avatar.gaussian_store()["opacity_logits"].sigmoid()
@@ -186,8 +185,8 @@ def test_other_methods_train_on_everything(toy: tuple[FaceModel, Sequence]) -> N
 
 def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
     """From behind, where nothing was seen, the head is opaque and has the colours of the fill."""
-    model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
+    model = toy[0]
+    avatar = bare_avatar(toy)
     filled_in = facing(model) <= 0
     colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(filled_in), 3)
     surface_of(avatar).close(SurfacePrior(torch.zeros(len(filled_in)), None, colors, filled_in.float(), filled_in))
@@ -206,8 +205,8 @@ def test_fills_close_the_head(toy: tuple[FaceModel, Sequence]) -> None:
 
 
 def test_colors_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Sequence]) -> None:
-    model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
+    model = toy[0]
+    avatar = bare_avatar(toy)
     doubt = (facing(model) <= 0).float()
     before = avatar.gaussian_store()["sh_constant"].detach().clone()
     prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt)
@@ -223,8 +222,8 @@ def test_colors_are_pulled_where_nothing_shows_them(toy: tuple[FaceModel, Sequen
 
 def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Sequence]) -> None:
     """Fills have limits to the surface, and hair that hangs beside a triangle widens them there alone."""
-    model, sequence = toy
-    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
+    model = toy[0]
+    avatar = bare_avatar(toy)
     count = len(model.faces)
     hanging = 0.05 * (torch.arange(count) % 2).float()
     with torch.no_grad():
@@ -235,62 +234,6 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: tuple[FaceModel, Seque
     bound, limits = avatar.gaussian_store()["face_index"], plain_gaussian_avatars().surface
     height = avatar.gaussian_store()["means"][:, 1] * surface_of(avatar).sizes[bound]
     torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
-
-
-@pytest.mark.parametrize(("hair", "widen"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
-def test_limits_keep_gaussians_on_the_surface(hair: float, widen: float) -> None:
-    torch.manual_seed(0)
-    count, limits = 200, SurfaceLimits(enabled=True)
-    values = {"means": torch.randn(count, 3), "quats": torch.randn(count, 4), "log_scales": torch.randn(count, 3)}
-    store = GaussianStore(values, {"face_index": torch.arange(count) % 5})
-    sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
-    widening = torch.full((5,), widen)
-    keep_on_surface(store, limits, sizes, torch.full((5,), hair), widening)
-    size = sizes[store["face_index"]]
-    height, scales = store["means"][:, 1] * size, store["log_scales"].exp() * size[:, None]
-    depth, thickness = widen * limits.depth, widen * limits.thickness
-    assert (height <= depth + limits.hair_share * hair + 1e-7).all()
-    assert (height >= -depth - 1e-7).all()
-    assert (height.abs() > 0.9 * depth).any()
-    assert (scales[:, 1] <= thickness + limits.hair_thickness * hair + 1e-7).all()
-    flat = scales[:, [0, 2]]
-    assert (flat <= limits.width + limits.hair_width * hair + 1e-7).all()
-    assert (flat.amax(1) / flat.amin(1) <= limits.ratio * 1.0001).all()
-    normal = matrix_from_quaternion(torch.nn.functional.normalize(store["quats"], dim=1))[:, 1, 1]
-    assert (normal >= math.cos(math.radians(widen * limits.tilt)) - 1e-5).all()
-    before = {name: store[name].clone() for name in store.names()}
-    keep_on_surface(store, limits, sizes, torch.full((5,), hair), widening)
-    for name, value in before.items():
-        torch.testing.assert_close(store[name], value)
-
-
-def test_needles_grow_wider_and_not_shorter() -> None:
-    """Training cannot hold a side that is thinner than a pixel. It must not take the longer side with it."""
-    limits, sizes = SurfaceLimits(enabled=True), torch.ones(1)
-    scales = torch.tensor([[0.004, 0.0001, 1e-7], [1e-7, 0.0001, 0.004], [0.9, 0.0001, 1e-7], [0.002, 0.0001, 0.001]])
-    values = {"means": torch.zeros(4, 3), "quats": torch.eye(4)[:1].repeat(4, 1), "log_scales": scales.log()}
-    store = GaussianStore(values, {"face_index": torch.zeros(4, dtype=torch.long)})
-    keep_on_surface(store, limits, sizes, torch.zeros(1))
-    expected = [[0.004, 0.0001, 0.0008], [0.0008, 0.0001, 0.004], [0.006, 0.0001, 0.0012], [0.002, 0.0001, 0.001]]
-    torch.testing.assert_close(store["log_scales"].exp(), torch.tensor(expected))
-
-
-def test_ellipses_have_the_moments_of_their_triangles() -> None:
-    torch.manual_seed(0)
-    vertices, faces = torch.randn(9, 3), torch.arange(9).view(3, 3)
-    from mien.avatar.ops.triangle_frames import bind_to_world
-    from mien.rotation import matrix_from_quaternion
-
-    quats, log_scales = triangle_ellipses(vertices, faces)
-    _, world, scales = bind_to_world(vertices[None], faces, torch.arange(3), torch.zeros(3, 3), quats, log_scales)
-    rotation = matrix_from_quaternion(world[0])
-    found = rotation @ torch.diag_embed(scales[0] ** 2) @ rotation.mT
-    corners = vertices[faces] - vertices[faces].mean(1, keepdim=True)
-    expected = 2.0**2 / 12 * torch.einsum("fci,fcj->fij", corners, corners)
-    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = normal / normal.norm(dim=-1, keepdim=True)
-    thin = torch.einsum("f,fi,fj->fij", scales[0].amin(-1) ** 2, normal, normal)
-    torch.testing.assert_close(found, expected + thin, atol=1e-4, rtol=1e-3)
 
 
 def test_a_run_keeps_its_coverage_and_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:

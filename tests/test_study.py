@@ -15,11 +15,10 @@ import train_toy
 from mien.avatar import METHODS
 from mien.capture.video import read_video_frames
 from mien.cli import main
-from mien.lab.analysis.study import StudySettings, read_key, tally_content
+from mien.lab.analysis.study import StudySettings, read_key
 from mien.lab.analysis.study.clips import spans
-from mien.lab.analysis.study.files import QUESTIONS, Answer, Answers, KeyClip, StudyKey, read_all_answers
+from mien.lab.analysis.study.files import read_all_answers
 from mien.lab.analysis.study.shuffling import shuffled
-from mien.lab.analysis.study.tally import interval, student_quantile, tally_text, wilson
 from mien.training import read_sequence, train
 from toy_workspace import write_toy_workspace
 from web_case import browse, chromium, node
@@ -163,77 +162,6 @@ def test_every_order_is_equally_likely() -> None:
     expected = 1000
     assert sum((count - expected) ** 2 / expected for count in counts.values()) < 20.5  # chi squared, 5 degrees, 0.1 %
     assert shuffled(["c", "a", "b"], "s", "0", "x") == shuffled(["a", "b", "c"], "s", "0", "x")
-
-
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """Participants differ in their taste, so that their judgements are not independent."""
-    random, held, naive, rounds = np.random.default_rng(0), 0, 0, 800
-    for _ in range(rounds):
-        taste = random.beta(0.6 * 4, 0.4 * 4, 15)
-        shares = random.binomial(10, taste) / 10
-        low, high = interval(shares, 10)
-        held += low <= 0.6 <= high
-        low, high = wilson(float(shares.mean()), 150.0, 1.96)
-        naive += low <= 0.6 <= high
-    assert 0.93 <= held / rounds <= 0.98
-    assert naive / rounds < 0.85
-
-
-def test_few_participants_have_wider_intervals_by_student_s_factor() -> None:
-    """Three people, 12.5 judgements' worth of evidence: (1.96 / 4.30)^2 of it counts, which leaves 2.6."""
-    shares = np.array([0.4, 0.5, 0.75])
-    share, variance = float(shares.mean()), float(np.var(shares, ddof=1)) / 3
-    evidence = share * (1 - share) / variance
-    assert 3 < evidence < 30
-    z = 1.959964
-    wanted = wilson(share, evidence * (z / 4.3027) ** 2, z)
-    assert interval(shares, 10) == pytest.approx(wanted, abs=0.005)
-    assert wanted[1] - wanted[0] > 1.5 * np.ptp(wilson(share, evidence, z)), "what the factor is about"
-
-
-def test_intervals_at_the_edges() -> None:
-    low, high = interval(np.zeros(15), 10)
-    assert low == 0
-    assert 0.15 < high < 0.25  # 15 people, not 150
-    low, high = interval(np.ones(15), 10)
-    assert high == pytest.approx(1)
-    alone = interval(np.array([0.5]), 10)
-    assert alone[0] < 0.1
-    assert alone[1] > 0.9
-    same = interval(np.full(20, 0.5), 10)
-    assert 0.4 < same[0] < 0.5 < same[1] < 0.6
-    assert student_quantile(1) == pytest.approx(12.706, rel=1e-3)
-    assert student_quantile(2) == pytest.approx(4.303, rel=0.012)
-    assert student_quantile(14) == pytest.approx(2.145, rel=1e-3)
-
-
-def table_3() -> tuple[StudyKey, list[Answers]]:
-    """Return answers with the counts of the paper's table: 15 participants, 10 clips, 4 methods."""
-    runs = ("nerface", "imavatar", "pointavatar", "ours")
-    counts = {"quality": (19, 0, 13, 118), "expression": (35, 0, 12, 103)}
-    tiles = {f"{index:012x}": run for index, run in enumerate(runs)}
-    clips = tuple(KeyClip(f"c{index:07x}", "w", "s", "0", 0, 9, tiles) for index in range(10))
-    picks = {question: np.repeat(runs, each).reshape(15, 10) for question, each in counts.items()}
-    answers = [
-        Answers(f"{i:08x}", tuple(Answer(clips[j], runs, {q: str(picks[q][i, j]) for q in picks}) for j in range(10)))
-        for i in range(15)
-    ]
-    return StudyKey("0123456789ab", 0, runs, clips), answers
-
-
-def test_the_tally_gives_the_paper_s_percentages() -> None:
-    content = tally_content(*table_3())
-    percents = {run: [entry[question]["percent"] for question in QUESTIONS] for run, entry in content["runs"].items()}
-    assert percents == {
-        "nerface": [12.67, 23.33], "imavatar": [0.0, 0.0], "pointavatar": [8.67, 8.0], "ours": [78.67, 68.67]
-    }  # fmt: skip
-    assert content["judgements"] == 150
-    for entry in content["runs"].values():
-        for figures in entry.values():
-            assert 0 <= figures["low"] <= figures["percent"] <= figures["high"] <= 100
-    text = tally_text(content)
-    assert "| ours | 78.7 % (" in text
-    assert "Chance is 25.0 %" in text
 
 
 def test_answers_become_percentages(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,11 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mien import runtime
-from mien.cli import main
-from mien.errors import UserError
 from mien.export import find_webcam_files, write_packed, write_page
-from mien.export.webcam import POLICY, TEMPLATE, VERSION
+from mien.export.webcam import TEMPLATE, VERSION
 from test_web_element import served
 from web_case import WEB, browse, chromium, drawn_head, node, tasks_vision
 from webcam_case import CELL, STILL, TRUE, Clip, write_clip
@@ -358,94 +355,6 @@ def test_smoothing_calms_what_is_still_and_follows_what_is_fast(built: Path) -> 
     ]
     assert late[0] > 0.95
     assert late[0] > late[1]
-
-
-def test_a_page_without_a_webcam_has_nothing_of_it(tmp_path: Path, test_data: Path) -> None:
-    tasks_vision()
-    files = find_webcam_files(test_data / "mediapipe" / "face_landmarker.task")
-    portable = drawn_head(10)
-    write_page(tmp_path / "a.html", portable)
-    write_page(tmp_path / "b.html", portable, webcam=files)
-    plain, camera = (tmp_path / "a.html").read_text(), (tmp_path / "b.html").read_text()
-    assert "webcam" not in plain
-    assert "{{" not in plain
-    assert "blob:" not in plain
-    assert "{{" not in camera.replace(camera[camera.index('id="webcam-vision"') :], "")
-    assert f"script-src 'unsafe-inline'{POLICY}; style-src" in camera
-    assert "connect-src 'none'" in POLICY
-    assert "Nothing leaves this page" in camera
-    assert 5_000_000 < len(camera) < 10_000_000
-    write_page(tmp_path / "c.html", portable, webcam=files)
-    assert (tmp_path / "c.html").read_text() == camera
-
-
-@pytest.fixture
-def avatar_file(tmp_path: Path) -> Path:
-    path = tmp_path / "me.mien"
-    runtime.write_portable(path, drawn_head(10))
-    return path
-
-
-def exported(avatar_file: Path, *more: str) -> int:
-    return main(["export", str(avatar_file), "--out", str(avatar_file.with_name("me.html")), *more])
-
-
-def test_the_command_writes_a_webcam(avatar_file: Path, test_data: Path) -> None:
-    tasks_vision()
-    model = test_data / "mediapipe" / "face_landmarker.task"
-    assert exported(avatar_file, "--webcam", "--webcam-model", str(model)) == 0
-    assert 'id="webcam-model"' in avatar_file.with_name("me.html").read_text()
-
-
-def test_a_missing_model_is_explained(
-    avatar_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    tasks_vision()
-    monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
-    assert exported(avatar_file, "--webcam") == 2
-    told = capsys.readouterr().err
-    assert "--webcam: no model" in told
-    assert "--webcam-model FILE" in told
-    assert "https://" in told
-    model = tmp_path / "any.task"
-    monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))
-    assert exported(avatar_file, "--webcam") == 2
-    assert f"{model}: no such file" in capsys.readouterr().err
-    for content in (b"", b"PK\x03\x04 no archive"):
-        model.write_bytes(content)
-        assert exported(avatar_file, "--webcam") == 2
-        assert "is no face_landmarker.task with blend shapes" in capsys.readouterr().err
-    assert not avatar_file.with_name("me.html").exists()
-
-
-def test_a_missing_or_other_package_is_explained(
-    avatar_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    folder = tmp_path / "package"
-    folder.mkdir()
-    monkeypatch.setenv("MIEN_TASKS_VISION", str(folder))
-    assert exported(avatar_file, "--webcam") == 2
-    told = capsys.readouterr().err
-    assert "make web-packages" in told
-    assert f"@mediapipe/tasks-vision@{VERSION}" in told
-    (folder / "package.json").write_text('{"version": "1.0.1"}')
-    assert exported(avatar_file, "--webcam") == 2
-    assert "is version 1.0.1" in capsys.readouterr().err
-    (folder / "package.json").write_text(json.dumps({"version": VERSION}))
-    with pytest.raises(UserError, match=r"lacks vision_bundle\.cjs"):
-        find_webcam_files(tmp_path / "any")
-
-
-def test_options_that_do_not_fit_are_refused(avatar_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exported(avatar_file, "--webcam-model", "a.task") == 2
-    assert "together with --webcam" in capsys.readouterr().err
-    assert main(["export", str(avatar_file), "--out", "me.packed", "--webcam"]) == 2
-    assert "only an .html page has a webcam" in capsys.readouterr().err
-
-
-def test_the_pinned_version_is_the_same_everywhere() -> None:
-    package = json.loads((WEB / "package.json").read_text())
-    assert package["devDependencies"]["@mediapipe/tasks-vision"] == VERSION
 
 
 CLASS = """(async () => {
