@@ -4,8 +4,6 @@ Tensors that are not float32 on a CPU use the plain PyTorch twins of all native 
 instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +22,6 @@ from mien.commands import render
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.progress import Advance
 from mien.training import TrainSettings, train
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
@@ -32,6 +29,7 @@ from mien.training.footage.sequence import Sequence, Targets
 from mien.training.trainer import TrainingData, start, step
 from toy_scene import toy_sequence
 from toy_workspace import write_toy_workspace
+from training_progress import silence, stopped_at
 
 SETTINGS = replace(train_toy.SETTINGS, steps=12, record_every=1)
 
@@ -123,15 +121,10 @@ def test_a_gpu_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> None:
     face_model, sequence = scene
-    train([sequence], face_model, train_toy.CONFIG, replace(SETTINGS, device="auto"), tmp_path / "run", no_bar)
+    train([sequence], face_model, train_toy.CONFIG, replace(SETTINGS, device="auto"), tmp_path / "run", silence)
     # The run is finished. On another device it is the same run, and is only loaded.
-    again = train([sequence], face_model, train_toy.CONFIG, SETTINGS, tmp_path / "run", no_bar)
+    again = train([sequence], face_model, train_toy.CONFIG, SETTINGS, tmp_path / "run", silence)
     assert len(again.gaussian_store()) > 0
-
-
-@contextmanager
-def no_bar(title: str, total: int, completed: int) -> Iterator[Advance]:
-    yield lambda amount=1, status="": None
 
 
 @pytest.mark.gpu
@@ -147,26 +140,14 @@ def test_what_a_gpu_trained_is_loaded_and_resumed_without_one(scene: Scene, tmp_
     face_model, sequence = scene
     run, half = tmp_path / "run", SETTINGS.steps // 2
 
-    @contextmanager
-    def stop_halfway(title: str, total: int, completed: int) -> Iterator[Advance]:
-        done = completed
-
-        def advance(amount: int = 1, status: str = "") -> None:
-            nonlocal done
-            done += amount
-            if done == half:
-                raise KeyboardInterrupt
-
-        yield advance
-
     often = replace(SETTINGS, device="cuda", checkpoint_every=1)
     with pytest.raises(KeyboardInterrupt):
-        train([sequence], face_model, train_toy.CONFIG, often, run, stop_halfway)
-    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), run, no_bar)
+        train([sequence], face_model, train_toy.CONFIG, often, run, stopped_at(half))
+    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), run, silence)
     avatar = load_avatar(run)
     assert avatar.gaussian_store()["means"].device.type == "cpu"
     whole = tmp_path / "whole"
-    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cuda"), whole, no_bar)
+    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cuda"), whole, silence)
     assert len(load_avatar(whole).gaussian_store()) > 0
 
 

@@ -1,10 +1,7 @@
 """Changes of gaussian_avatars with the expression: their formulas, and their way through training and files."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +23,11 @@ from mien.avatar.ops.expression_changes import (
     within_reach,
 )
 from mien.errors import UserError
-from mien.progress import Advance
 from mien.render.rendering import Rendering
 from mien.training import train
 from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera, toy_face, toy_face_model, toy_sequence
+from training_progress import stopped_at
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
 PARTS = ("means", "quats", "scales", "opacities", "sh")
@@ -179,20 +176,6 @@ def test_the_prior_is_the_mean_square_of_the_changes() -> None:
     assert losses["expression"].item() > 0.01
 
 
-@contextmanager
-def stopping(step: int, title: str, total: int, completed: int) -> Iterator[Advance]:
-    """A progress bar that ends training after a step."""
-    done = completed
-
-    def advance(amount: int = 1, status: str = "") -> None:
-        nonlocal done
-        done += amount
-        if done == step:
-            raise KeyboardInterrupt
-
-    yield advance
-
-
 def test_training_learns_them_and_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     config = replace(train_toy.CONFIG, expression_rank=3)
@@ -201,7 +184,7 @@ def test_training_learns_them_and_resumes_to_the_same_bytes(tmp_path: Path) -> N
 
     for step in (14, 22):
         with pytest.raises(KeyboardInterrupt):
-            train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts", partial(stopping, step))
+            train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts", stopped_at(step))
     train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts")
     for name in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name

@@ -1,9 +1,6 @@
 """Features on Gaussians that follow a mesh: their formulas, and their way through training, files and refusals."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +16,6 @@ from mien.avatar.settings import GradientSettings
 from mien.errors import UserError
 from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
 from mien.export.packed import pack
-from mien.progress import Advance
 from mien.render.rendering import Rendering
 from mien.runtime.checks import baked_fault
 from mien.training import train
@@ -28,6 +24,7 @@ from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from plain_settings import plain_gaussian_avatars
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
+from training_progress import stopped_at
 
 RANK, DIRECTIONS = 3, 5
 CONFIG = plain_gaussian_avatars(
@@ -168,24 +165,10 @@ def test_training_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     assert float(whole.gaussian_store()["feature_bases"].detach().abs().max()) > 0
     for stop in (14, 22):
         with pytest.raises(KeyboardInterrupt):
-            train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts", partial(stopping, stop))
+            train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts", stopped_at(stop))
     train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts")
     for name in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
-
-
-@contextmanager
-def stopping(at: int, title: str, total: int, completed: int) -> Iterator[Advance]:
-    """Progress that ends like Ctrl-C at a step."""
-    done = completed
-
-    def advance(amount: int = 1, status: str = "") -> None:
-        nonlocal done
-        done += amount
-        if done == at:
-            raise KeyboardInterrupt
-
-    yield advance
 
 
 def test_formats_that_hold_no_features_say_so(tmp_path: Path) -> None:

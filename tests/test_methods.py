@@ -1,8 +1,6 @@
 """Every method keeps the promises of the interface, in one suite on a toy scene."""
 
 import base64
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +25,6 @@ from mien.avatar import (
 )
 from mien.config import decode, encode
 from mien.export import MeshModel, pack, read_glb_avatar, write_glb, write_page
-from mien.progress import Advance
 from mien.render import rasterize
 from mien.training.checkpoint import resume, write_checkpoint
 from mien.training.density_control import density_strategy
@@ -41,11 +38,6 @@ SIZE = 32
 FIRST, LAST = slice(0, 5), slice(-5, None)
 SETTINGS = plain_run(steps=50, split="none", background="white", record_every=1, checkpoint_every=1000)
 method = pytest.mark.parametrize("method", METHODS)
-
-
-@contextmanager
-def silence(title: str, total: int, completed: int) -> Iterator[Advance]:
-    yield lambda amount=1, status="": None
 
 
 def config_of(method: str) -> MethodConfig:

@@ -1,7 +1,5 @@
 """The perceptual loss: its features, its crops, its steps, and runs that resume with the same bytes."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +13,13 @@ from mien.errors import UserError
 from mien.face import FaceModel
 from mien.perceptual import load_training_features, weights
 from mien.perceptual.weights import weights_path
-from mien.progress import Advance
 from mien.render.rendering import Rendering
 from mien.training import Sequence, TrainSettings, read_curves, train
 from mien.training.footage.frames import crop_random
 from mien.training.footage.sequence import Target, Targets
 from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss
 from toy_scene import toy_sequence
+from training_progress import silence, stopped_at
 
 RESULTS = ("avatar/avatar.safetensors", "face_track.safetensors")
 
@@ -154,31 +152,15 @@ class StoppedError(Exception):
     """Ends a run in the middle of a step's report."""
 
 
-def stopped_at(step: int):
-    @contextmanager
-    def progress(title: str, total: int, completed: int) -> Iterator[Advance]:
-        done = completed
-
-        def advance(amount: int = 1, status: str = "") -> None:
-            nonlocal done
-            done += amount
-            if done == step:
-                raise StoppedError
-
-        yield advance
-
-    return progress
-
-
 def test_a_stopped_run_resumes_with_the_same_bytes(scene: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
     face_model, sequence = scene
     whole, parted, plain = tmp_path / "whole", tmp_path / "parted", tmp_path / "plain"
-    train([sequence], face_model, CONFIG, train_toy.SETTINGS, whole, stopped_at(-1))
+    train([sequence], face_model, CONFIG, train_toy.SETTINGS, whole, silence)
     for stop in (7, 14):
         with pytest.raises(StoppedError):
-            train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, stopped_at(stop))
-    train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, stopped_at(-1))
-    train([sequence], face_model, train_toy.CONFIG, train_toy.SETTINGS, plain, stopped_at(-1))
+            train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, stopped_at(stop, StoppedError))
+    train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, silence)
+    train([sequence], face_model, train_toy.CONFIG, train_toy.SETTINGS, plain, silence)
     for name in RESULTS:
         assert (parted / name).read_bytes() == (whole / name).read_bytes(), f"{name} differs"
         assert (plain / name).read_bytes() != (whole / name).read_bytes(), f"{name}: the loss does nothing"
@@ -195,5 +177,5 @@ def test_missing_features_are_told_before_the_run_begins(
     monkeypatch.setattr(weights, "_PACKAGE", "no_such_package_here")
     face_model, sequence = scene
     with pytest.raises(UserError, match="pip install stlpips-pytorch"):
-        train([sequence], face_model, CONFIG, train_toy.SETTINGS, tmp_path / "run", stopped_at(-1))
+        train([sequence], face_model, CONFIG, train_toy.SETTINGS, tmp_path / "run", silence)
     assert not (tmp_path / "run").exists()

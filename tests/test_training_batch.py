@@ -1,7 +1,5 @@
 """Several frames in one optimiser step: the mean of their losses, the same order of frames, and exact resuming."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,6 @@ from mien.adam import Moments
 from mien.avatar import Avatar, MonoGaussianAvatarConfig, PerceptualLoss, Photometric, Progress
 from mien.cli import main
 from mien.errors import UserError
-from mien.progress import Advance
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
 from mien.training import TrainSettings, read_curves, train
@@ -27,16 +24,12 @@ from plain_settings import plain_mono_gaussian_avatar, plain_run
 from test_methods import new_avatar
 from test_training_resume import assert_same_results
 from toy_scene import toy_camera, toy_face, toy_sequence
+from training_progress import silence
 
 SMALL = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
 )
 SETTINGS = plain_run(steps=30, split="none", background="random", checkpoint_every=7, record_every=5)
-
-
-@contextmanager
-def silence(title: str, total: int, completed: int) -> Iterator[Advance]:
-    yield lambda amount=1, status="": None
 
 
 def new_state(
