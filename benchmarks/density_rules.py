@@ -21,14 +21,14 @@ import torch
 from mien.avatar import Avatar, DensityRules, FaceTuning, GaussianAvatarsConfig, GradientSettings
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.evaluation.metrics import psnr
-from mien.evaluation.scoring import as_8_bit, evenly_spread
+from mien.evaluation.scoring import as_8_bit
 from mien.face import FaceParams, load_face_model
 from mien.lab.synthetic import Segment, SyntheticRecipe, synthesize
 from mien.render import rasterize
 from mien.storage import read_tensors
 from mien.tracking import Scoring, make_scoring
 from mien.training import PRESETS, Sequence, held_out, read_curves, train
-from mien.training.footage.frames import Frame
+from mien.training.footage.frames import Frame, evenly_spread
 from mien.training.footage.sequence import composite
 
 RECIPE = SyntheticRecipe(

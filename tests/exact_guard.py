@@ -60,7 +60,7 @@ def exact_guard() -> Iterator[None]:
     before = sys.getprofile(), sys.gettrace()
     originals = {name: getattr(np, name) for name in _NAMED if hasattr(np, name)}
     with _TorchGuard():
-        torch.ones(1) + 1  # the first one makes torch import modules, which must not happen under a profiler
+        _ = torch.ones(1) + 1  # the first one makes torch import modules, which must not happen under a profiler
     for name in originals:
         setattr(np, name, _refusing(f"np.{name}"))
     sys.setprofile(_watch)

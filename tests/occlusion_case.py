@@ -54,11 +54,11 @@ def _hand(marks: np.ndarray, timestep: int, size: tuple[int, int]) -> tuple[np.n
     hand, shade = np.zeros(large, np.float32), np.ones(large, np.float32)
 
     def capsule(start: np.ndarray, end: np.ndarray, radius: float, light: float) -> None:
-        ends = [tuple((4 * point).round().astype(int).tolist()) for point in (start, end)]
+        first, last = ((4 * point).round().astype(int).tolist() for point in (start, end))
         for step in range(6):  # brighter in the middle of a finger, with a dark rim
             width = max(round(4 * 2 * radius * (1 - step / 8)), 1)
-            cv2.line(shade, *ends, light * (0.82 + 0.18 * (1 - (1 - step / 5) ** 2)), width)
-        cv2.line(hand, *ends, 1.0, round(8 * radius))
+            cv2.line(shade, first, last, light * (0.82 + 0.18 * (1 - (1 - step / 5) ** 2)), width)
+        cv2.line(hand, first, last, 1.0, round(8 * radius))
 
     knuckles = middle + 0.35 * unit * down
     capsule(knuckles + 0.25 * unit * down, knuckles + 1.2 * unit * down, 0.48 * unit, 0.95)

@@ -102,13 +102,13 @@ def test_cameras_become_one_capture_with_the_head_at_one_scale(rig, tmp_path):
         sizes.append(float(corners[:, 1].max() - corners[:, 1].min()))
     assert max(sizes) < 1.15 * min(sizes)
     # The cropped cameras agree with the cropped pictures: the nose tip of all cameras is at the same place of the face.
+    first: np.ndarray | None = None
     for index in range(4):
         corners = capture.calibration[index].project(corners_at(0))[0].numpy().astype(np.float32)
         unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
         to_face = cv2.getPerspectiveTransform(corners, unit)
         places = cv2.perspectiveTransform(capture.landmarks[0, index][None].astype(np.float32), to_face)[0]
-        if index == 0:
-            first = places
+        first = places if first is None else first
         assert np.median(np.linalg.norm(places - first, axis=-1)) < 0.02, capture.camera_ids[index]
 
 

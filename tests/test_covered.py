@@ -64,6 +64,7 @@ def test_two_looks_that_are_equally_steady_leave_the_face_unknown():
     assert the_face(usual_look(still, shown), still, shown) is None
     moving = pictures(random.normal(size=(18, 60, 3)))
     look = the_face(usual_look(moving, shown), moving, shown)
+    assert look is not None
     assert np.corrcoef(look.ravel(), face.ravel())[0, 1] > 0.95
 
 
@@ -79,7 +80,9 @@ def test_what_is_covered_is_kept_and_told(drawn, tmp_path):
     covered[HALF, 0, 0] = True
     tracking = replace(truth, covered=covered)
     write_tracking(tmp_path / "some", tracking)
-    assert torch.equal(read_tracking(tmp_path / "some").covered, covered)
+    again = read_tracking(tmp_path / "some").covered
+    assert again is not None
+    assert torch.equal(again, covered)
     report = residual_report(capture, tracking, face_model)
     assert report["covered_frames"] == {"mouth": HALF}
     told = [text for kind, text in findings(tracking, report) if kind == "odd" and "mouth" in text]

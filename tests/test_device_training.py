@@ -162,7 +162,7 @@ def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
     """Return the pictures that `mien render --device` wrote."""
     options = ["--path", "turntable", "--frames", "2", "--size", "32", "--device", device]
     assert main(["render", str(workspace), "--out", str(out), *options]) == 0
-    return np.stack([cv2.imread(str(path)).astype(np.float32) for path in sorted(out.glob("*.png"))])
+    return np.stack([np.asarray(cv2.imread(str(path)), np.float32) for path in sorted(out.glob("*.png"))])
 
 
 def test_pictures_are_the_same_wherever_they_are_drawn(

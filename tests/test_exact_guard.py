@@ -44,7 +44,7 @@ LEARNT = torch.ones(5, 5, requires_grad=True)
         lambda: np.matmul(A, A), lambda: np.dot(A, A), lambda: A.dot(A), lambda: np.einsum("ij,jk->ik", A, A),
         lambda: np.linalg.norm(A[0]), lambda: np.linalg.svd(A), lambda: np.linalg.lstsq(A, A, rcond=None),
         lambda: np.tensordot(A, A), lambda: np.polyfit(np.arange(5), A[0], 1), lambda: np.convolve(A[0], A[0]),
-        lambda: np.inner(A, A), lambda: A @ A, lambda: T @ T, lambda: cv2.gemm(A, A, 1.0, None, 0.0),
+        lambda: np.inner(A, A), lambda: A @ A, lambda: T @ T, lambda: cv2.gemm(A, A, 1.0, A, 0.0),
     ],
 )  # fmt: skip
 def test_the_guard_refuses(inexact):

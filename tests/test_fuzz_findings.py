@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -224,7 +225,8 @@ def test_triangles_that_face_nowhere(tmp_path: Path) -> None:
     """A head without a triangle that faces outwards is refused."""
     path = tmp_path / "tiny.npz"
     arrays = tiny_flame()
-    np.savez(path, **{**arrays, "f": arrays["f"][:, ::-1]})
+    turned: dict[str, Any] = {**arrays, "f": arrays["f"][:, ::-1]}
+    np.savez(path, **turned)
     with pytest.raises(UserError, match=r"tiny\.npz: 'f' has no triangle that faces outwards"):
         read_flame(path)
 

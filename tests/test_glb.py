@@ -213,6 +213,7 @@ def test_the_gaussians_are_those_at_rest(glb: Glb, portable: runtime.PortableAva
     np.testing.assert_allclose(cosines, 1, atol=1e-5)
     for place, (degree, k) in enumerate([(0, 0), (1, 0), (1, 1), (1, 2)]):
         np.testing.assert_array_equal(attribute(glb, f"{SPLATS}:SH_DEGREE_{degree}_COEF_{k}", 1), expected.sh[:, place])
+    assert isinstance(portable.baked, runtime.MeshBound)
     np.testing.assert_array_equal(attribute(glb, "_TRIANGLE", 1), portable.baked.face_index)
     assert "do not move" in glb.content["asset"]["extras"]["mien"]["animates"]
     assert glb.content["scenes"][0]["nodes"] == [0, 1]

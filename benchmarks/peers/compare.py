@@ -63,7 +63,7 @@ def measure(scene: Scene, rounds: int) -> dict[str, Timing]:
                 if turn > 0:  # the first round warms up
                     walls.setdefault(name, []).append(took[0])
                     processors.setdefault(name, []).append(took[1])
-            picture = picture.detach().cpu()
+            picture = picture.detach().cpu()  # pyright: ignore[reportPossiblyUnboundVariable]
             expected = picture if expected is None else expected
             difference = float((picture - expected).abs().mean())
             assert difference < 2e-3, f"{name} draws another picture: mean difference {difference}"

@@ -240,7 +240,7 @@ PICTURES = {function.__name__: function for function in (mouth, shards, jitter, 
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder of clips and runs")
     parser.add_argument("--only", nargs="*", choices=PICTURES, default=list(PICTURES))
     options = parser.parse_args()

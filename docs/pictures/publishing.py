@@ -104,12 +104,12 @@ def make(workspace: Path, run: str | None) -> None:
                 page = "element" if what == "element" else "three"
                 shoot(f"{address}/{page}.html", script, site / f"{what}.png")
             server.shutdown()
-        pictures = [cv2.imread(str(site / f"{what}.png")) for what in shots]
+        pictures = [np.asarray(cv2.imread(str(site / f"{what}.png"))) for what in shots]
     cv2.imwrite(str(OUT), np.concatenate(pictures, 1), [cv2.IMWRITE_WEBP_QUALITY, 80])
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--run")
     given = parser.parse_args()

@@ -152,6 +152,8 @@ def _value(public: PublicName) -> str:
     for node in ast.parse(inspect.getsource(importlib.import_module(public.home))).body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         if any(isinstance(target, ast.Name) and target.id == public.name for target in targets):
+            assert isinstance(node, ast.Assign | ast.AnnAssign)
+            assert node.value is not None, public.name
             return textwrap.shorten(ast.unparse(node.value), _LONGEST_VALUE, placeholder=" ...")
     return "..."
 
@@ -198,6 +200,6 @@ def _write(path: Path, text: str) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "docs", help="folder of the site")
     sys.exit(build(parser.parse_args().out))

@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 _ROOT = Path(__file__).parent.parent.parent
 
 project = "mien"
-version = release = re.search(r'^version = "(.+)"', (_ROOT / "pyproject.toml").read_text("utf-8"), re.MULTILINE)[1]
+version = release = re.findall(r'^version = "(.+)"', (_ROOT / "pyproject.toml").read_text("utf-8"), re.MULTILINE)[0]
 html_title = f"mien {release}"
 copyright = "the authors of mien, Apache-2.0"  # noqa: A001
 

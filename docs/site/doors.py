@@ -4,7 +4,7 @@ A door is a package or module directly in `mien`, or in `mien.lab`, that has an 
 """
 
 import ast
-import importlib
+import importlib.util
 import inspect
 import pkgutil
 from dataclasses import dataclass

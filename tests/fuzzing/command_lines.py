@@ -166,7 +166,7 @@ def _options(kind: type, prefix: str) -> Iterator[tuple[str, Any]]:
             name = getattr(extra, "name", None) if getattr(extra, "name", None) is not None else name
         if any(extra is tyro.conf.Positional for extra in more):
             continue
-        inner = [one for one in (hint, *get_args(hint)) if dataclasses.is_dataclass(one)]
+        inner = [one for one in (hint, *get_args(hint)) if isinstance(one, type) and dataclasses.is_dataclass(one)]
         inner += [get_args(one)[0] for one in get_args(hint) if get_origin(one) is Annotated]
         if inner:
             for one in inner:

@@ -7,6 +7,7 @@ import wave
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -88,7 +89,8 @@ def _write_sounds(folder: Path) -> None:
                                   ("m4a", "aac", "fltp")):  # fmt: skip
         with av.open(str(folder / f"voice.{ending}"), "w") as container:
             stream = container.add_stream(codec, rate=48_000, layout="mono")
-            rows = np.repeat(samples, 3)[None]
+            assert isinstance(stream, av.AudioStream)
+            rows: Any = np.repeat(samples, 3)[None]
             rows = (rows * 32767).astype(np.int16) if sample == "s16" else rows
             frame = av.AudioFrame.from_ndarray(np.ascontiguousarray(rows), format=sample, layout="mono")
             frame.sample_rate = 48_000

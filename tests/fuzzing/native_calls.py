@@ -217,13 +217,14 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
         elif kind < 0.83:
             new = at(arguments, paths[int(rng.integers(0, len(paths)))])
         elif kind < 0.95:  # the same type, but from another call
-            value = at(arguments, path)
+            value: Any = at(arguments, path)
             stranger = BASELINES[str(rng.choice(STRANGERS))](native, rng)
             alike = [own for own in places(stranger) if isinstance(at(stranger, own), type(value))]
             new = at(stranger, alike[int(rng.integers(0, len(alike)))]) if alike else None
             if not alike or rng.random() < 0.1:
                 own = type(value).__module__ == "_native" and not isinstance(value, tuple)
-                new = type(value).__new__(type(value)) if own else None
+                kind_of: Any = type(value)
+                new = kind_of.__new__(kind_of) if own else None
         else:
             new = rng.choice(np.array([None, object(), "x", b"x", 1, 0.5, {}, np.float32(1)], object))
         arguments = put(arguments, path, new)

@@ -72,6 +72,7 @@ class Server:
 
     def ended(self, seconds: float) -> bool:
         """Wait at most so long for the command that was started last; return whether it has ended."""
+        assert self._process.stdout is not None
         return bool(select.select([self._process.stdout], [], [], seconds)[0])
 
     def result(self) -> tuple[int, int]:

@@ -218,9 +218,10 @@ def _odd_bytes(dice: Random) -> bytes | str:
 def _any_message(dice: Random, control: Control) -> dict[str, Any]:
     """A message of any type that viser knows, with odd fields of which some have the right type."""
     name = dice.choice(sorted(_TYPES))
-    hints = get_type_hints(_TYPES[name])
+    kind: Any = _TYPES[name]
+    hints = get_type_hints(kind)
     message: dict[str, Any] = {"type": name}
-    for entry in dataclasses.fields(_TYPES[name]) if dataclasses.is_dataclass(_TYPES[name]) else ():
+    for entry in dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ():
         hint = hints[entry.name]
         plain = {int: 1, float: 1.0, str: "x", bool: True, bytes: b"x", dict: {}, tuple: ()}
         usual = control.uuid if "uuid" in entry.name else plain.get(get_origin(hint) or hint)
