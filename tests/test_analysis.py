@@ -192,6 +192,19 @@ def test_growth_of_known_curves(workspace: Path) -> None:
     assert analyze(workspace, "--parts", "growth") == 2
 
 
+def test_growth_tells_of_the_limit_near_it_only(workspace: Path) -> None:
+    """The limit, 400 in this run, is named from 95 % of it on."""
+    curves = read_curves(workspace / "runs/toy")
+    changed = {name: torch.full((40,), 0.5, dtype=torch.float64) for name in curves}
+    for peak, told in ((370, False), (385, True), (400, True)):
+        changed["gaussians"] = torch.linspace(100, peak, 40, dtype=torch.float64)
+        write_tensors(workspace / "runs/toy/curves.safetensors", changed)
+        shutil.rmtree(workspace / "analysis", ignore_errors=True)
+        assert analyze(workspace, "--parts", "growth") == 0
+        notes = record(workspace)["parts"]["growth"]["notes"]
+        assert any("limit, --method.density.max-gaussians 400" in note for note in notes) == told
+
+
 def test_the_jaw_opens_and_teeth_go() -> None:
     model = toy_with_teeth()
     face = toy_scene.toy_face(1)

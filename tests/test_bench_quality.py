@@ -14,6 +14,7 @@ from mien.lab.benchmarking.following import Following
 from mien.lab.benchmarking.quality import (
     QualityRow,
     TrackingErrors,
+    _visible,
     aligned_distance,
     crop_landmarks,
     markdown_table,
@@ -21,6 +22,7 @@ from mien.lab.benchmarking.quality import (
     tracking_errors,
 )
 from mien.lab.synthetic import RECIPES, REFERENCES, Segment, SyntheticScene, truth_of
+from mien.render.mesh import vertex_normals
 
 RECIPE = replace(
     RECIPES["demo"], width=128, height=128, fps=10.0, glasses=False, hair="none",
@@ -88,6 +90,23 @@ def test_another_expression_is_a_distance_and_noise_is_jitter(case):
     assert errors.jitter_px > 0.3
     assert errors.jitter_mm is not None
     assert 2 < errors.jitter_mm < 20
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.2, -1.2])
+def test_vertices_that_do_not_face_the_camera_are_left_out(case, yaw):
+    """A vertex counts if the cosine of its normal and the direction to a camera is above 0.2."""
+    scene, _, truth = case
+    face = replace(
+        truth.tracking.face, head_rotation=torch.tensor([0.0, yaw, 0.0]).expand_as(truth.tracking.face.head_rotation)
+    )
+    turned = replace(truth, tracking=replace(truth.tracking, face=face))
+    vertices = scene.model(face[0])
+    towards = truth.tracking.cameras[0].position - vertices[0]
+    cosine = (vertex_normals(vertices, scene.model.faces)[0] * towards).sum(-1) / towards.norm(dim=-1)
+    cosine, visible = cosine.numpy()[truth.vertex_index], _visible(turned, scene.model, 0)
+    # Normals at the region's rim differ, since the benchmark takes the region's triangles only.
+    assert visible[cosine > 0.22].mean() > 0.98
+    assert visible[cosine < 0.18].mean() < 0.03
 
 
 def test_distances_do_not_see_rotation_scale_and_shift():

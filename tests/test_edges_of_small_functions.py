@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from mien import runtime
 from mien.camera import camera_from_fov
 from mien.capture.matte import guided_filter
+from mien.commands.expression import with_expression
 from mien.errors import UserError
 from mien.face.checks import check_face_model
 from mien.face.mirror import triangle_geometry
 from mien.face.npz import read_npz
+from mien.lab.synthetic import Segment, SyntheticRecipe
 from mien.limits import MAX_NUMBER
 from mien.ranges import Range
 from mien.render.camera_paths import sway
@@ -32,6 +35,24 @@ def test_a_fitted_view_keeps_its_middle() -> None:
         fitted = camera.fitted(300, 90, zoom)
         torch.testing.assert_close(fitted.project(axis)[0], torch.tensor([[150.0, 45.0]]))
         assert float(fitted.K[0, 0]) == pytest.approx(float(camera.K[0, 0]) * zoom * 90 / 200)
+
+
+def test_a_camera_without_torch_scales_each_axis_by_its_own_factor() -> None:
+    K = np.array([[300, 0, 90], [0, 320, 60], [0, 0, 1]], np.float32)
+    resized = runtime.Camera(K, np.eye(4, dtype=np.float32), 200, 100).resized(100, 300)
+    assert (resized.width, resized.height) == (100, 300)
+    assert resized.K.tolist() == [[150, 0, 45], [0, 960, 180], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fps", "timesteps"), [(0.29, 100.0, 29), (0.1, 25.0, 2), (0.15, 25.0, 4), (1e-3, 25.0, 1)]
+)
+def test_a_synthetic_clip_has_the_number_of_frames_nearest_to_its_length(
+    seconds: float, fps: float, timesteps: int
+) -> None:
+    recipe = SyntheticRecipe(seconds=seconds, fps=fps)
+    assert recipe.timesteps == timesteps
+    assert replace(recipe, script=(Segment("still", seconds),)).timesteps == timesteps
 
 
 def test_ascending_numbers_may_not_repeat() -> None:
@@ -65,6 +86,18 @@ def test_huge_numbers_of_a_face_model_are_refused_with_either_sign(sign: float) 
     template[3, 1] = sign * 2 * MAX_NUMBER
     with pytest.raises(UserError, match="template holds NaN or numbers beyond"):
         check_face_model(replace(model, template=template), "here", "bake it again")
+
+
+@pytest.mark.parametrize("assignment", ["move0=0", "move0=1", "neck_x=-1", "neck_x=1"])
+def test_the_ends_of_a_range_can_be_set(assignment: str) -> None:
+    model = make_small_face_model()
+    name, _, text = assignment.partition("=")
+    face = with_expression(model.neutral(2), model, (assignment,))
+    found = face.expression[:, 0] if name == "move0" else face.joints[:, model.free_joint_names.index("neck"), 0]
+    assert found.tolist() == [float(text)] * 2
+    beyond = f"{name}={1.01 * float(text) or -0.01}"
+    with pytest.raises(UserError, match=f"--set {beyond}: {name} goes from"):
+        with_expression(model.neutral(2), model, (beyond,))
 
 
 @pytest.mark.parametrize("length", [0, 300, 65535])

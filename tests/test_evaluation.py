@@ -12,7 +12,7 @@ import torch
 from evaluation_case import make_experiment
 from mien.avatar import DEFAULT_METHOD
 from mien.evaluation.baselines import make_baselines
-from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
@@ -21,6 +21,7 @@ from mien.evaluation.report_sections import spans
 from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
 from mien.perceptual import load_perceptual
 from mien.tracking.tracking import PARTS
+from mien.training.footage import Frame
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +41,14 @@ def test_target_is_the_picture_inside_the_mask_over_white(experiment: Experiment
     assert torch.equal(target[torch.from_numpy(alpha == 0)], torch.ones(int((alpha == 0).sum()), 3))
     image = torch.from_numpy(experiment.sequences[0].capture.images[frame[1:]]).float() / 255
     torch.testing.assert_close(target[torch.from_numpy(alpha == 255)], image[torch.from_numpy(alpha == 255)])
+
+
+def test_the_box_of_some_frames_holds_their_crops_with_a_margin(experiment: Experiment) -> None:
+    """Crops from (10, 20) to (60, 80) and from (30, 5) to (110, 45) span 100 x 75 pixels. The margin is 5 % of 100."""
+    crops = experiment.scorings[0].crops.copy()
+    crops[3, 0], crops[4, 0], crops[5, 0] = (10, 20, 50, 60), (30, 5, 80, 40), (0, 0, 400, 400)
+    moved = replace(experiment, scorings=(replace(experiment.scorings[0], crops=crops),))
+    assert head_box(moved, [Frame(0, 3, 0), Frame(0, 4, 0)]) == (5, 0, 110, 85)
 
 
 def test_frames_with_a_hand_are_scored_and_counted(experiment: Experiment, evaluation: Evaluation) -> None:

@@ -149,6 +149,17 @@ def test_first_update_of_a_row_moves_by_about_the_rate() -> None:
     torch.testing.assert_close(moved, expected[:, None].expand_as(moved))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rows_move_against_gradients_of_either_sign(dtype: torch.dtype) -> None:
+    """A first update moves by the rate, also where all gradients of a row have the same sign."""
+    values, rows = torch.zeros(3, 1, 2, dtype=dtype), torch.tensor([[-1.0, -2], [1, 2], [0, 0]], dtype=dtype)
+    moments = FactoredMoments.zeros(values)
+    factored_update(FactoredUpdate(values, [(rows, torch.ones(1, dtype=dtype))], moments, 0.01))
+    expected = torch.tensor([[0.01, 0.01], [-0.01, -0.01], [0, 0]], dtype=dtype)
+    torch.testing.assert_close(values[:, 0], expected, rtol=1e-5, atol=0)
+    assert (moments.weights > 0).tolist() == [True, True, False]
+
+
 def test_rows_and_columns_without_gradient_stay() -> None:
     update = update_of()
     before, second, weights = update.values.clone(), update.moments.second.clone(), update.moments.weights.clone()

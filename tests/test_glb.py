@@ -220,6 +220,20 @@ def test_the_gaussians_are_those_at_rest(glb: Glb, portable: runtime.PortableAva
     assert glb.content["nodes"][glb.content["scenes"][1]["nodes"][0]]["mesh"] == 1
 
 
+def test_programs_without_splats_show_points_in_the_colors_of_the_gaussians(
+    glb: Glb, portable: runtime.PortableAvatar
+) -> None:
+    """The colours of points are 8 bits of linear light. In sRGB, they are half grey plus the constant harmonic."""
+    expected = runtime.pose(portable.baked, at_rest(portable))
+    shown = attribute(glb, "COLOR_0", 1) / 255
+    srgb = np.where(shown[:, :3] <= 0.0031308, 12.92 * shown[:, :3], 1.055 * shown[:, :3] ** (1 / 2.4) - 0.055)
+    truth = np.clip(0.5 + expected.sh[:, 0] / np.sqrt(4 * np.pi), 0, 1)
+    assert truth.std() > 0.1
+    np.testing.assert_allclose(srgb, truth, atol=0.5 * 12.92 / 255 + 1e-6)
+    np.testing.assert_allclose(srgb[truth > 0.2], truth[truth > 0.2], atol=0.01)
+    np.testing.assert_allclose(shown[:, 3], expected.opacities, atol=0.5 / 255 + 1e-6)
+
+
 def test_the_same_avatar_gives_the_same_bytes(written: Path, portable: runtime.PortableAvatar, tmp_path: Path) -> None:
     write_glb(tmp_path / "again.glb", portable, mesh_model(portable), SIZE)
     assert (tmp_path / "again.glb").read_bytes() == written.read_bytes()

@@ -127,6 +127,22 @@ def test_a_zero_quaternion_is_no_rotation() -> None:
     close(matrix_from_quaternion(torch.zeros(4)), torch.eye(3))
 
 
+@given(st.lists(vectors, min_size=1, max_size=3).map(torch.stack))
+def test_rotations_without_torch_are_the_same(axis_angles: Tensor) -> None:
+    matrices = runtime_rotation.matrix_from_axis_angle(axis_angles.numpy())
+    close(torch.from_numpy(matrices), matrix_from_axis_angle(axis_angles))
+    recovered = runtime_rotation.axis_angle_from_matrix(matrices)
+    close(matrix_from_axis_angle(torch.from_numpy(recovered)), torch.from_numpy(matrices), 1e-7)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (0.6, 0, -0.8), (0.48, 0.6, 0.64)])
+@pytest.mark.parametrize("angle", [0.0, 1e-10, 0.3, 1.6, 3.1])
+def test_turns_without_torch_come_back(axis: tuple[float, float, float], angle: float) -> None:
+    turn = angle * np.array(axis)
+    found = runtime_rotation.axis_angle_from_matrix(runtime_rotation.matrix_from_axis_angle(turn))
+    np.testing.assert_allclose(found, turn, rtol=0, atol=1e-9)
+
+
 def test_compositions_round_as_without_torch() -> None:
     first, second = (torch.randn(4, 4, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2))
     composed = compose_rigid(first, second)

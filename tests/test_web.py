@@ -289,6 +289,16 @@ def mouth_region(portable: runtime.PortableAvatar, camera: runtime.Camera) -> np
     return np.maximum(*(only.render(only.pose(given), camera)[1] for given in ({}, open_))) > 0
 
 
+def test_rotations_are_packed_with_one_sign_and_of_unit_length() -> None:
+    """Quaternions of either sign and of any length are the same rotation, so they have the same bytes."""
+    portable = drawn_head(300)
+    baked = portable.baked
+    assert isinstance(baked, runtime.MeshBound)
+    factors = np.where(np.arange(300) % 3 == 0, np.float32(-2), np.float32(0.5))[:, None]
+    attributes = replace(baked.attributes, quats=baked.attributes.quats * factors)
+    assert pack(replace(portable, baked=replace(baked, attributes=attributes))) == pack(portable)
+
+
 def test_forty_thousand_fit_into_three_megabytes(tmp_path: Path) -> None:
     """Random numbers compress worst, so an avatar of a person is smaller."""
     page = write_page(tmp_path / "a.html", drawn_head(40_000))
