@@ -122,9 +122,9 @@ def test_distances_do_not_see_rotation_scale_and_shift():
 
 def test_truth_follows_the_capture_s_crop(case):
     _, capture, truth = case
-    cropped = replace(capture, source={"crop": {"left": 32, "top": 16, "width": 64, "height": 64}})
+    cropped = replace(capture, source={"crop": {"left": 32, "top": 16, "width": 64, "height": 32}})
     moved = crop_landmarks(truth.landmarks, cropped)
-    np.testing.assert_allclose(moved, (truth.landmarks - [32, 16]) * 2, rtol=1e-5)
+    np.testing.assert_allclose(moved, (truth.landmarks - [32, 16]) * [2, 4], rtol=1e-5)
 
 
 def test_the_table_names_key_and_baselines():
