@@ -34,7 +34,7 @@ class WholeHeadConstants:
     color_spread: float = 0.12
     """Distance between colours (0..1) over which a colour stops counting as skin or as hair. Not varied."""
     tint_spread: float = 0.06
-    """The same for colours of equal brightness. Chosen with the rule, on drawn people (log, 11-22); not varied alone."""
+    """The same for colours of equal brightness. Chosen with the rule (log, 11-22); not varied alone."""
     light_spread: float = 0.25
     """The same for the logarithm of their brightness beyond half or twice. Chosen with the rule; not varied alone."""
     different_colors: float = 0.10
