@@ -18,10 +18,10 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import mien
 from mien.cli import main as run_mien
@@ -29,13 +29,12 @@ from mien.errors import UserError
 from mien.terminal import show
 from mien.workspace import open_workspace
 
-UNCHANGED = "unchanged"
 Change = tuple[Any, str, Any]
 """The constants of a room, the name of one of them, and its other value."""
+UNCHANGED = "unchanged"
 
 
-@dataclass(frozen=True)
-class Figures:
+class Figures(NamedTuple):
     """What a run got on its held-out frames: means over its protocols, PSNR in dB, and seconds of training."""
 
     change: str
@@ -51,8 +50,9 @@ def rooms() -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(root.rglob("constants.py")):
         module = importlib.import_module(".".join(("mien", *path.relative_to(root).with_suffix("").parts)))
-        room = path.parent.name
-        found |= {room: one for one in vars(module).values() if is_dataclass(one) and not isinstance(one, type)}
+        for one in vars(module).values():
+            if is_dataclass(one) and not isinstance(one, type):
+                found[path.parent.name] = one
     return found
 
 
@@ -80,15 +80,16 @@ def change_of(text: str) -> Change:
 @contextmanager
 def changed(change: Change | None) -> Iterator[None]:
     """Give a constant its other value. Its dataclass is frozen, and only this script gets around that."""
-    constants, name, value = change or (None, "", None)
-    before = getattr(constants, name, None)
-    if change:
-        object.__setattr__(constants, name, value)
+    if change is None:
+        yield
+        return
+    constants, name, value = change
+    before = getattr(constants, name)
+    object.__setattr__(constants, name, value)
     try:
         yield
     finally:
-        if change:
-            object.__setattr__(constants, name, before)
+        object.__setattr__(constants, name, before)
 
 
 def run_name(label: str, options: Sequence[str]) -> str:
@@ -116,14 +117,10 @@ def measure(folder: Path, label: str, change: Change | None, options: Sequence[s
 def table(rows: Sequence[Figures]) -> str:
     """The figures in markdown, with differences to the unchanged run, and each change's mean over several captures."""
     lines = ["| change | capture | PSNR, dB | head crop, dB | training, s |", "|---|---|---|---|---|"]
-    by_change = {row.change: [other for other in rows if other.change == row.change] for row in rows}
-    means = [
-        Figures(
-            change, "mean", *(fmean(getattr(row, name) for row in own) for name in ("psnr", "head_psnr", "seconds"))
-        )
-        for change, own in by_change.items()
-    ]
-    rows = [*rows, *(means if len(by_change[UNCHANGED]) > 1 else ())]
+    for change in dict.fromkeys(row.change for row in rows) if len({row.capture for row in rows}) > 1 else ():
+        own = [row for row in rows if row.change == change]
+        means = (fmean(getattr(row, name) for row in own) for name in ("psnr", "head_psnr", "seconds"))
+        rows = [*rows, Figures(change, "mean", *means)]
     base = {row.capture: row for row in rows if row.change == UNCHANGED}
     for row in rows:
         pairs = ((row.psnr, base[row.capture].psnr), (row.head_psnr, base[row.capture].head_psnr))
@@ -136,18 +133,17 @@ def main() -> None:
     """Measure every change on every capture, and print the table."""
     parser = argparse.ArgumentParser(usage=__doc__, allow_abbrev=False)
     parser.add_argument("captures", type=Path, nargs="*")
-    for option in ("--set", "--setting"):
-        parser.add_argument(option, action="append", default=[])
+    parser.add_argument("--set", action="append", default=[])
+    parser.add_argument("--setting", action="append", default=[])
     parser.add_argument("--list", action="store_true")
     given, options = parser.parse_known_args()
     if given.list:
         show("\n".join(f"{room}.{k}={v!r}" for room, values in rooms().items() for k, v in asdict(values).items()))
     changes = [(UNCHANGED, None, []), *((text, change_of(text), []) for text in given.set)]
     changes += [(text, None, f"--{text}".split("=", 1)) for text in given.setting]
-    if given.captures:
-        show(
-            table([measure(path, name, one, [*options, *own]) for path in given.captures for name, one, own in changes])
-        )
+    rows = [measure(folder, name, one, [*options, *own]) for folder in given.captures for name, one, own in changes]
+    if rows:
+        show(table(rows))
 
 
 if __name__ == "__main__":
