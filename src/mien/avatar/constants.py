@@ -19,7 +19,7 @@ class AvatarConstants:
     """Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond
     it. Measured: 0.5 has 0.2 dB more at 30 degrees and 0.3 less at 90, and 1 has 0.2 dB less at 30 (log, 11-24)."""
 
-    # gaussian_avatars/surface.py, and `whole_head` for the inside of the mouth
+    # what fills the surface of a bound method, outside and inside the mouth
     fill_opacity: float = 0.97
     """Opacity of a fill. Not varied."""
 
