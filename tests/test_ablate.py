@@ -90,8 +90,8 @@ def _uses(tree: ast.AST, running: bool = False) -> Iterator[tuple[str, str, bool
             yield node.value.id, node.attr, running
         if isinstance(node, ast.FunctionDef | ast.Lambda):
             yield from _uses(node.args, running)
-            for part in node.body if isinstance(node.body, list) else [node.body]:
-                yield from _uses(ast.Module([part], []), running=True)
+            body = node.body if isinstance(node.body, list) else [ast.Expr(node.body)]
+            yield from _uses(ast.Module(body, []), running=True)
         else:
             yield from _uses(node, running)
 
@@ -101,7 +101,7 @@ def test_every_constant_says_what_it_is_and_is_read_when_it_is_needed(ablate: Mo
     used = {use for path in root.rglob("*.py") for use in _uses(ast.parse(path.read_text()))}
     for room, constants in ablate.rooms().items():
         path = next(p for p in root.rglob("constants.py") if p.parent.name == room)
-        name = next(n.targets[0].id for n in ast.parse(path.read_text()).body if isinstance(n, ast.Assign))
+        name = next(ast.unparse(n.targets[0]) for n in ast.parse(path.read_text()).body if isinstance(n, ast.Assign))
         docs, aliases = field_docs(type(constants)), {name, "known"}
         assert set(docs) == {each.name for each in fields(constants)}
         for field in asdict(constants):
