@@ -17,7 +17,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from statistics import fmean
@@ -72,17 +72,14 @@ def change_of(text: str) -> Change:
     except (ValueError, SyntaxError):
         new = None
     new = float(new) if isinstance(now, float) and type(new) is int else new
-    if type(new) is not type(now) or (isinstance(now, tuple) and len(new) != len(now)):
+    if type(new) is not type(now) or (isinstance(new, tuple) and isinstance(now, tuple) and len(new) != len(now)):
         raise UserError(f"--set {text}: give a value like {now!r}")
     return known[room], field, new
 
 
 @contextmanager
-def changed(change: Change | None) -> Iterator[None]:
+def changed(change: Change) -> Iterator[None]:
     """Give a constant its other value. Its dataclass is frozen, and only this script gets around that."""
-    if change is None:
-        yield
-        return
     constants, name, value = change
     before = getattr(constants, name)
     object.__setattr__(constants, name, value)
@@ -104,7 +101,7 @@ def measure(folder: Path, label: str, change: Change | None, options: Sequence[s
     from mien.evaluation.protocols import EvaluationSettings
 
     quick = EvaluationSettings(perceptual=False, baselines=False, video_frames=0)
-    with changed(change):
+    with changed(change) if change else nullcontext():
         run = run_name(label, options)
         if code := run_mien(["train", str(folder), "--run", run, *options]):
             raise SystemExit(code)
@@ -141,8 +138,7 @@ def main() -> None:
         show("\n".join(f"{room}.{k}={v!r}" for room, values in rooms().items() for k, v in asdict(values).items()))
     changes = [(UNCHANGED, None, []), *((text, change_of(text), []) for text in given.set)]
     changes += [(text, None, f"--{text}".split("=", 1)) for text in given.setting]
-    rows = [measure(folder, name, one, [*options, *own]) for folder in given.captures for name, one, own in changes]
-    if rows:
+    if rows := [measure(path, name, one, [*options, *own]) for path in given.captures for name, one, own in changes]:
         show(table(rows))
 
 

@@ -39,8 +39,7 @@ def test_a_change_holds_as_long_as_it_is_asked_for(ablate: ModuleType) -> None:
     with contextlib.suppress(UserError), ablate.changed(ablate.change_of("avatar.fill_height_share=0.25")):
         raise UserError("stop")
     assert AVATAR.fill_height_share == 0.9
-    with ablate.changed(None):
-        assert ablate.run_name("one", ["--steps", "9"]) == before != ablate.run_name("one", ["--steps", "8"])
+    assert ablate.run_name("one", ["--steps", "9"]) == before != ablate.run_name("one", ["--steps", "8"])
 
 
 @pytest.mark.parametrize(
@@ -90,7 +89,7 @@ def _uses(tree: ast.AST, running: bool = False) -> Iterator[tuple[str, str, bool
             yield node.value.id, node.attr, running
         if isinstance(node, ast.FunctionDef | ast.Lambda):
             yield from _uses(node.args, running)
-            body = node.body if isinstance(node.body, list) else [ast.Expr(node.body)]
+            body: list[ast.stmt] = node.body if isinstance(node.body, list) else [ast.Expr(node.body)]
             yield from _uses(ast.Module(body, []), running=True)
         else:
             yield from _uses(node, running)
