@@ -11,8 +11,9 @@ import torch
 from mien import runtime
 from mien.avatar import GradientSettings, HeadGas, HeadGasConfig, Progress, load_avatar, make_portable, write_avatar
 from mien.avatar.encoding import positional_encoding
+from mien.avatar.headgas.constants import HEADGAS
 from mien.avatar.headgas.settings import Variant
-from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, VARIANTS, averaging_weights
+from mien.avatar.headgas.variants import MOVED, VARIANTS, averaging_weights
 from mien.config import decode, encode
 from mien.errors import UserError
 from mien.face import FaceParams
@@ -81,7 +82,7 @@ def test_delta_moves_and_turns_by_the_network_and_paints_nothing() -> None:
     moved = avatar.network(values)
     assert moved.shape == (40, MOVED)
     store, found = avatar.store, posed.gaussians.timestep(2)
-    torch.testing.assert_close(found.means, store["means"] + SHIFT_LENGTH * moved[:, :3])
+    torch.testing.assert_close(found.means, store["means"] + HEADGAS.shift_length * moved[:, :3])
     turn = matrix_from_quaternion(moved[:, 3:] + torch.tensor([1.0, 0, 0, 0]))
     expected = turn @ matrix_from_quaternion(store["quats"])
     torch.testing.assert_close(matrix_from_quaternion(found.quats), expected)
@@ -102,7 +103,7 @@ def test_change_all_paints_too() -> None:
     outputs, found = avatar.network(values), posed.gaussians.timestep(2)
     assert outputs.shape == (40, 12 + MOVED + 1)
     torch.testing.assert_close(found.sh[:, 0], outputs[:, :3])
-    torch.testing.assert_close(found.means, avatar.store["means"] + SHIFT_LENGTH * outputs[:, 12:15])
+    torch.testing.assert_close(found.means, avatar.store["means"] + HEADGAS.shift_length * outputs[:, 12:15])
     torch.testing.assert_close(found.opacities, outputs[:, -1].sigmoid())
     assert set(avatar.regularizers(posed, rasterize(found, toy_camera(32), torch.ones(3)), Progress(1, 2))) == {"shift"}
 

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, Rate
 from mien.avatar.mono_gaussian_avatar.avatar import (
-    CANONICAL_JAW,
     canonical_face,
     nearest_vertices,
 )
+from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.mono_gaussian_avatar.networks import Deformation
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
@@ -81,7 +81,7 @@ def test_canonical_jaw_is_open() -> None:
     mean = toy_face(5).expression.mean(0)
     expression, joints = canonical_face(follows, mean)
     opening = follows.joint_rotation_basis[:, jaw, 0]
-    assert float(expression @ opening) == pytest.approx(CANONICAL_JAW, abs=1e-6)
+    assert float(expression @ opening) == pytest.approx(MONO.canonical_jaw, abs=1e-6)
     # Only the coefficient that opens the jaw most has changed.
     assert (expression != mean).nonzero()[:, 0].tolist() == [int(opening.argmax())]
     assert joints.abs().max() == 0
@@ -95,7 +95,7 @@ def test_canonical_jaw_is_open() -> None:
     expression, joints = canonical_face(free, mean)
     assert torch.equal(expression, mean)
     turned = joints[free.free_joint_names.index("jaw")]
-    torch.testing.assert_close(turned, torch.tensor([CANONICAL_JAW, 0, 0]))
+    torch.testing.assert_close(turned, torch.tensor([MONO.canonical_jaw, 0, 0]))
     assert joints.abs().sum() == turned.abs().sum()
     headless = replace(follows, joint_names=tuple("chin" if name == "jaw" else name for name in follows.joint_names))
     assert torch.equal(canonical_face(headless, mean)[0], mean)

@@ -15,7 +15,8 @@ from mien.camera import Camera
 from mien.training import PRESETS, TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import _round_steps
-from mien.training.footage.frames import MIN_EXTENT, Frame, camera_extent
+from mien.training.footage.constants import FOOTAGE
+from mien.training.footage.frames import Frame, camera_extent
 from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import toy_face, toy_face_model, toy_sequence
 
@@ -207,9 +208,9 @@ def test_extent_is_that_of_the_training_cameras() -> None:
     cameras = (camera_at(0, 0, 0), camera_at(4, 0, 0), camera_at(2, 30, 0))
     rig = replace(sequence, tracking=replace(sequence.tracking, cameras=cameras))
     assert camera_extent([rig], [Frame(0, 0, 0), Frame(0, 1, 0), Frame(0, 0, 1)]) == pytest.approx(1.1 * 2)
-    assert camera_extent([rig], [Frame(0, 0, 0)]) == MIN_EXTENT == 0.5
+    assert camera_extent([rig], [Frame(0, 0, 0)]) == FOOTAGE.least_extent == 0.5
     near = replace(sequence, tracking=replace(sequence.tracking, cameras=(camera_at(0, 0, 0), camera_at(0.1, 0, 0))))
-    assert camera_extent([near], [Frame(0, 0, 0), Frame(0, 0, 1)]) == MIN_EXTENT
+    assert camera_extent([near], [Frame(0, 0, 0), Frame(0, 0, 1)]) == FOOTAGE.least_extent
 
 
 def test_extent_reaches_rates_in_its_unit_only() -> None:

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-_FILL_HEIGHT = 0.9
-"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it."""
+from mien.avatar.constants import AVATAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,7 @@ class SurfacePrior:
     @property
     def fill_height(self) -> Float[Tensor, " f"]:
         """Height at which a fill lies above its triangle, in metres."""
-        return _FILL_HEIGHT * self.hair
+        return AVATAR.fill_height_share * self.hair
 
 
 class BoundSurface(ABC):

@@ -5,7 +5,7 @@ Most methods use one frame in a step. Of several, networks of positions run once
 
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Items
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from jaxtyping import Float
@@ -21,7 +21,7 @@ from mien.render.rendering import Rendering
 from mien.training.ahead import TargetQueue
 from mien.training.checkpoint import TrainingState
 from mien.training.footage import (
-    MIN_EXTENT,
+    FOOTAGE,
     Frame,
     FrameOrder,
     Target,
@@ -41,7 +41,7 @@ class TrainingData:
     order: FrameOrder
     targets: tuple[Targets, ...]
     """One entry per sequence."""
-    extent: float = MIN_EXTENT
+    extent: float = field(default_factory=lambda: FOOTAGE.least_extent)
     """Extent of the training cameras, in metres."""
     representative: tuple[Frame, ...] = ()
     """A few frames that show the head from all the sides that were filmed."""

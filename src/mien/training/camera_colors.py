@@ -14,12 +14,10 @@ from mien.adam import Moments
 from mien.avatar import ParameterGroup, Rate
 from mien.errors import UserError
 from mien.render.rendering import Rendering
+from mien.training.constants import TRAINING
 from mien.training.footage import Frame, Sequence
 from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
-
-_LAST_RATE = 0.1
-"""Learning rate at the last step, as a share of that at the first."""
 
 
 class CameraColors:
@@ -47,7 +45,7 @@ class CameraColors:
         self.ids = tuple(ids)
         """The cameras, in the order of the maps."""
         self._changes = like.new_zeros(len(ids), 3, 4).requires_grad_()
-        self._rate = Rate(settings.camera_color_rate, _LAST_RATE * settings.camera_color_rate)
+        self._rate = Rate(settings.camera_color_rate, TRAINING.camera_colors_last_rate * settings.camera_color_rate)
         self._moments = {"changes": Moments.zeros(self._changes.detach())}
         places = {camera_id: place for place, camera_id in enumerate(ids)}
         self._places = [[places.get(camera_id, 0) for camera_id in one.capture.camera_ids] for one in sequences]

@@ -11,11 +11,9 @@ from torch import Tensor
 from mien.avatar import FaceTuning, Moments, ParameterGroup
 from mien.face import FaceParams
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
+from mien.training.constants import TRAINING
 
 _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
-_STILL = 0.02
-"""Standard deviation of a head's turns at which half of what follows them is removed, in radians. Less is removed of
-what follows smaller turns, which explain less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +206,8 @@ def without_turns(
     within = away.clone()
     for index in sequence.unique():
         within[sequence == index] -= away[sequence == index].mean(0)
-    slopes_of = torch.linalg.solve(within.T @ within + len(away) * _STILL**2 * torch.eye(3).to(away), within.T)
+    doubt = len(away) * TRAINING.still_turns**2 * torch.eye(3).to(away)
+    slopes_of = torch.linalg.solve(within.T @ within + doubt, within.T)
     return corrections - (away - away.mean(0)).to(corrections) @ (slopes_of.to(corrections) @ corrections)
 
 

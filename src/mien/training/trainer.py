@@ -42,6 +42,7 @@ from mien.training.ahead import targets_ahead
 from mien.training.batch import TrainingData, compare, compare_features, draw, face_groups, next_batch, seen
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
+from mien.training.constants import TRAINING
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack, turns_from_mean
 from mien.training.footage import (
@@ -62,12 +63,6 @@ from mien.training.losses import train_psnr
 from mien.training.parts import Preparation, Step, passed
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.settings import TrainSettings
-
-_STEADY_EVERY = 25
-"""Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
-
-_REPRESENTATIVE = 12
-"""Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
@@ -127,7 +122,8 @@ def train(
             for sequence in sequences
         ]
         faces = [sequence.tracking.face for sequence in sequences]
-        representative = representative_frames(faces, sequences, frames, _REPRESENTATIVE, _REPRESENTATIVE)
+        looked = TRAINING.representative_frames
+        representative = representative_frames(faces, sequences, frames, looked, looked)
         data = TrainingData(order, tuple(targets), extent, tuple(representative))
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
         write_results(run_dir, state, state.covered or measure_coverage(face_model, sequences, faces, frames))
@@ -313,7 +309,7 @@ def _update(state: TrainingState, now: Step, posed: Items[Posed], renderings: It
     state.adam.step(groups, now.progress)
     for one in now.batch:
         state.track.confine(one.index)
-    if now.reaches(_STEADY_EVERY):
+    if now.reaches(TRAINING.steady_every):
         state.track.steady_pose()
     random = partial(density_random, now.settings, state.step)
     return state.density.adapt(state.avatar.gaussian_store(), posed[0], now.progress, random)

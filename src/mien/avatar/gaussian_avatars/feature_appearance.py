@@ -12,13 +12,11 @@ from mien.adam import FactoredGradient
 from mien.avatar.avatar import ParameterGroup, factored_group, network_group, store_group
 from mien.avatar.baking import as_array
 from mien.avatar.encoding import positional_encoding
+from mien.avatar.gaussian_avatars.constants import GAUSSIAN_AVATARS
 from mien.avatar.ops.feature_network import Layers, feature_network
 from mien.avatar.schedules import Rate
 from mien.avatar.store import GaussianStore
 from mien.runtime.baked import FeatureChanges
-
-_BANDS, _LENGTH = 4, 0.05
-"""Octaves of the encoding of a place, and its unit in metres, as in HeadGaS."""
 
 
 class FeatureAppearance(nn.Module):
@@ -29,7 +27,8 @@ class FeatureAppearance(nn.Module):
     def __init__(self, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], features: int, hidden: int):
         """Start without any change. `vertices` are those of the person at rest in the head frame, in metres."""
         super().__init__()
-        places = positional_encoding(vertices[faces.long()].mean(1).detach() / _LENGTH, _BANDS)
+        middles = vertices[faces.long()].mean(1).detach()
+        places = positional_encoding(middles / GAUSSIAN_AVATARS.feature_length, GAUSSIAN_AVATARS.feature_bands)
         # Not in files: it follows from the face model and the person.
         self.register_buffer("places", places, persistent=False)
         self.first = nn.Linear(features + places.shape[1], hidden).to(places)

@@ -4,23 +4,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mien.avatar.gaussian_avatars.constants import GAUSSIAN_AVATARS
 from mien.avatar.ops.triangle_frames import TriangleFrames, triangle_frames
 from mien.face.mirror import triangle_geometry
 from mien.gaussians import sh_from_rgb
-
-_PER_AREA = 150_000.0
-"""Strands per square metre of scalp."""
-_LENGTH, _WIDTH, _THICKNESS = 0.005, 0.001, 0.0004
-"""Scales (standard deviations) of a strand in metres: along it, across it, and along the normal."""
-_OPACITY = 0.7
-_DOWN, _BACK, _DISORDER = 1.0, 0.6, 0.15
-"""The direction of strands in the head frame, and the standard deviation of each coordinate."""
-_CONTRAST = 0.2
-"""Standard deviation of the logarithm of a strand's brightness."""
-_BELOW = 0.003
-"""Range below the top of the hair in which strands lie, in metres. Above it, they would widen the outline."""
-_HEAD_RADIUS, _NECK_RADIUS, _CHIN = 0.1, 0.055, -0.05
-"""Radii in metres of the head and of the neck that hair is a shell around, and the level below which it is the neck."""
 
 
 def strand_gaussians(
@@ -46,25 +33,28 @@ def strand_gaussians(
         The tensors `face_index, means, quats, log_scales, opacity_logits, sh_constant` of a store, with one row for
         each strand.
     """
+    known = GAUSSIAN_AVATARS
     vertices, random = vertices.detach(), torch.Generator().manual_seed(0)
     frames = triangle_frames(vertices, faces)
     triangles = _evenly_drawn(vertices, faces, chosen)
     count, size, high = len(triangles), frames.k[triangles], height[triangles]
     means = _to_triangles(frames, triangles, _places(vertices, faces, triangles, random) - frames.T[triangles])
     means = means * shell_growth(vertices, faces, height)[triangles, None]
-    means[:, 1] = high - _BELOW * torch.rand(count, generator=random)
-    direction = torch.tensor([0.0, -_DOWN, -_BACK]) + _DISORDER * torch.randn(count, 3, generator=random)
+    means[:, 1] = high - known.strand_depth * torch.rand(count, generator=random)
+    combed = torch.tensor([0.0, -known.strand_down, -known.strand_back])
+    direction = combed + known.strand_disorder * torch.randn(count, 3, generator=random)
     along = _to_triangles(frames, triangles, direction)
     # A turn about the normal, the second axis, takes the first axis to (cos, 0, -sin).
     half, zero = 0.5 * torch.atan2(-along[:, 2], along[:, 0]), torch.zeros(count)
-    scales = torch.tensor([_LENGTH, _THICKNESS, _WIDTH]) / size[:, None]
-    light = torch.exp(_CONTRAST * torch.randn(count, 1, generator=random) - 0.5 * _CONTRAST**2)
+    scales = torch.tensor([known.strand_length, known.strand_thickness, known.strand_width]) / size[:, None]
+    contrast = known.strand_contrast
+    light = torch.exp(contrast * torch.randn(count, 1, generator=random) - 0.5 * contrast**2)
     return {
         "face_index": triangles,
         "means": means / size[:, None],
         "quats": torch.stack([half.cos(), zero, half.sin(), zero], dim=1),
         "log_scales": scales.log(),
-        "opacity_logits": torch.logit(torch.full((count,), _OPACITY)),
+        "opacity_logits": torch.logit(torch.full((count,), known.strand_opacity)),
         "sh_constant": sh_from_rgb((colors[triangles] * light).clamp(0, 1))[:, None],
     }
 
@@ -76,8 +66,8 @@ def shell_growth(
 
     Hair is a shell around the head or, where it hangs, around the neck, which is thinner.
     """
-    below = triangle_geometry(vertices.detach(), faces)[0][:, 1] < _CHIN
-    return 1 + height / torch.where(below, _NECK_RADIUS, _HEAD_RADIUS).to(height)
+    below = triangle_geometry(vertices.detach(), faces)[0][:, 1] < GAUSSIAN_AVATARS.chin_level
+    return 1 + height / torch.where(below, GAUSSIAN_AVATARS.neck_radius, GAUSSIAN_AVATARS.head_radius).to(height)
 
 
 def _evenly_drawn(
@@ -85,7 +75,7 @@ def _evenly_drawn(
 ) -> Int[Tensor, " n"]:
     """The triangle of each strand. A triangle has as many as its area says, rounded down or up."""
     areas = triangle_geometry(vertices.double(), faces)[1]
-    ends = (areas * chosen * _PER_AREA).cumsum(0)
+    ends = (areas * chosen * GAUSSIAN_AVATARS.strands_per_area).cumsum(0)
     points = torch.arange(int(ends[-1])) + 0.5
     return torch.searchsorted(ends, points.double(), right=True)
 

@@ -6,19 +6,14 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.avatar.bound_surface import BoundSurface, SurfacePrior
+from mien.avatar.constants import AVATAR
+from mien.avatar.gaussian_avatars.constants import GAUSSIAN_AVATARS
 from mien.avatar.gaussian_avatars.hair_strands import shell_growth, strand_gaussians
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface
 from mien.avatar.ops.triangle_frames import triangle_ellipses, triangle_frames
 from mien.avatar.store import GaussianStore
 from mien.gaussians import sh_from_rgb
-
-_OPEN = 0.5
-"""Sum of the opacities of a triangle's Gaussians below which its surface is open."""
-_PULL = 0.05
-"""Share of the difference to the completed colour that a step takes away where no picture shows a triangle."""
-_OPAQUE = 0.97
-"""Opacity of a fill."""
 
 
 class GaussianSurface(BoundSurface):
@@ -95,7 +90,7 @@ class GaussianSurface(BoundSurface):
             "means": torch.stack([0 * height, height / self.sizes, 0 * height], 1),
             "quats": quats,
             "log_scales": log_scales + wider,
-            "opacity_logits": torch.logit(torch.full_like(height, _OPAQUE)),
+            "opacity_logits": torch.logit(torch.full_like(height, AVATAR.fill_opacity)),
         }
 
     @torch.no_grad()
@@ -108,7 +103,7 @@ class GaussianSurface(BoundSurface):
             bound, own = self._store["face_index"], self._store["sh_constant"].detach()[:, 0]
             # What is made up has the colours that it was given, strand by strand.
             doubt = prior.doubt if prior.filled_in is None else prior.doubt.masked_fill(prior.filled_in, 0)
-            pull = _PULL * doubt[bound, None]
+            pull = GAUSSIAN_AVATARS.color_pull * doubt[bound, None]
             own += pull * (sh_from_rgb(prior.colors)[bound] - own)
 
     @torch.no_grad()
@@ -154,7 +149,7 @@ class GaussianSurface(BoundSurface):
         total = opacities.new_zeros(len(chosen)).index_add(0, bound, opacities)
         order = torch.arange(len(store), device=bound.device)
         first = torch.full_like(chosen, len(store), dtype=torch.long).scatter_reduce(0, bound, order, "amin")
-        opened = (chosen & (total < _OPEN) & (first < len(store))).nonzero()[:, 0]
+        opened = (chosen & (total < GAUSSIAN_AVATARS.open_opacity) & (first < len(store))).nonzero()[:, 0]
         for name, values in self._flat(opened, total.new_full((len(chosen),), opacity), colors).items():
             store.assign_rows(name, first[opened], values)
 

@@ -29,10 +29,9 @@ from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array
 from mien.avatar.density import GradientDensity
 from mien.avatar.encoding import positional_encoding
+from mien.avatar.headgas.constants import HEADGAS
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.headgas.variants import (
-    OPACITY_RATE,
-    SHIFT_LENGTH,
     VARIANTS,
     Changes,
     Parts,
@@ -56,8 +55,6 @@ from mien.rotation import multiply_quaternions
 from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
 
 _CHUNK = 512
-_COLOR_RATE = 2.5e-3
-"""Learning rate of the colours in 3D Gaussian Splatting."""
 
 
 class HeadGas(Avatar):
@@ -121,7 +118,7 @@ class HeadGas(Avatar):
         moved = [one.moved for one in changes if one.moved is not None]
         if moved:
             shifts, turns = _stacked(moved).split([3, 4], dim=-1)
-            aux["shifts"] = SHIFT_LENGTH * shifts
+            aux["shifts"] = HEADGAS.shift_length * shifts
             means = means + aux["shifts"]
             identity = turns.new_tensor([1.0, 0.0, 0.0, 0.0])
             quats = multiply_quaternions(identity + turns, quats.expand_as(turns))
@@ -142,7 +139,7 @@ class HeadGas(Avatar):
         if parts.blends:
             rates["neutral_features"] = config.features_rate
         if not parts.recolors:
-            rates |= {"sh": config.features_rate, "opacity_logits": Rate(OPACITY_RATE)}
+            rates |= {"sh": config.features_rate, "opacity_logits": Rate(HEADGAS.opacity_rate)}
         extent = {"means": config.means_times_extent}
         groups = [
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
@@ -265,7 +262,7 @@ class HeadGas(Avatar):
         colors, moved, opacity = output_widths(self._parts, 3 * self._coefficients)
         shares = self._color_shares(progress).flatten()[:colors]
         # Explicit colours and opacities are in one tensor, but opacities learn at their own rate.
-        faster = 1.0 if self._parts.layers else OPACITY_RATE / _COLOR_RATE
+        faster = 1.0 if self._parts.layers else HEADGAS.opacity_rate / HEADGAS.color_rate
         return torch.cat([shares, torch.ones(moved), torch.full((opacity,), faster)])
 
     def _color_shares(self, progress: Progress) -> Float[Tensor, "s 3"]:

@@ -11,17 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mien.avatar.headgas.constants import HEADGAS
 from mien.avatar.headgas.settings import Variant
 from mien.avatar.ops.feature_network import SLOPE
 
 MOVED = 7
 """Numbers that move a Gaussian: a shift (3), and a rotation as a quaternion less the identity (4)."""
-SHIFT_LENGTH = 0.01
-"""Unit of the network's shifts, in metres. The papers do not say one."""
-START_OPACITY = 0.1
-"""Opacity of all Gaussians at the start, as in 3D Gaussian Splatting."""
-OPACITY_RATE = 0.05
-"""Learning rate of opacities that Gaussians have themselves: that of 3D Gaussian Splatting."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +81,7 @@ def new_network(parts: Parts, inputs: int, hidden: int, colors: int) -> nn.Seque
 
 def start_logit() -> Float[Tensor, ""]:
     """The logit of the opacity at the start."""
-    return torch.logit(torch.tensor(START_OPACITY))
+    return torch.logit(torch.tensor(HEADGAS.start_opacity))
 
 
 def split_outputs(

@@ -28,6 +28,7 @@ from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, Pretrainin
 from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
+from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.mono_gaussian_avatar.networks import (
     ATTRIBUTE_WIDTHS,
     ATTRIBUTES,
@@ -48,14 +49,6 @@ from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
-
-CANONICAL_JAW = 0.4
-"""Angle by which the jaw is open in the canonical face, in radians."""
-_PRETRAINING_POINTS, _PRETRAINING_FRAMES, _PRETRAINING_RATE = 1024, 4, 3e-3
-"""Points and frames of a step of pre-training on the face model's motion, and the first step's learning rate."""
-_PRETRAINING_WEIGHT = 10.0
-"""Weight of the distance between points and their places on the moved mesh, beside the losses that keep the networks
-near the face model."""
 
 
 class MonoGaussianAvatar(Avatar):
@@ -163,18 +156,18 @@ class MonoGaussianAvatar(Avatar):
 
         The published network starts without any motion, and needs some hundred thousand steps to find it.
         """
-        optimizer = torch.optim.Adam(self.deformation.parameters(), lr=_PRETRAINING_RATE)
+        optimizer = torch.optim.Adam(self.deformation.parameters(), lr=MONO.pretraining_rate)
         canonical, faces = self._at_rest().vertices, self.face_model.faces
         for step in range(self.config.pretraining):
-            optimizer.param_groups[0]["lr"] = _PRETRAINING_RATE * 0.1 ** (step / self.config.pretraining)
-            frames = face[torch.randint(len(face), (_PRETRAINING_FRAMES,))].detach()
-            corners, weights = random_places(canonical, faces, _PRETRAINING_POINTS)
+            optimizer.param_groups[0]["lr"] = MONO.pretraining_rate * 0.1 ** (step / self.config.pretraining)
+            frames = face[torch.randint(len(face), (MONO.pretraining_frames,))].detach()
+            corners, weights = random_places(canonical, faces, MONO.pretraining_points)
             means = at_places(canonical, corners, weights)
             target = at_places(self.face_model.head_vertices(frames), corners, weights)
             found, _ = self._deformed_from(means, frames)
             distance = (found - target).norm(dim=-1).mean() / LENGTH_UNIT
             optimizer.zero_grad()
-            torch.autograd.backward([_PRETRAINING_WEIGHT * distance, *self._face_losses(means).values()])
+            torch.autograd.backward([MONO.pretraining_weight * distance, *self._face_losses(means).values()])
             optimizer.step()
             yield
 
@@ -319,20 +312,20 @@ class _AtRest(NamedTuple):
 def canonical_face(
     model: FaceModel, expression: Float[Tensor, " e"]
 ) -> tuple[Float[Tensor, " e"], Float[Tensor, "j 3"]]:
-    """An expression and joints at which the jaw is open by `CANONICAL_JAW`.
+    """An expression and joints at which the jaw is open by `MONO.canonical_jaw`.
 
     A free jaw turns by this angle. A jaw that follows the expression gets it from the coefficient that opens it most.
     Other joints are at rest. A model without a joint `jaw` keeps its jaw.
     """
     joints = expression.new_zeros(len(model.free_joint_names), 3)
     if "jaw" in model.free_joint_names:
-        joints[model.free_joint_names.index("jaw"), 0] = CANONICAL_JAW
+        joints[model.free_joint_names.index("jaw"), 0] = MONO.canonical_jaw
     elif "jaw" in model.joint_names:
         opening = model.joint_rotation_basis[:, model.joint_names.index("jaw"), 0].to(expression)
         best = opening.argmax()
         if opening[best] > 0:
             expression = expression.clone()
-            expression[best] += (CANONICAL_JAW - expression @ opening) / opening[best]
+            expression[best] += (MONO.canonical_jaw - expression @ opening) / opening[best]
     return expression, joints
 
 

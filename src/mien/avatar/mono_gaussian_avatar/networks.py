@@ -15,12 +15,10 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
 from mien.avatar.encoding import positional_encoding
+from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.ops.point_network import Activation, Layer, point_network
 
-SKINNING_SHARPNESS = 20.0
-"""Factor on the logits of the skinning weights: their softmax has a temperature of 1/20."""
 _SKIP = 3  # the layer, counted from 0, that reads the encoding again
-_SPHERE_RADIUS = 0.6
 
 ATTRIBUTES = ("log_scales", "quats", "opacity_logits", "sh")
 """Outputs of the attribute networks, in the order of their columns."""
@@ -57,7 +55,7 @@ class AttributeNet(nn.Module):
                 plain[self.skip].weight[:, width - inputs + 3 :] = 0
             if sphere:
                 nn.init.normal_(plain[-1].weight, math.sqrt(math.pi / width), 1e-4)
-                nn.init.constant_(plain[-1].bias, -_SPHERE_RADIUS)
+                nn.init.constant_(plain[-1].bias, -MONO.sphere_radius)
         # Last, so that the norms are those of the weights above.
         self.trunk = nn.ModuleList(weight_norm(layer) for layer in plain)
         self.heads = nn.ModuleList(nn.Linear(width, width) for _ in ATTRIBUTE_WIDTHS)
@@ -127,7 +125,7 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight, bias))
         offset, moved, logits = outputs.split([3, 3 * len(coefficients), self.skinning.out_features], dim=-1)
         moved = moved.unflatten(-1, (-1, 3)).transpose(0, 1)
-        return offset, moved, (SKINNING_SHARPNESS * logits).softmax(-1)
+        return offset, moved, (MONO.skinning_sharpness * logits).softmax(-1)
 
     def whole(self, points: Float[Tensor, "n 3"]) -> Deformation:
         """Everything about some points, with every direction."""
@@ -136,7 +134,7 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight.flatten(0, 1), bias.flatten()))
         directions, logits = outputs.split([3 * sum(widths), self.skinning.out_features], dim=-1)
         offset, expression, pose = directions.unflatten(-1, (3, -1)).split(widths, dim=-1)
-        return Deformation(offset[..., 0], expression, pose, (SKINNING_SHARPNESS * logits).softmax(-1))
+        return Deformation(offset[..., 0], expression, pose, (MONO.skinning_sharpness * logits).softmax(-1))
 
     def _directions(self) -> tuple[Float[Tensor, "3 _ w"], Float[Tensor, "3 _"]]:
         return self.directions.weight.unflatten(0, (3, -1)), self.directions.bias.unflatten(0, (3, -1))

@@ -4,10 +4,10 @@
 whatever its number of steps. Needs no torch.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
+from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 
 ScheduleName = Literal["paper", "code"]
@@ -26,10 +26,6 @@ _SHRINKING: dict[ScheduleName, tuple[int, ...]] = {
     "code": (5, 10, 15, 20, 25, 30, 40, 50),
 }
 """Epochs at which the radius shrinks, up to epoch 60. Then it shrinks every 5 epochs."""
-_FIRST_RADIUS = 0.15 * 0.75 ** math.log2(400 / 100)
-_FACTOR, _FACTOR_AT_60 = 0.75, 0.9
-_LATE_LENGTH = 0.004
-_FACE_HALVINGS = (20, 30, 50, 70)
 
 
 @dataclass(frozen=True)
@@ -49,15 +45,15 @@ class Schedule:
     def rendering_radius(self, fraction: float) -> float:
         """Length added to all scales, in metres."""
         epoch = self._epoch(fraction)
-        factor = _FACTOR ** sum(epoch >= start for start in _SHRINKING[self.name])
+        factor = MONO.radius_factor ** sum(epoch >= start for start in _SHRINKING[self.name])
         if self.name == "code":
-            factor *= _FACTOR_AT_60 if epoch >= 60 else 1.0
+            factor *= MONO.radius_factor_at_60 if epoch >= 60 else 1.0
         late = epoch if self.name == "code" else min(epoch, 100)
-        return LENGTH_UNIT * _FIRST_RADIUS * factor * _FACTOR ** max(0, (late - 60) // 5)
+        return LENGTH_UNIT * MONO.first_radius * factor * MONO.radius_factor ** max(0, (late - 60) // 5)
 
     def sampling_length(self, fraction: float) -> float:
         """Radius of the sphere (`paper`) or side of the cube (`code`) of children around their parent, in metres."""
-        return LENGTH_UNIT * _LATE_LENGTH if self._epoch(fraction) > 100 else self.rendering_radius(fraction)
+        return LENGTH_UNIT * MONO.late_length if self._epoch(fraction) > 100 else self.rendering_radius(fraction)
 
     def points_at(self, fraction: float) -> int:
         """The number of points after a round."""
@@ -66,7 +62,7 @@ class Schedule:
 
     def face_decay(self, fraction: float) -> float:
         """Factor on the weight of the face model's terms."""
-        return 0.5 ** sum(self._epoch(fraction) >= epoch for epoch in _FACE_HALVINGS)
+        return 0.5 ** sum(self._epoch(fraction) >= epoch for epoch in MONO.face_halvings)
 
     def _epoch(self, fraction: float) -> int:
         """Number of whole epochs before a time; after the run, the number of its last one."""

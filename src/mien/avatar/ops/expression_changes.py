@@ -13,14 +13,11 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.arrays import native, recycled, unpacked
+from mien.avatar.constants import AVATAR
 from mien.face import FaceParams
 
-SEEN_SHARE = 0.98
-"""Share of the training timesteps whose activations are not shortened."""
 MARGIN = 0.1
 """How far activations can get beyond what training saw, as a share of its reach."""
-_WEAKEST = 0.1
-"""Smallest deviation that is scaled to 1, relative to that of the first direction. Weaker ones stay weak."""
 
 
 class ExpressionActivations(nn.Module):
@@ -97,7 +94,7 @@ def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
 def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> tuple[Float[Tensor, "i r"], Float[Tensor, " 1"]]:
     """Directions of the largest spread, strongest first, and how far along them the timesteps reach from 0.
 
-    The reach is the length of the activations that `SEEN_SHARE` of the timesteps do not exceed.
+    The reach is the length of the activations that `AVATAR.expressions_seen_share` of the timesteps do not exceed.
     """
     exact = offsets.detach().double().cpu()
     centered = exact - exact.mean(0)
@@ -106,10 +103,10 @@ def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> tuple[Floa
     deviations, vectors = strengths.flip(0)[:count].clamp_min(0).sqrt(), vectors.flip(1)[:, :count]
     largest = vectors.gather(0, vectors.abs().argmax(0, keepdim=True))
     usable = deviations > 1e-6
-    scales = deviations.clamp_min(max(_WEAKEST * float(deviations[0]), 1e-6))
+    scales = deviations.clamp_min(max(AVATAR.expressions_least_deviation * float(deviations[0]), 1e-6))
     directions = exact.new_zeros(len(vectors), rank)
     directions[:, :count] = vectors * largest.sign() * usable / scales
-    reach = (exact @ directions).norm(dim=-1).quantile(SEEN_SHARE, dim=0, keepdim=True)
+    reach = (exact @ directions).norm(dim=-1).quantile(AVATAR.expressions_seen_share, dim=0, keepdim=True)
     return directions.to(offsets), reach.to(offsets)
 
 

@@ -10,14 +10,11 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from mien import _native
 from mien.arrays import native, unpacked
+from mien.avatar.constants import AVATAR
 from mien.rotation import multiply_quaternions, quaternion_from_matrix
 
 DEGENERATE_LENGTH = 1e-7
 """Shortest first edge or height of a triangle that has a frame of its own, in metres."""
-
-
-_WIDENING, _FLATNESS = 2.0, 0.05
-"""Scales of Gaussians that cover a triangle: those in its plane, in its standard deviations, and the other one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +61,9 @@ def triangle_ellipses(
     xx, zz, xz = ((a * b).sum(-1) / 12 for a, b in ((x, x), (z, z), (x, z)))
     middle, half = (xx + zz) / 2, torch.hypot((xx - zz) / 2, xz)
     angle = -0.5 * torch.atan2(2 * xz, xx - zz)
-    zero, flat = torch.zeros_like(angle), torch.full_like(angle, _FLATNESS)
+    zero, flat = torch.zeros_like(angle), torch.full_like(angle, AVATAR.ellipse_flatness)
     quats = torch.stack([(angle / 2).cos(), zero, (angle / 2).sin(), zero], dim=-1)
-    wide, narrow = ((middle + sign * half).clamp_min(1e-6).sqrt() * _WIDENING for sign in (1, -1))
+    wide, narrow = ((middle + sign * half).clamp_min(1e-6).sqrt() * AVATAR.ellipse_widening for sign in (1, -1))
     return quats, torch.stack([wide, flat, narrow], dim=-1).log()
 
 

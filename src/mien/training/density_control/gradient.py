@@ -34,10 +34,8 @@ from mien import _native
 from mien.arrays import is_native, unpacked
 from mien.avatar import GaussianStore, GradientDensity, Posed, Progress
 from mien.render.rendering import Rendering
+from mien.training.constants import TRAINING
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
-
-_AFTER_RESET = 0.03
-"""Time after a reset of opacities in which nothing is judged by its contribution, as a fraction of the run."""
 
 
 class GradientStrategy(DensityStrategy):
@@ -81,7 +79,7 @@ class GradientStrategy(DensityStrategy):
 
     def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
         """Remove redundant Gaussians, but not soon after a reset of opacities. The statistics start again."""
-        if fraction < 1 and any(0 <= fraction - time < _AFTER_RESET for time in self._resets):
+        if fraction < 1 and any(0 <= fraction - time < TRAINING.unjudged_after_reset for time in self._resets):
             return
         store.select(~redundant())
         self._restart(len(store))

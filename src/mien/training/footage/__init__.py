@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.training.footage.constants import FOOTAGE
     from mien.training.footage.coverage import (
         Coverage,
         drawn_share,
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
         write_coverage,
     )
     from mien.training.footage.frames import (
-        MIN_EXTENT,
         Frame,
         FrameOrder,
         background_at,
@@ -53,9 +53,9 @@ else:
 __all__ = [
     "Coverage",
     "DRIVING",
+    "FOOTAGE",
     "Frame",
     "FrameOrder",
-    "MIN_EXTENT",
     "NAMED_SPLIT",
     "NamedSplit",
     "Sequence",

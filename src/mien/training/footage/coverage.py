@@ -18,20 +18,11 @@ from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import NeckCut, NeckParts, fit_neck_cut
+from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.mesh_colors import sample_picture
 from mien.training.footage.sequence import Sequence
 
-_EVEN_FRAMES, _TURNED_FRAMES = 48, 24
-"""Number of frames that are looked at: some evenly spread, and those in which the head turns furthest to each side."""
-_DEPTH_TOLERANCE = 0.004
-"""Depth in metres behind the nearest surface over which a triangle fades from visible to hidden, twice."""
-_FACING = (0.1, 0.3)
-"""Cosines between a triangle's normal and the direction to the camera, between which its view begins to count."""
-_ENOUGH = 1.0
-"""Sum of squared cosines over the frames from which a triangle is certain. Rare sights, such as teeth, count fully."""
-_SOFT = 0.001
-"""Distance in metres below the cut at the neck to which a vertex counts as above. It fades over the same distance."""
 _INTERIOR = ("mouth", "teeth", "tongue")
 """Regions inside the mouth. Lips hide them in most frames, so the mesh cannot say which of them pictures show."""
 
@@ -71,7 +62,8 @@ def measure_coverage(
     """
     count = len(face_model.faces)
     colors, weights, above = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
-    chosen = representative_frames(faces, sequences, frames)
+    even, turned = FOOTAGE.coverage_even_frames, FOOTAGE.coverage_turned_frames
+    chosen = representative_frames(faces, sequences, frames, even, turned)
 
     neck = NeckParts.of(face_model)
 
@@ -87,7 +79,7 @@ def measure_coverage(
         above += line
     known = weights > 1e-3
     colors = torch.where(known[:, None], colors / weights.clamp_min(1e-3)[:, None], torch.tensor(0.5))
-    seen = torch.where(known, smoothstep(weights / _ENOUGH), 0.0)
+    seen = torch.where(known, smoothstep(weights / FOOTAGE.coverage_enough), 0.0)
     return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 1))
 
 
@@ -95,8 +87,8 @@ def representative_frames(
     faces: Items[FaceParams],
     sequences: Items[Sequence],
     frames: Items[Frame],
-    even: int = _EVEN_FRAMES,
-    turned: int = _TURNED_FRAMES,
+    even: int,
+    turned: int,
 ) -> list[Frame]:
     """Evenly spread frames, and those in which the camera sees the head furthest from each side, above and below.
 
@@ -162,13 +154,15 @@ def _seen_colors(
     colors, head = (sample_picture(whole, grid, "bilinear") for whole in (picture, mask))
     front = sample_picture(nearest, grid, "nearest")[:, 0]
     cosine = triangle_views(vertices, faces, camera.position)
-    visible = smoothstep((front + 2 * _DEPTH_TOLERANCE - depth) / _DEPTH_TOLERANCE)
-    facing = smoothstep((cosine - _FACING[0]) / (_FACING[1] - _FACING[0]))
+    visible = smoothstep((front + 2 * FOOTAGE.depth_tolerance - depth) / FOOTAGE.depth_tolerance)
+    hardly, well = FOOTAGE.coverage_facing
+    facing = smoothstep((cosine - hardly) / (well - hardly))
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
     weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
     line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
     corners, _ = camera.project(vertices)
     # What is below the neck line in the picture, or below the cut in space, is not scored.
-    above = torch.minimum((corners @ line[:2] + line[2]).clamp(0, 1), (cut.heights(vertices) / _SOFT + 2).clamp(0, 1))
+    in_space = (cut.heights(vertices) / FOOTAGE.coverage_cut_softness + 2).clamp(0, 1)
+    above = torch.minimum((corners @ line[:2] + line[2]).clamp(0, 1), in_space)
     # All of the triangle has to be above: what hangs over the cut is scored as background.
     return colors, torch.where(inside, weight, 0.0), above[faces.long()].amin(1)

@@ -16,18 +16,13 @@ from mien.render.camera_paths import turned_camera
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_tensors, write_tensors
+from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.coverage import Coverage
 
 FILE = "coverage.safetensors"
 """Name of the file in a run's folder."""
 _FIELDS = ("seen", "colors", "above")
 _REMEDY = "train it again"
-_FILMED = 0.85
-"""Mean confidence of the visible surface from which a view counts as filmed."""
-_SHOWN = 0.5
-"""The same from which the head of a filled avatar may turn there."""
-_MOST_YAW, _MOST_PITCH = 60, 30
-"""Degrees beyond which that does not hold. Fills have neither strands nor folds."""
 _STEP, _SIZE, _FIELD, _DISTANCE = 5, 128, 0.4, 1.0
 """Degrees between the views that are tried; their size in pixels, field of view in radians and distance in metres."""
 _FILLED_IN = (0.93, 0.45, 0.30)
@@ -81,7 +76,7 @@ def filmed_yaws(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage:
     """
 
     def is_filmed(yaw: int) -> bool:
-        return filmed_share(vertices, face_model, coverage, view_of_head(vertices, yaw)) >= _FILMED
+        return filmed_share(vertices, face_model, coverage, view_of_head(vertices, yaw)) >= FOOTAGE.filmed_confidence
 
     if not is_filmed(0):
         return None
@@ -97,12 +92,13 @@ def with_shown_angles(
     """
 
     def is_shown(yaw: int, pitch: int) -> bool:
-        return filmed_share(vertices, face_model, coverage, view_of_head(vertices, yaw, pitch=pitch)) >= _SHOWN
+        camera = view_of_head(vertices, yaw, pitch=pitch)
+        return filmed_share(vertices, face_model, coverage, camera) >= FOOTAGE.shown_confidence
 
     if not is_shown(0, 0):
         return filmed
-    right, left = (_reached(lambda turn, to=to: is_shown(to * turn, 0), _MOST_YAW) for to in (-1, 1))
-    down, up = (_reached(lambda turn, to=to: is_shown(0, to * turn), _MOST_PITCH) for to in (-1, 1))
+    right, left = (_reached(lambda turn, to=to: is_shown(to * turn, 0), FOOTAGE.shown_most_yaw) for to in (-1, 1))
+    down, up = (_reached(lambda turn, to=to: is_shown(0, to * turn), FOOTAGE.shown_most_pitch) for to in (-1, 1))
     shown, known = np.radians(np.array([[-right, left], [-down, up]], np.float32)), filmed.head_angles
     lowest, highest = np.minimum(known[:, 0], shown[:, 0]), np.maximum(known[:, 1], shown[:, 1])
     return replace(filmed, head_angles=np.stack([lowest, highest], axis=1))

@@ -12,10 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-_WINDOWS = (1 / 11, 1 / 73)
-"""Sides of the windows of both passes, as shares of the picture's longer side: 45 and 7 pixels of 500."""
-_SOLID = 252
-"""Opacity from which a pixel is person alone, of 255."""
+from mien.training.footage.constants import FOOTAGE
 
 
 def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -31,7 +28,7 @@ def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray
     result = np.zeros_like(image)
     if width == 0:
         return result
-    windows = [max(3, 2 * round(share * max(image.shape[:2]) / 2) + 1) for share in _WINDOWS]
+    windows = [max(3, 2 * round(share * max(image.shape[:2]) / 2) + 1) for share in FOOTAGE.foreground_windows]
     # Only the head's box with the first window's margin counts; the picture's own edge stays an edge.
     low, high = (max(0, left - windows[0]), max(0, top - windows[0])), (left + width, top + height)
     inside = (slice(low[1], high[1] + windows[0]), slice(low[0], high[0] + windows[0]))
@@ -44,14 +41,14 @@ def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray
         person = _rounded(near_person + share * rest)
         if number == 0:
             background = _rounded(near_background + (1 - share) * rest)
-    cv2.copyTo(filmed, (opacity >= _SOLID).view(np.uint8), person)
+    cv2.copyTo(filmed, (opacity >= FOOTAGE.foreground_solid).view(np.uint8), person)
     cv2.copyTo(person, (opacity > 0).view(np.uint8), result[inside])
     return result
 
 
 def soft_pixels(matte: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the pixels whose colours `foreground_colors` estimates: neither empty nor solid."""
-    return (matte > 0) & (matte < _SOLID)
+    return (matte > 0) & (matte < FOOTAGE.foreground_solid)
 
 
 def _mean(

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien.errors import UserError
+from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 
@@ -22,14 +23,6 @@ _ORDER, _BACKGROUND, _DENSITY, _CROP, _COVER, _ASIDE = range(6)
 """Purposes of random numbers."""
 _BLOCK, _EVERY = 10, 5
 _TAIL_SHARE = 0.2
-_EXTENT_MARGIN = 1.1
-MIN_EXTENT = 0.5
-"""Least extent of the training cameras, in metres.
-
-A single fixed camera has an extent of 0: centres would not move, and every Gaussian would be too large. Half a metre is
-less than the extent of a ring of cameras around a head, and more than the head.
-"""
-_MAX_RARITY, _MAX_NEIGHBOR = 2.0, 100
 
 
 class Frame(NamedTuple):
@@ -96,7 +89,7 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
 
 
 def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
-    """The extent of the cameras that some frames were seen by, in metres, and at least `MIN_EXTENT`.
+    """The extent of the cameras that some frames were seen by, in metres, and at least `FOOTAGE.least_extent`.
 
     It is 1.1 x the largest distance of a camera from the mean of all cameras (3D Gaussian Splatting, published code).
     Each camera of each sequence counts once.
@@ -104,7 +97,7 @@ def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
     seen = sorted({(frame.sequence, frame.camera) for frame in frames})
     centers = torch.stack([sequences[index].tracking.cameras[camera].position for index, camera in seen]).double()
     distances = (centers - centers.mean(0)).norm(dim=-1)
-    return max(MIN_EXTENT, _EXTENT_MARGIN * float(distances.max()))
+    return max(FOOTAGE.least_extent, FOOTAGE.extent_margin * float(distances.max()))
 
 
 def evenly_spread(items: Items[Item], max_count: int) -> list[Item]:
@@ -128,13 +121,13 @@ def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float
     """
     timesteps = sorted({(frame.sequence, frame.timestep) for frame in frames})
     expressions = torch.stack([sequences[s].tracking.face.expression[t] for s, t in timesteps]).double()
-    neighbor = min(max(1, round(len(timesteps) ** 0.5)), _MAX_NEIGHBOR, len(timesteps) - 1)
+    neighbor = min(max(1, round(len(timesteps) ** 0.5)), FOOTAGE.rarity_most_neighbors, len(timesteps) - 1)
     # In rows of bounded memory. Without matrix products, equal expressions are exactly 0 apart.
     rows = (
         torch.cdist(some, expressions, compute_mode="donot_use_mm_for_euclid_dist") for some in expressions.split(512)
     )
     distances = torch.cat([row.kthvalue(neighbor + 1, dim=1).values for row in rows])
-    rarity = (distances / distances.median().clamp_min(1e-9)).clamp(1 / _MAX_RARITY, _MAX_RARITY)
+    rarity = (distances / distances.median().clamp_min(1e-9)).clamp(1 / FOOTAGE.rarity_limit, FOOTAGE.rarity_limit)
     index = {timestep: number for number, timestep in enumerate(timesteps)}
     return rarity[[index[frame.sequence, frame.timestep] for frame in frames]]
 

@@ -11,14 +11,9 @@ from torch.nn.functional import grid_sample, normalize
 from mien.face import FaceModel, FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
+from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.sequence import Sequence, composite
-
-_MAX_FRAMES = 60
-"""Number of training frames, evenly spread, for the mean vertex colours. More frames make no visible difference."""
-_DEPTH_TOLERANCE = 0.004
-"""Depth in metres behind the depth picture up to which a vertex still counts as visible."""
-_SMOOTHING_ROUNDS = 200
 
 
 @torch.no_grad()
@@ -48,7 +43,7 @@ def vertex_colors(
         vertices = face_model(faces[frame.sequence][frame.timestep])[0]
         return _seen_colors(sequences[frame.sequence], frame, vertices, face_model.faces)
 
-    for seen, weight in stream_in_threads(seen_in, spread_frames(frames, _MAX_FRAMES), threads):
+    for seen, weight in stream_in_threads(seen_in, spread_frames(frames, FOOTAGE.color_frames), threads):
         colors += weight[:, None] * seen
         weights += weight
     known = weights > 1e-3
@@ -76,7 +71,7 @@ def _seen_colors(
     to_camera = normalize(camera.position - vertices, dim=-1)
     facing = (vertex_normals(vertices, faces) * to_camera).sum(-1).clamp_min(0)
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
-    seen = inside & (depth < front + _DEPTH_TOLERANCE) & (alpha[:, 0] > 0.9)
+    seen = inside & (depth < front + FOOTAGE.depth_tolerance) & (alpha[:, 0] > 0.9)
     return colors, torch.where(seen, facing**2, torch.zeros_like(facing))
 
 
@@ -87,9 +82,7 @@ def sample_picture(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], 
     return values[0, :, 0].T
 
 
-def _spread(
-    colors: Float[Tensor, "v 3"], known: Tensor, faces: Int[Tensor, "f 3"], rounds: int = _SMOOTHING_ROUNDS
-) -> Float[Tensor, "v 3"]:
+def _spread(colors: Float[Tensor, "v 3"], known: Tensor, faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
     """The colours with unknown ones replaced by a smooth continuation of the known ones along the mesh's edges."""
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long()
     edges = torch.cat([edges, edges.flip(1)])
@@ -97,7 +90,7 @@ def _spread(
     degree = torch.zeros(len(colors)).index_add(0, edges[:, 0], torch.ones(len(edges))).clamp_min(1)
     unknown = torch.zeros(len(colors), dtype=torch.bool)
     unknown[edges[:, 0]] = True
-    for _ in range(rounds):
+    for _ in range(FOOTAGE.color_spread_rounds):
         means = torch.zeros_like(colors).index_add(0, edges[:, 0], colors[edges[:, 1]]) / degree[:, None]
         colors = torch.where(unknown[:, None], means, colors)
     return colors

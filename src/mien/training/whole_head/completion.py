@@ -14,17 +14,8 @@ from mien.face import FaceModel, mirror_triangles
 from mien.face.head_parts import HeadParts, head_parts, mouth_colors
 from mien.face.mirror import triangle_geometry
 from mien.render.mesh import shade
+from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.spreading import Surface
-
-_COLOR_SPREAD = 0.12
-"""Distance between colours (0..1) over which a colour stops counting as skin or as hair."""
-_TINT_SPREAD, _LIGHT_SPREAD = 0.06, 0.25
-"""The same for colours of equal brightness, and for the logarithm of their brightness beyond half or twice."""
-_DIFFERENT = 0.10
-"""Distance between the medians of skin and hair from which their colours can be told apart."""
-_LARGEST_OFFSET = 0.25
-"""Largest difference of brightness between a triangle and its mirror image that counts as light."""
-_LEAST_LIGHT = 0.1
 
 
 def complete_colors(
@@ -95,7 +86,7 @@ def _shading(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], light: Float[Tensor, "9 3"]
 ) -> Float[Tensor, "f 3"]:
     normals = triangle_geometry(vertices, faces)[2]
-    shading = shade(normals, light.detach().to(vertices)).clamp_min(_LEAST_LIGHT)
+    shading = shade(normals, light.detach().to(vertices)).clamp_min(WHOLE_HEAD.least_light)
     return torch.where(shading.isfinite(), shading, 1.0)
 
 
@@ -121,22 +112,22 @@ def _trust(
     skin_like = _close_but_for_light(colors, skin)
     trust = torch.where(parts.skin, skin_like, trust)
     trust = torch.where(parts.neck, skin_like if hair is None else torch.maximum(skin_like, hair_like), trust)
-    if hair is not None and float((skin - hair).norm()) > _DIFFERENT:
+    if hair is not None and float((skin - hair).norm()) > WHOLE_HEAD.different_colors:
         trust = torch.where(parts.scalp, hair_like / (hair_like + _close(colors, skin) + 1e-3), trust)
     return trust
 
 
 def _close(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
     """Return how close colours are to one colour, 0..1."""
-    return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / _COLOR_SPREAD**2)
+    return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / WHOLE_HEAD.color_spread**2)
 
 
 def _close_but_for_light(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
     """Return how close colours are to one colour in half to twice the light, 0..1."""
     light = (colors @ color) / (color @ color).clamp_min(1e-6)
-    tint = ((colors - light[:, None] * color) ** 2).sum(1) / _TINT_SPREAD**2
+    tint = ((colors - light[:, None] * color) ** 2).sum(1) / WHOLE_HEAD.tint_spread**2
     beyond = (light.clamp_min(1e-3).log().abs() - math.log(2)).clamp_min(0)
-    return torch.exp(-0.5 * (tint + (beyond / _LIGHT_SPREAD) ** 2))
+    return torch.exp(-0.5 * (tint + (beyond / WHOLE_HEAD.light_spread) ** 2))
 
 
 def _spread_by_part(
@@ -165,7 +156,7 @@ def _mirrored(
     images = mirror_triangles(face_model)
     has, image = images >= 0, images.clamp_min(0)
     both = torch.where(has, known * known[image], 0.0)
-    offset = (albedo - albedo[image]).clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
+    offset = (albedo - albedo[image]).clamp(-WHOLE_HEAD.largest_offset, WHOLE_HEAD.largest_offset)
     offset = torch.where((both > 0.05)[:, None], offset, 0.0)
     return albedo[image] + mesh.spread(offset, both, torch.ones_like(has)), torch.where(has, seen[image], 0.0)
 
@@ -174,13 +165,13 @@ def _noise(
     parts: HeadParts, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
 ) -> Float[Tensor, "f 3"]:
     """Return the seen triangles' differences from their neighbours, dealt out to all triangles of their part."""
-    noise = torch.zeros_like(albedo)
+    noise, most = torch.zeros_like(albedo), WHOLE_HEAD.largest_offset
     random = torch.Generator().manual_seed(0)
     for part in (parts.scalp, parts.skin | parts.neck):
         sources = (part & (known > 0.8)).nonzero()[:, 0]
         targets = part.nonzero()[:, 0]
         if len(sources):
-            detail = (albedo - mesh.around(albedo, known * part))[sources].clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
+            detail = (albedo - mesh.around(albedo, known * part))[sources].clamp(-most, most)
             noise[targets] = detail[torch.randint(len(sources), (len(targets),), generator=random)]
     return noise
 

@@ -14,30 +14,8 @@ from mien.face.mirror import triangle_geometry
 from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.training.footage import Frame, Sequence, spread_frames
+from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.spreading import Surface
-
-_MAX_FRAMES = 60
-_STEP, HIGHEST = 0.002, 0.08
-"""Distance between the points that are tested above the scalp, and the largest height that counts, in metres."""
-_GRAZING = 0.4
-"""Cosine between a triangle's normal and the direction to the camera up to which the outline tells its height."""
-_CLEAR = 0.008
-"""Height in metres at which nothing of the mesh may be behind or in front of a triangle at the outline."""
-_QUANTILE = 0.3
-"""Share of the measured heights below the one that counts. Single strands and other things behind make some higher."""
-_SAME_HAIR = 1.3
-"""Largest height where nothing was measured, as a multiple of the median height on top of the head."""
-_SLOPE, _NEAR = 0.12, 0.03
-"""Difference of slope (the upward part of a normal) and distance in metres, within which measured heights count alike
-for what is never measured."""
-_AT_HAIRLINE, _RISE = 0.004, 0.4
-"""Largest height in metres at the hairline where nothing was measured, and how much it grows per metre from skin."""
-_SMOOTHING_ROUNDS = 2
-"""Rings of triangles over which heights are averaged. More would flatten the hair on top."""
-_FADING_ROUNDS = 2
-"""Rings of triangles over which the height fades at the hairline."""
-_NEAR_ROUNDS = 4
-"""Rings of triangles around an outline that hanging hair may cover too."""
 
 
 @torch.no_grad()
@@ -69,16 +47,17 @@ def hair_height(
         return height[:, 0]
     vertices = face_model.rest_vertices(faces[0])
     surface, upward = Surface.of(vertices, face_model.faces), triangle_geometry(vertices, face_model.faces)[2][:, 1]
-    guess = _by_slope(surface, upward, height, known, scalp).clamp_max(_SAME_HAIR * _on_top(surface, height, known))
+    most = WHOLE_HEAD.hair_guess_limit * _on_top(surface, height, known)
+    guess = _by_slope(surface, upward, height, known, scalp).clamp_max(most)
     guess[scalp, 0] = guess[scalp, 0].minimum(_behind_hairline(surface, scalp, parts.skin))
     height = torch.lerp(guess, height, known[:, None])
     inside = scalp.to(height)
-    for _ in range(_SMOOTHING_ROUNDS):
+    for _ in range(WHOLE_HEAD.hair_smoothing_rounds):
         height = surface.around(height, inside) * inside[:, None]
     share = inside[:, None]
-    for _ in range(_FADING_ROUNDS):
+    for _ in range(WHOLE_HEAD.hairline_fading_rounds):
         share = torch.minimum(share, surface.around(share, torch.ones_like(known))) * inside[:, None]
-    return (height * share)[:, 0].clamp(0, HIGHEST)
+    return (height * share)[:, 0].clamp(0, WHOLE_HEAD.hair_highest)
 
 
 @torch.no_grad()
@@ -100,10 +79,10 @@ def hanging_hair(
     if not bool(known.any()):
         return height[:, 0]
     surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
-    for _ in range(_NEAR_ROUNDS):
+    for _ in range(WHOLE_HEAD.hanging_hair_rounds):
         height = torch.maximum(height, surface.around(height, torch.ones_like(known)))
         height[~beside] = 0
-    return height[:, 0].clamp(0, HIGHEST)
+    return height[:, 0].clamp(0, WHOLE_HEAD.hair_highest)
 
 
 def _outline_heights(
@@ -121,12 +100,12 @@ def _outline_heights(
         vertices = face_model(faces[frame.sequence][frame.timestep])[0]
         return _measured(sequences[frame.sequence], frame, vertices, face_model.faces, chosen)
 
-    used = spread_frames(frames, _MAX_FRAMES)
+    used = spread_frames(frames, WHOLE_HEAD.hair_frames)
     heights = torch.stack(list(stream_in_threads(measured_in, used, threads))) if used else torch.zeros(0, len(chosen))
     height, known = torch.zeros(len(region), 1), torch.zeros(len(region))
     found = heights.isfinite().any(0)
     if bool(found.any()):
-        height[chosen[found], 0] = heights[:, found].nanquantile(_QUANTILE, dim=0)
+        height[chosen[found], 0] = heights[:, found].nanquantile(WHOLE_HEAD.hair_quantile, dim=0)
         known[chosen[found]] = heights.isfinite().sum(0)[found].clamp_max(3) / 3
     return height, known
 
@@ -152,8 +131,8 @@ def _by_slope(
     """
     targets, sources = among.nonzero()[:, 0], (known > 0).nonzero()[:, 0]
     apart = surface.middles[targets, None] - surface.middles[sources]
-    alike = torch.exp(-0.5 * ((upward[targets, None] - upward[sources]) / _SLOPE).square()) + 1e-9
-    weight = alike * known[sources] / (apart.square().sum(-1) + _NEAR**2)
+    alike = torch.exp(-0.5 * ((upward[targets, None] - upward[sources]) / WHOLE_HEAD.hair_slope).square()) + 1e-9
+    weight = alike * known[sources] / (apart.square().sum(-1) + WHOLE_HEAD.hair_slope_distance**2)
     guess = torch.zeros_like(height)
     guess[targets, 0] = (weight * height[sources, 0]).sum(1) / weight.sum(1)
     return guess
@@ -162,10 +141,10 @@ def _by_slope(
 def _behind_hairline(surface: Surface, scalp: Bool[Tensor, " f"], skin: Bool[Tensor, " f"]) -> Float[Tensor, " k"]:
     """Return the largest height of hair on each triangle of the scalp. Hair over a forehead grows out of the skin."""
     if not bool(skin.any()):
-        return surface.middles.new_full((int(scalp.sum()),), HIGHEST)
+        return surface.middles.new_full((int(scalp.sum()),), WHOLE_HEAD.hair_highest)
     from_scalp, to_skin = surface.middles[scalp], surface.middles[skin]
     apart = torch.cdist(from_scalp, to_skin, compute_mode="donot_use_mm_for_euclid_dist")
-    return _AT_HAIRLINE + _RISE * apart.amin(1)
+    return WHOLE_HEAD.hairline_height + WHOLE_HEAD.hairline_rise * apart.amin(1)
 
 
 def _measured(
@@ -177,16 +156,18 @@ def _measured(
     empty = rasterize_mesh(vertices, faces, camera).face_index < 0
     middles, _, normals = (values[chosen] for values in triangle_geometry(vertices, faces))
     cosine = (normals * normalize(camera.position - middles, dim=-1)).sum(-1)
-    steps = torch.arange(0.0, HIGHEST + _STEP / 2, _STEP)
+    step = WHOLE_HEAD.hair_step
+    steps = torch.arange(0.0, WHOLE_HEAD.hair_highest + step / 2, step)
     pixels, depth = camera.project(middles[:, None] + steps[:, None] * normals[:, None])
     grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
     inside = _sample(matte, grid) > 0.5
     framed = (grid.abs() < 1).all(-1) & (depth > 0)
-    clear = _sample(empty.float(), grid[:, round(_CLEAR / _STEP) :][:, :1])[:, 0] > 0.5
+    aside = round(WHOLE_HEAD.hair_outline_clearance / step)
+    clear = _sample(empty.float(), grid[:, aside:][:, :1])[:, 0] > 0.5
     count = inside.int().cumprod(1).sum(1)
     ends = (count < len(steps)) & framed.all(1)
-    tells = (cosine.abs() < _GRAZING) & clear & ends
-    height = _STEP * (count - 1).clamp_min(0).float()
+    tells = (cosine.abs() < WHOLE_HEAD.hair_grazing) & clear & ends
+    height = step * (count - 1).clamp_min(0).float()
     return torch.where(tells, height, torch.nan)
 
 

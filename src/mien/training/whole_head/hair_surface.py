@@ -18,20 +18,9 @@ from torch import Tensor
 from mien.avatar import Avatar, BoundSurface, SurfacePrior
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
+from mien.training.whole_head.constants import WHOLE_HEAD
 
-EVERY = 8
-"""Number of training frames from one correction to the next."""
-_BEGIN, _END = 0.03, 0.6
-"""Times of the first and the last correction, as fractions of the run. Their size falls to 0 in between."""
-_REACH = 0.012
-"""Distance in metres over which gradients are smoothed (standard deviation of a Gaussian)."""
-_SAME_SIDE = 0.3
-"""Cosine between two normals from which triangles belong to the same side of a fold."""
-_FIRST, _SECOND = 0.9, 0.98
-"""Decay of the running means of the gradient and of its square (Adam, Kingma and Ba 2015)."""
 _EPSILON = 1e-12
-_LOWEST, _FURTHEST = -0.004, 0.03
-"""Limits of the shift in metres: how far hair may sink below the scalp, and how far it may move at all."""
 
 
 @dataclass(eq=False)
@@ -59,7 +48,7 @@ class HairSurface:
             surface: The surface of the avatar.
             fraction: How far the run was before the step, 0..1.
         """
-        gradient = surface.height_gradient() if fraction < _END else None
+        gradient = surface.height_gradient() if fraction < WHOLE_HEAD.hair_end else None
         if gradient is not None:
             self.state["gradient"] += gradient[self.scalp].to(self.kernel) * self.shown
 
@@ -71,12 +60,13 @@ class HairSurface:
             fraction: How far the run is, 0..1.
             rate: Size of a first correction in metres, where all gradients agree.
         """
-        moves = rate > 0 and _BEGIN <= fraction < _END
+        begin, end, furthest = WHOLE_HEAD.hair_begin, WHOLE_HEAD.hair_end, WHOLE_HEAD.hair_furthest_shift
+        moves = rate > 0 and begin <= fraction < end
         if moves:
-            step = self._step() * rate * (_END - fraction) / (_END - _BEGIN)
+            step = self._step() * rate * (end - fraction) / (end - begin)
             before = self.state["shift"].clone()
-            lowest = _LOWEST - self.start.hair[self.scalp]
-            self.state["shift"] = (before - step).clamp(-_FURTHEST, _FURTHEST).maximum(lowest)
+            lowest = WHOLE_HEAD.hair_lowest_shift - self.start.hair[self.scalp]
+            self.state["shift"] = (before - step).clamp(-furthest, furthest).maximum(lowest)
             surface.raise_by(self._on_all(self.state["shift"] - before))
         self.state["gradient"] = torch.zeros_like(self.state["gradient"])
         return moves
@@ -98,10 +88,10 @@ class HairSurface:
         """Adam's step for the smoothed gradient, at most about 1. Neighbours share the second moment."""
         gradient, state = self.kernel @ self.state["gradient"], self.state
         state["count"] = state["count"] + 1
-        state["first"] = torch.lerp(gradient, state["first"], _FIRST)
-        state["second"] = torch.lerp(gradient.square(), state["second"], _SECOND)
-        first = state["first"] / (1 - _FIRST ** state["count"])
-        second = self.mean @ state["second"] / (1 - _SECOND ** state["count"])
+        state["first"] = torch.lerp(gradient, state["first"], WHOLE_HEAD.hair_first_decay)
+        state["second"] = torch.lerp(gradient.square(), state["second"], WHOLE_HEAD.hair_second_decay)
+        first = state["first"] / (1 - WHOLE_HEAD.hair_first_decay ** state["count"])
+        second = self.mean @ state["second"] / (1 - WHOLE_HEAD.hair_second_decay ** state["count"])
         return first / (second.sqrt() + _EPSILON)
 
     def _on_all(self, values: Float[Tensor, " k"]) -> Float[Tensor, " f"]:
@@ -122,8 +112,8 @@ def hair_surface(avatar: Avatar, prior: SurfacePrior) -> HairSurface | None:
         return None
     geometry = triangle_geometry(vertices.cpu().float(), avatar.face_model.faces.cpu())
     middles, areas, normals = (values[scalp] for values in geometry)
-    apart = torch.cdist(middles, middles, compute_mode="donot_use_mm_for_euclid_dist") / _REACH
-    kernel = torch.exp(-0.5 * apart.square()) * (apart < 3) * (normals @ normals.T > _SAME_SIDE)
+    apart = torch.cdist(middles, middles, compute_mode="donot_use_mm_for_euclid_dist") / WHOLE_HEAD.hair_reach
+    kernel = torch.exp(-0.5 * apart.square()) * (apart < 3) * (normals @ normals.T > WHOLE_HEAD.hair_same_side)
     mean = kernel * areas
     mean = mean / mean.sum(1, keepdim=True)
     scalp = scalp.to(prior.hair.device)

@@ -13,17 +13,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien.avatar import Avatar, BoundSurface, Posed
+from mien.avatar.constants import AVATAR
 from mien.face.head_parts import head_parts
 from mien.gaussians import sh_from_rgb
 from mien.training.footage import Coverage, cover_random, inside_triangles
 from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
 from mien.training.whole_head.completion import complete_colors
-
-_FURNISH_AT = 0.5
-"""Time at which an open surface inside the mouth is closed, as a fraction of the run: after the last opacity reset of
-the presets, from which surface that is hardly ever seen does not recover."""
-_OPAQUE = 0.97
-"""Opacity of this surface."""
+from mien.training.whole_head.constants import WHOLE_HEAD
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +33,8 @@ class Inside:
 
     def fill_interior(self, surface: BoundSurface, step: int, steps: int) -> None:
         """Close the surface where it is open, if this is a step of a run of `steps` at which this is due."""
-        if step == round(_FURNISH_AT * steps):
-            surface.fill_interior(self.triangles, _OPAQUE, self.colors)
+        if step == round(WHOLE_HEAD.mouth_closed_at * steps):
+            surface.fill_interior(self.triangles, AVATAR.fill_opacity, self.colors)
 
     def to(self, like: Tensor) -> "Inside":
         """The same on the device of `like`, with colours of its dtype."""

@@ -12,8 +12,9 @@ from mien.render.rendering import Rendering
 from mien.training.footage import resolved, side_random, with_shown_angles
 from mien.training.parts import Preparation, Step, TrainingPart
 from mien.training.settings import TrainSettings
+from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.contribution import prune_hidden
-from mien.training.whole_head.hair_surface import EVERY, HairSurface, hair_surface
+from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.side_views import SideViews, side_views_of
 from mien.training.whole_head.unseen import Unseen, fills_sides, moved, spare_fills, unseen_of
 
@@ -80,7 +81,7 @@ class WholeHead:
             self._surface.keep_to(self.unseen.prior)
 
     def _after_step(self, step: Step) -> None:
-        hair, surface = self.hair if step.reaches(EVERY) else None, self._surface
+        hair, surface = self.hair if step.reaches(WHOLE_HEAD.hair_every) else None, self._surface
         if hair and surface and hair.correct(surface, step.fraction_done, step.settings.hair_rate):
             self.follow_hair()
         self._prune_hidden(step)

@@ -23,24 +23,8 @@ from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import NeckParts, head_cutter
 from mien.training.whole_head.completion import vertex_means
+from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen
-
-_EVERY = 8
-"""Number of steps between two side views. Views of raised expressions take turns with those from the side."""
-_SIDE = 256
-"""Longer side of these pictures, in pixels. The completed colours are no finer."""
-_LEAST, _MOST = 45.0, 180.0
-"""Angles between which the head turns to the side, in degrees. Pictures know the outline nearer to the front better."""
-_EXPRESSION_MOST = 45.0
-"""Largest angle at which a raised expression is seen, in degrees."""
-_RAISED = 6
-"""Number of coefficients that are raised."""
-_FREE = 0.06
-"""Difference of colour (0..1) between an avatar and the completed mesh that costs nothing in raised expressions. The
-mesh knows neither hair nor pores."""
-_OUTLINE = 3.0
-"""Weight of the difference of alpha from the side against that of colours. Most errors from the side are at the
-outline."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +49,7 @@ class SideViews:
 
     def due(self, step: int) -> bool:
         """Whether a step has a side view."""
-        return self.weight > 0 and step % (_EVERY // 2) == 0
+        return self.weight > 0 and step % (WHOLE_HEAD.side_views_every // 2) == 0
 
     def loss(
         self, avatar: Avatar, face: FaceParams, camera: Camera, progress: Progress, step: int, random: torch.Generator
@@ -81,12 +65,12 @@ class SideViews:
             step: The step, which says whether the head is turned or the expression raised.
             random: Draws the angle and the coefficients.
         """
-        raised = step % _EVERY != 0
+        raised = step % WHOLE_HEAD.side_views_every != 0
         angle = _drawn_angle(raised, random)
         face = turned_to_side(face.detach(), angle)
         if raised:
             face = replace(face, expression=self._raised(face.expression, random))
-        scale = _SIDE / max(camera.width, camera.height)
+        scale = WHOLE_HEAD.side_views_size / max(camera.width, camera.height)
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         background = torch.rand(3, generator=random)
         picture, alpha, compared = self._target(face, small, background)
@@ -94,9 +78,10 @@ class SideViews:
         seen = rasterize(avatar.pose(face, progress).gaussians.timestep(0), small, background.to(like))
         difference = (seen.image - picture.to(like)).abs()
         if raised:
-            difference = (difference - _FREE).clamp_min(0) * compared.to(like)[..., None]
+            difference = (difference - WHOLE_HEAD.raised_free_difference).clamp_min(0) * compared.to(like)[..., None]
             return self.weight * difference.mean()
-        return self.weight * (difference.mean() + _OUTLINE * (seen.alpha - alpha.to(like)).abs().mean())
+        outline = WHOLE_HEAD.side_views_outline_weight * (seen.alpha - alpha.to(like)).abs().mean()
+        return self.weight * (difference.mean() + outline)
 
     @torch.no_grad()
     def _target(
@@ -116,7 +101,7 @@ class SideViews:
     def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""
         count = expression.shape[1]
-        chosen = torch.randperm(count, generator=random)[:_RAISED]
+        chosen = torch.randperm(count, generator=random)[: WHOLE_HEAD.raised_coefficients]
         values = torch.rand(len(chosen), generator=random) * self.face_model.expression_bounds[chosen, 1].float().cpu()
         result = expression.clone()
         result[0, chosen.to(expression.device)] = values.to(expression)
@@ -167,6 +152,7 @@ def turned_to_side(face: FaceParams, angle: float) -> FaceParams:
 def _drawn_angle(raised: bool, random: torch.Generator) -> float:
     """An angle to either side, in radians."""
     share, side = torch.rand(2, generator=random, dtype=torch.float64).tolist()
-    low, high = (0.0, _EXPRESSION_MOST) if raised else (_LEAST, _MOST)
+    aside = (WHOLE_HEAD.side_views_least_angle, WHOLE_HEAD.side_views_most_angle)
+    low, high = (0.0, WHOLE_HEAD.raised_most_angle) if raised else aside
     degrees = low + share * (high - low)
     return math.radians(degrees if side < 0.5 else -degrees)

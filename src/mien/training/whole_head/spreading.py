@@ -7,16 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.face.mirror import triangle_geometry
+from mien.training.whole_head.constants import WHOLE_HEAD
 
-_NEAREST = 24
-"""Number of known triangles that a value spreads from before it is smoothed."""
-_SOFT = 0.004
-"""Distance in metres within which known triangles count alike."""
-_OWN = 0.7
-"""Knowledge (0..1) from which smoothing begins with a triangle's own value."""
-_SMOOTHING_ROUNDS = 80
-_HOLD = 4.0
-"""Weight of a known value against the mean of its neighbours while values spread."""
 _CHUNK = 512
 
 
@@ -50,15 +42,15 @@ class Surface:
         if not len(sources):
             return values
         begun = values.clone()
-        targets = (among & (known < _OWN)).nonzero()[:, 0]
+        targets = (among & (known < WHOLE_HEAD.spread_own)).nonzero()[:, 0]
         for part in targets.split(_CHUNK):
             distance, index = torch.cdist(self.middles[part], self.middles[sources]).topk(
-                min(_NEAREST, len(sources)), largest=False
+                min(WHOLE_HEAD.spread_nearest, len(sources)), largest=False
             )
-            weight = known[sources[index]] / (distance**2 + _SOFT**2)
+            weight = known[sources[index]] / (distance**2 + WHOLE_HEAD.spread_softness**2)
             begun[part] = (weight[..., None] * values[sources[index]]).sum(1) / weight.sum(1, keepdim=True)
-        held, inside = _HOLD * (known * among)[:, None], among.to(values)
+        held, inside = WHOLE_HEAD.spread_hold * (known * among)[:, None], among.to(values)
         smooth = begun
-        for _ in range(_SMOOTHING_ROUNDS):
+        for _ in range(WHOLE_HEAD.spread_rounds):
             smooth = (held * values + self.around(smooth, inside)) / (held + 1)
         return torch.where(among[:, None], smooth, values)

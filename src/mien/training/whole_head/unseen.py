@@ -30,27 +30,12 @@ from mien.training.footage import (
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.completion import complete_colors
+from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
 from mien.training.whole_head.spreading import Surface
 
-_RARE = 0.02
-"""Confidence below which a triangle is made up."""
-_SIGHTS, _RARELY = 240, 0.02
-"""Number of frames in which the inside of the mouth is looked for, and the share of them that have to show it."""
-_MOVING, _WIDENING = ("lips", "eyelids", "eyes", "irises"), 3.0
-"""Regions that move most, and the factor on the limits there and inside the mouth. The tracked mesh is millimetres off
-there, and its folds are not those of the skin."""
-_NEAR = (0.008, 0.024)
-"""Distances in metres from these regions between which the factor falls to 1."""
-_STRANDS_FROM = 0.003
-"""Height of hair in metres from which made-up hair has strands."""
-_CONTRADICTION = 1e-6
-"""Gradient of a centre, in triangle units, from which pictures contradict the height of a fill. A little light shines
-through every avatar, so smaller gradients reach what is hidden."""
-
-
-_ALPHA = 0.2
-"""Least weight of the loss of alpha. Without it, white Gaussians hide fills that stand out beyond the outline."""
+_MOVING = ("lips", "eyelids", "eyes", "irises")
+"""Regions that move most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +55,7 @@ class Unseen:
         """The weights of the losses, with a loss of alpha if anything is filled."""
         if not self.fills:
             return weights
-        return replace(weights, alpha_weight=max(weights.alpha_weight, _ALPHA))
+        return replace(weights, alpha_weight=max(weights.alpha_weight, WHOLE_HEAD.fill_alpha_weight))
 
     def filled_in(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
@@ -91,7 +76,7 @@ class Unseen:
             height = gradient[:, 1].clone() if name == "means" else None
             gradient.masked_fill_(filled_in.view(-1, *[1] * (gradient.ndim - 1)), 0)
             if height is not None:
-                strong = height.sign() * (height.abs() - _CONTRADICTION).clamp_min(0)
+                strong = height.sign() * (height.abs() - WHOLE_HEAD.fill_contradiction).clamp_min(0)
                 gradient[:, 1] = torch.where(filled_in, strong, height)
         for rendering in renderings:
             if rendering.means2d_offset.grad is not None:
@@ -143,14 +128,14 @@ def unseen_of(
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
     if avatar.surface() is None:
         return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
-    filled_in = (shown < _RARE) & (found.above > 0.5)
+    filled_in = (shown < WHOLE_HEAD.unseen_confidence) & (found.above > 0.5)
     filled_in |= hidden_inside(model, parts.interior, sequences, faces, frames)
     widening = wider_where_faces_move(model, neutral, parts.interior)
     behind_head = back_hair(model, neutral, hair, hanging)
     behind = filled_in & (behind_head > hair)
     colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
     hair, hanging = torch.where(behind, behind_head, hair), torch.maximum(hanging, behind_head)
-    strands = filled_in & (parts.scalp | behind) & (hair > _STRANDS_FROM)
+    strands = filled_in & (parts.scalp | behind) & (hair > WHOLE_HEAD.strands_least_height)
     return Unseen(
         found, SurfacePrior(hair, hanging, colors, doubt, filled_in, filled_in | parts.interior, strands, widening)
     )
@@ -179,10 +164,11 @@ def wider_where_faces_move(
     """
     middles, moving = vertices[face_model.faces.long()].mean(1), face_model.region_mask(*_MOVING)
     if not bool(moving.any()):
-        return torch.where(interior, _WIDENING, 1.0)
+        return torch.where(interior, WHOLE_HEAD.moving_widening, 1.0)
     distances = torch.cdist(middles, middles[moving], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
-    near = smoothstep((_NEAR[1] - distances) / (_NEAR[1] - _NEAR[0]))
-    return 1 + (_WIDENING - 1) * torch.where(interior, 1.0, near)
+    close, far = WHOLE_HEAD.moving_near
+    near = smoothstep((far - distances) / (far - close))
+    return 1 + (WHOLE_HEAD.moving_widening - 1) * torch.where(interior, 1.0, near)
 
 
 def hidden_inside(
@@ -199,11 +185,11 @@ def hidden_inside(
         camera = sequences[frame.sequence].tracking.cameras[frame.camera]
         return interior & ~hidden_triangles(vertices, face_model, interior, camera)
 
-    looked = spread_frames(frames, _SIGHTS)
+    looked = spread_frames(frames, WHOLE_HEAD.mouth_frames)
     sights = torch.zeros(len(interior))
     for shown in stream_in_threads(shown_in, looked):
         sights += shown
-    return interior & (sights < _RARELY * len(looked))
+    return interior & (sights < WHOLE_HEAD.mouth_shown_share * len(looked))
 
 
 def moved(unseen: Unseen, like: Tensor) -> Unseen:

@@ -1,0 +1,36 @@
+"""Numbers that decide how a training goes and that no setting changes, with how each was chosen.
+
+"Not varied" means that the first value worked and no other was measured. Sub-rooms have constants of their own.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrainingConstants:
+    """The constants of this room, by the file that uses them. `benchmarks/ablate.py` measures what one is worth."""
+
+    # camera_colors.py
+    camera_colors_last_rate: float = 0.1
+    """Learning rate of the cameras' colours at the last step, as a share of that at the first. Not varied."""
+
+    # face_track.py
+    still_turns: float = 0.02
+    """Standard deviation of a head's turns at which half of what follows them is removed, in radians. Less is removed
+    of what follows smaller turns, which explain less. Not varied."""
+
+    # trainer.py
+    steady_every: int = 25
+    """Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`). Not
+    varied."""
+    representative_frames: int = 12
+    """Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for.
+    Not varied."""
+
+    # density_control/gradient.py
+    unjudged_after_reset: float = 0.03
+    """Time after a reset of opacities in which nothing is judged by its contribution, as a fraction of the run. It
+    changes nothing that one run can show (sides of 11-24). It is kept because every Gaussian is faint then."""
+
+
+TRAINING = TrainingConstants()
