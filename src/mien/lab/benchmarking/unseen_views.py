@@ -30,7 +30,8 @@ from mien.training.footage import composite, measure_coverage
 from mien.training.whole_head import complete_colors, vertex_means
 
 AVATAR, MESH = "avatar", "mesh"
-_TILE_SIDE = 160
+_TILE = 160
+"""Side of a picture on the sheet, in pixels."""
 _DEPTH_OF_MIDDLE = 0.08
 """Distance of the head's middle behind that of the face, in metres."""
 Figures = dict[str, dict[str, Any]]
@@ -209,9 +210,7 @@ def score_side_views(
         for view in track_progress(views, "unseen views", len(views)):
             job = drawn(view)
             if view.moment == len(pictures.timesteps) // 2:
-                _, images, truth, crop = job
-                tiles = (truth, images[AVATAR], images[MESH])
-                shown.append([in_white_square(crop_to(image, crop), _TILE_SIDE) for image in tiles])
+                shown.append([in_white_square(crop_to(image, job[3]), _TILE) for image in (job[2], *job[1].values())])
             yield job
 
     rows = list(stream_in_threads(score, jobs(), settings.threads or None))
