@@ -11,12 +11,13 @@ from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
-from mien.gaussians import rgb_from_sh, sh_from_rgb
+from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.training import PRESETS
 from mien.training.footage.coverage import triangle_views
 from mien.training.whole_head.contribution import contributions, prune_hidden
 from mien.training.whole_head.unseen import Unseen
+from sh_colors import rgb_from_sh
 from toy_scene import surface_of
 
 _COLOR = 0.3

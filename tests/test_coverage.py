@@ -21,7 +21,6 @@ from mien.avatar.density import GradientDensity
 from mien.errors import UserError
 from mien.export import MeshModel, read_glb, read_ply, write_glb, write_page, write_ply
 from mien.face import FaceModel
-from mien.gaussians import rgb_from_sh
 from mien.render import rasterize
 from mien.runtime.baked import Filmed
 from mien.training import Sequence, filmed_words, read_coverage, train
@@ -31,6 +30,7 @@ from mien.training.footage.filmed import FILE, filmed_yaws, view_of_head, with_s
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.whole_head.unseen import Unseen, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
+from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_face, toy_sequence
 
 SETTINGS = plain_run(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)

@@ -11,10 +11,11 @@ from mien.avatar.gaussian_avatars.avatar import (
 )
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
 from mien.face import FaceModel
-from mien.gaussians import rgb_from_sh, world_means
+from mien.gaussians import world_means
 from mien.render import rasterize
 from mien.render.rendering import Rendering
 from plain_settings import plain_gaussian_avatars
+from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_camera, toy_face, toy_face_model
 
 

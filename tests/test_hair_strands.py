@@ -7,9 +7,9 @@ from mien.avatar.gaussian_avatars.hair_strands import strand_gaussians
 from mien.avatar.ops.triangle_frames import frames_to_world, triangle_frames
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
-from mien.gaussians import rgb_from_sh
 from mien.rotation import matrix_from_quaternion
 from mien.training import PRESETS
+from sh_colors import rgb_from_sh
 from toy_scene import surface_of
 
 _HEIGHT = 0.02

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from mien.avatar import METHODS, Avatar, Progress
 from mien.face import FaceModel
-from mien.gaussians import rgb_from_sh, sh_from_rgb
+from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.training import Sequence, train
 from mien.training.density_control import density_strategy
@@ -19,6 +19,7 @@ from mien.training.footage.sequence import Targets
 from mien.training.whole_head.mouth_interior import Inside, cover_hidden, covered_reference
 from mien.training.whole_head.unseen import spare_fills, unseen_of
 from plain_settings import plain_config, plain_gaussian_avatars, plain_run
+from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_face, toy_sequence
 
 SETTINGS = plain_run(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)

@@ -18,10 +18,10 @@ from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.surface_places import at_places, random_places
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, head_poses
-from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
 from mien.training import PRESETS
 from plain_settings import plain_mono_gaussian_avatar
+from sh_colors import rgb_from_sh
 from toy_scene import toy_face, toy_face_model
 
 SMALL = plain_mono_gaussian_avatar(points=30, max_points=60, own_rate=Rate(1e-2))

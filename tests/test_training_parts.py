@@ -19,7 +19,6 @@ from mien.avatar import (
     store_group,
 )
 from mien.errors import UserError
-from mien.gaussians import rgb_from_sh
 from mien.render.rendering import Rendering
 from mien.training import held_out
 from mien.training.adam import Adam
@@ -35,6 +34,7 @@ from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
+from sh_colors import rgb_from_sh
 from toy_scene import toy_sequence
 
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Gaussians", "rgb_from_sh", "sh_from_rgb", "stack_timesteps", "world_means"]
+__all__ = ["Gaussians", "sh_from_rgb", "stack_timesteps", "world_means"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +119,3 @@ SH_C0 = 0.28209479177387814
 def sh_from_rgb(rgb: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
     """Constant SH coefficients for the colour `rgb` (0..1)."""
     return (rgb - 0.5) / SH_C0
-
-
-def rgb_from_sh(dc: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """Colours of constant SH coefficients, clamped to 0 from below as in the renderers."""
-    return torch.clamp_min(dc * SH_C0 + 0.5, 0)

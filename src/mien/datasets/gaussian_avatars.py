@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mien import export
 from mien.datasets.dataset import Dataset, TrainedAvatar
 
 if TYPE_CHECKING:
@@ -18,9 +19,7 @@ def _recognises(path: Path) -> str | None:
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> TrainedAvatar:
-    from mien.export import read_gaussian_avatars_folder
-
-    content = read_gaussian_avatars_folder(path, face_model)
+    content = export.read_gaussian_avatars_folder(path, face_model)
     return TrainedAvatar(content.avatar, content.face)
 
 

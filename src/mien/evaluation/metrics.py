@@ -1,9 +1,9 @@
-"""Image metrics: pure functions of float32 RGB images in 0..1. Arguments select the pixels that are averaged."""
+"""Image metrics: pure functions of float32 RGB images in 0..1."""
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from mien.pictures import Box
@@ -24,42 +24,24 @@ def crop_to(image: Shaped[Tensor, "h w *c"], box: Box | None) -> Shaped[Tensor, 
     return cut
 
 
-def l1(
-    image: Float[Tensor, "h w 3"],
-    target: Float[Tensor, "h w 3"],
-    box: Box | None = None,
-    mask: Bool[Tensor, "h w"] | None = None,
-) -> float:
-    """Mean absolute difference, 0..1, over the channels of the pixels in `box` that `mask` selects."""
-    return float(_mean((crop_to(image, box) - crop_to(target, box)).abs(), box, mask))
+def l1(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
+    """Mean absolute difference over all channels, 0..1."""
+    return float((image - target).abs().double().mean())
 
 
-def psnr(
-    image: Float[Tensor, "h w 3"],
-    target: Float[Tensor, "h w 3"],
-    box: Box | None = None,
-    mask: Bool[Tensor, "h w"] | None = None,
-) -> float:
+def psnr(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], box: Box | None = None) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1: -10 log10 of the mean squared difference.
 
-    The mean is over the channels of the pixels in `box` that `mask` selects. The result is at most `MAX_PSNR`. The
+    The mean is over the channels of the pixels in `box`, in double precision. The result is at most `MAX_PSNR`. The
     figure for a set of frames is the mean of the figures of its frames, as is usual in the field.
     """
-    squared = _mean((crop_to(image, box) - crop_to(target, box)) ** 2, box, mask)
+    squared = ((crop_to(image, box) - crop_to(target, box)) ** 2).double().mean()
     return float(-10 * torch.log10(squared.clamp_min(10 ** (-MAX_PSNR / 10))))
 
 
-def ssim(
-    image: Float[Tensor, "h w 3"],
-    target: Float[Tensor, "h w 3"],
-    box: Box | None = None,
-    mask: Bool[Tensor, "h w"] | None = None,
-) -> float:
-    """Structural similarity (Wang et al. 2004): the mean of `ssim_map` over channels and over `mask`.
-
-    The image is cut to the box first: windows at the box's border see zeros beyond it, not the rest of the image.
-    """
-    return float(_mean(ssim_map(crop_to(image, box), crop_to(target, box)), box, mask))
+def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
+    """Structural similarity (Wang et al. 2004): the mean of `ssim_map` over pixels and channels."""
+    return float(ssim_map(image, target).double().mean())
 
 
 def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -86,12 +68,3 @@ def _blur(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     window = np.exp(-(offsets**2) / (2 * WINDOW_SIGMA**2)).astype(image.dtype)
     window = window / window.sum()
     return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
-
-
-def _mean(values: Float[Tensor, "y x 3"], box: Box | None, mask: Bool[Tensor, "h w"] | None) -> Float[Tensor, ""]:
-    """The mean in double precision over all channels of the selected pixels."""
-    if mask is None:
-        return values.double().mean()
-    kept = crop_to(mask, box)
-    assert bool(kept.any()), "the mask is empty: there is nothing to average over"
-    return values[kept].double().mean()

@@ -44,6 +44,12 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in ("format", "version")}
 
 
+def protocol_means(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """The protocols of metrics.json without the figures of single frames."""
+    protocols = metrics["protocols"].items()
+    return {name: {key: value for key, value in entry.items() if key != "per_frame"} for name, entry in protocols}
+
+
 def read_figures(run_dir: Path) -> dict[str, Any]:
     """`read_metrics`, with a check of every figure that tables, pages and lines show.
 

@@ -213,17 +213,11 @@ def _face_model_of(folder: Path) -> FaceModel | None:
     for name in _MODEL_FILES:
         _refuse_links(folder / name)
     model = read_face_model(folder / MODEL, "copy the folder again, or export it again")
-    marks = read_landmarks(model.name, model) if _is_known(model) else {}
-    return replace(model, landmarks=marks)
-
-
-def _is_known(model: FaceModel) -> bool:
-    """Whether the landmarks of the model's name are for its mesh."""
     try:
-        read_landmarks(model.name, model)
-    except UserError:
-        return False
-    return True
+        marks = read_landmarks(model.name, model)
+    except UserError:  # there are none of the model's name, or they are for another mesh
+        marks = {}
+    return replace(model, landmarks=marks)
 
 
 def _refuse_links(path: Path) -> None:

@@ -18,6 +18,7 @@ from mien.driving.motion import ARKIT_NAMES, gaze_of, within_lids
 from mien.errors import UserError
 from mien.export.glb_avatar import EXTENSION, avatar_extension
 from mien.export.glb_file import INDICES, VERTICES, GlbWriter
+from mien.export.splats import unit_quats
 from mien.export.texture import FRONT_VIEWS, Shot, Surface, bake_texture
 from mien.files import check_writable
 from mien.picture_files import encode_picture
@@ -268,14 +269,12 @@ def _add_texture(writer: GlbWriter, content: dict[str, Any], texture: Float32[np
 
 def _add_splats(writer: GlbWriter, content: dict[str, Any], avatar: PortableAvatar, gaussians: Gaussians) -> None:
     """Add the Gaussians at rest as a second mesh, with a node of its own as the last one."""
-    lengths = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
-    unit = np.where(lengths > 1e-12, gaussians.quats / np.maximum(lengths, 1e-12), (1.0, 0.0, 0.0, 0.0))
     linear = _linear(np.clip(0.5 + SH_C0 * gaussians.sh[:, 0], 0, 1))
     shown = np.concatenate([linear, gaussians.opacities[:, None]], axis=1)
     attributes = {
         "POSITION": writer.accessor(gaussians.means, VERTICES, bounds=True),
         "COLOR_0": writer.accessor((shown * 255 + 0.5).astype(np.uint8), VERTICES, normalized=True),
-        f"{_SPLATS}:ROTATION": writer.accessor(unit[:, [1, 2, 3, 0]].astype(np.float32), VERTICES),
+        f"{_SPLATS}:ROTATION": writer.accessor(unit_quats(gaussians.quats)[:, [1, 2, 3, 0]], VERTICES),
         f"{_SPLATS}:SCALE": writer.accessor(gaussians.scales, VERTICES),
         f"{_SPLATS}:OPACITY": writer.accessor(gaussians.opacities, VERTICES),
     }

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from mien import export
 from mien.formats.format import Content, Format, Options
 
 _EVERY = "GaussianAvatars' folder holds every timestep; leave --set, --series and --every out"
@@ -12,10 +13,8 @@ _OWN_MODEL = (
 
 
 def _write(path: Path, content: Content, options: Options) -> str:
-    from mien.export import write_gaussian_avatars_folder
-
     avatar, face = content.trained()
-    write_gaussian_avatars_folder(path, avatar, face)
+    export.write_gaussian_avatars_folder(path, avatar, face)
     note = "" if avatar.face_model.flame_origin is not None else _OWN_MODEL.format(name=avatar.face_model.name)
     return f"{content.count:,} Gaussians, {len(face)} timesteps{note}"
 

@@ -1,25 +1,14 @@
 """The .ply file: Gaussians in one pose (docs/splat_files.md)."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from mien import export
 from mien.formats.format import Content, Format, Options
-
-if TYPE_CHECKING:
-    from mien.gaussians import Gaussians
 
 
 def _write(path: Path, content: Content, options: Options) -> str:
-    from mien.export import write_ply
-
-    write_ply(path, content.pose(), options.sh)
+    export.write_ply(path, content.pose(), options.sh)
     return f"{content.count:,} Gaussians"
 
 
-def _read(path: Path) -> "Gaussians":
-    from mien.export import read_ply
-
-    return read_ply(path)
-
-
-PLY = Format("ply", "pose", _write, (".ply",), _read, options=frozenset({"sh"}))
+PLY = Format("ply", "pose", _write, (".ply",), lambda path: export.read_ply(path), options=frozenset({"sh"}))

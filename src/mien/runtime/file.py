@@ -23,7 +23,6 @@ from mien.runtime.baked import PortableAvatar
 from mien.runtime.checks import check
 
 FORMAT, VERSION = "mien.baked", 1
-ENDING = ".mien"
 _MAX_BYTES = 1 << 29
 """Largest file that is read, in bytes. The largest that mien writes has some tens of megabytes."""
 _REMEDY = "write one with `mien export DIR --out me.mien`"

@@ -16,6 +16,7 @@ from mien.commands.stages.quality import (
 )
 from mien.commands.stages.training import run_training_stage
 from mien.errors import UserError
+from mien.evaluation.metrics_file import protocol_means
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table
@@ -142,14 +143,10 @@ def _row(subject: _Subject, method: str, settings: CompareSettings, out: Path) -
     run_training_stage(workspace, subject.sequences, run, config, own)
     metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
     summary = read_training_summary(run_dir)
-    protocols = {
-        name: {key: value for key, value in entry.items() if key != "per_frame"}
-        for name, entry in metrics["protocols"].items()
-    }
     size = sum(path.stat().st_size for path in (run_dir / "avatar").rglob("*") if path.is_file())
     return MethodRow(
-        subject.name, method, run, summary["steps"], summary["seconds"], summary["gaussians"], size, protocols,
-        _unseen(subject, run),
+        subject.name, method, run, summary["steps"], summary["seconds"], summary["gaussians"], size,
+        protocol_means(metrics), _unseen(subject, run),
     )  # fmt: skip
 
 

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
@@ -23,12 +22,19 @@ from mien.evaluation import read_metrics
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
+from mien.evaluation.metrics_file import protocol_means
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face import load_face_model
 from mien.inside import remove_tree
 from mien.lab.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
-from mien.lab.benchmarking.unseen_views import Figures, SidePictures, score_side_views, write_unseen_chart
+from mien.lab.benchmarking.unseen_views import (
+    Figures,
+    SidePictures,
+    in_white_square,
+    score_side_views,
+    write_unseen_chart,
+)
 from mien.lab.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
 from mien.locks import WAIT, hold
 from mien.picture_files import write_png
@@ -37,6 +43,7 @@ from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.terminal import show
 from mien.tracking import Tracking, TrackingSettings, make_scoring, read_tracking, write_scoring, write_tracking
 from mien.training import PRESETS, TrainSettings, read_training_summary
+from mien.training.footage import Frame
 from mien.workspace import Workspace
 
 _FORMAT, _VERSION = "mien.bench_quality", 1
@@ -93,10 +100,6 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
         metrics = read_metrics(workspace.run_dir(run)) if scored else run_evaluation_stage(workspace, run, _SCORED)
     errors = {name: _errors(workspace, drawn, name) for name in trackings}
     summary = read_training_summary(workspace.run_dir(run))
-    protocols = {
-        name: {key: value for key, value in entry.items() if key != "per_frame"}
-        for name, entry in metrics["protocols"].items()
-    }
     with times.measured("views"):
         unseen = score_unseen_views(reference, drawn, workspace, run)
     by_truth: Figures = {}
@@ -106,7 +109,16 @@ def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: in
             run_training_stage(true, list(trackings), run, PRESETS["standard"].config(method), settings)
             by_truth = score_unseen_views(reference, drawn, true, run)
     row = QualityRow(
-        reference.name, key, method, steps, summary["gaussians"], protocols, errors, times.seconds, unseen, by_truth
+        reference.name,
+        key,
+        method,
+        steps,
+        summary["gaussians"],
+        protocol_means(metrics),
+        errors,
+        times.seconds,
+        unseen,
+        by_truth,
     )
     return row, _strip(workspace, run)
 
@@ -221,20 +233,11 @@ def _strip(workspace: Workspace, run: str) -> np.ndarray:
     # Choose at random: evenly spread frames of several cameras could show one camera again and again.
     places = np.random.default_rng(0).choice(len(frames), _SHEET_FRAMES, replace=len(frames) < _SHEET_FRAMES)
     chosen = [frames[index] for index in np.sort(places)]
-    rows = [
-        np.concatenate(
-            [_small(crop_to(draw(experiment, frame), experiment.crop(frame)).numpy()) for frame in chosen], 1
-        )
+
+    def tile(picture: torch.Tensor, frame: Frame) -> np.ndarray:
+        return in_white_square(crop_to(picture, experiment.crop(frame)), _SHEET_SIDE)
+
+    return np.concatenate([
+        np.concatenate([tile(draw(experiment, frame), frame) for frame in chosen], 1)
         for draw in (target_image, avatar_image)
-    ]
-    return np.concatenate(rows)
-
-
-def _small(image: np.ndarray) -> np.ndarray:
-    """The picture scaled into a white square."""
-    scale = _SHEET_SIDE / max(image.shape[:2])
-    size = tuple(max(1, round(side * scale)) for side in image.shape[1::-1])
-    scaled = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    square = np.full((_SHEET_SIDE, _SHEET_SIDE, 3), 255, np.uint8)
-    square[: size[1], : size[0]] = np.clip(np.rint(scaled * 255), 0, 255).astype(np.uint8)
-    return square
+    ])  # fmt: skip

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from mien.pictures import WHITE, picture_grid
 from mien.render.camera_paths import orbit
 from mien.runtime.baked import Filmed
 
-SheetKind = Literal["expressions", "filmed", "turntable"]
 TURNTABLE_TILES = 9
 """Number of angles on a sheet of a turntable."""
 MAX_TILES = 120

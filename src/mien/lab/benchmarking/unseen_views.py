@@ -6,9 +6,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mien.camera import Camera
@@ -29,6 +30,8 @@ from mien.training.footage import composite, measure_coverage
 from mien.training.whole_head import complete_colors, vertex_means
 
 AVATAR, MESH = "avatar", "mesh"
+_TILE = 160
+"""Side of a picture on the sheet, in pixels."""
 _DEPTH_OF_MIDDLE = 0.08
 """Distance of the head's middle behind that of the face, in metres."""
 Figures = dict[str, dict[str, Any]]
@@ -207,7 +210,7 @@ def score_side_views(
         for view in track_progress(views, "unseen views", len(views)):
             job = drawn(view)
             if view.moment == len(pictures.timesteps) // 2:
-                shown.append([_tile(crop_to(image, job[3])) for image in (job[2], job[1][AVATAR], job[1][MESH])])
+                shown.append([in_white_square(crop_to(image, job[3]), _TILE) for image in (job[2], *job[1].values())])
             yield job
 
     rows = list(stream_in_threads(score, jobs(), settings.threads or None))
@@ -254,10 +257,8 @@ def _judged(moments: int, count: int) -> set[int]:
     return set(range(0, moments, max(1, -(-moments // count)) if count else 1))
 
 
-def _tile(image: Tensor, side: int = 160) -> np.ndarray:
-    """The picture scaled into a white square."""
-    import cv2
-
+def in_white_square(image: Float[Tensor, "h w 3"], side: int) -> UInt8[np.ndarray, "s s 3"]:
+    """The picture in 8 bits, scaled into a white square of `side` pixels."""
     scale = side / max(image.shape[:2])
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     square = np.full((side, side, 3), 255, np.uint8)

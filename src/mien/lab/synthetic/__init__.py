@@ -9,11 +9,10 @@ The order of the files:
 - `painter` draws the posed person with the materials of `shading` in the light of `light`. `arithmetic` has the noise
   and the ramps of all of these.
 - `scene` joins them into frames; `captures` writes whole captures; `truth` stores what is known exactly.
-- `signature` compares what two machines drew. `detector_calibration` measures a landmark detector on drawn people.
+- `detector_calibration` measures a landmark detector on drawn people.
 """
 
 from mien.lab.synthetic.captures import (
-    read_synthetic_hash,
     synthesize,
     write_synthetic_capture,
     write_synthetic_video,
@@ -33,7 +32,6 @@ __all__ = [
     "SyntheticRecipe",
     "SyntheticScene",
     "Truth",
-    "read_synthetic_hash",
     "read_truth",
     "reference_named",
     "synthesize",

@@ -93,24 +93,13 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
     return scene_key(scene)
 
 
-def read_synthetic_hash(folder: Path) -> str:
-    """Return the hash over the bytes of a drawn capture: all pictures, mattes and the truth.
-
-    It is the same for the same key on the same machine. Another processor may draw a pixel one grey level differently.
-
-    Raises:
-        UserError: there is no drawn capture, or it is not complete.
-    """
-    return str(read_json(folder / _JSON, FORMAT, VERSION).get("content_hash"))
-
-
 def scene_key(scene: SyntheticScene) -> str:
     """Return the key that is quoted with figures on a capture.
 
     It is 16 hex digits over recipe, seeds, face model and drawing version.
 
     It is known before anything is drawn, and is the same on every machine, since it depends on no computed numbers.
-    `mien.lab.synthetic.signature` checks whether two machines draw the same under one key.
+    `tests/reference_signatures.py` checks whether two machines draw the same under one key.
     """
     marks = scene.model.landmarks["mediapipe"]  # as read from disk; they place paint and strands
     content = {
@@ -137,27 +126,6 @@ def inputs_hash(scene: SyntheticScene) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def hash_scene(scene: SyntheticScene) -> str:
-    """Return the hash over the bytes of a scene, drawn in memory; for small scenes."""
-    pictures = _Hasher(scene)
-    for frames in scene.all_frames(range(scene.timesteps)):
-        pictures.add(np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
-    return pictures.finish(scene)
-
-
-class _Hasher:
-    def __init__(self, scene: SyntheticScene) -> None:
-        self._digest = hashlib.sha256(repr((scene.timesteps, scene.recipe.camera_ids)).encode())
-
-    def add(self, images: np.ndarray, mattes: np.ndarray) -> None:
-        self._digest.update(images.tobytes())
-        self._digest.update(mattes.tobytes())
-
-    def finish(self, scene: SyntheticScene) -> str:
-        hash_surface(self._digest, scene)
-        return self._digest.hexdigest()[:16]
-
-
 def _is_current(folder: Path, inputs: str) -> bool:
     try:
         return read_json(folder / _JSON, FORMAT, VERSION).get("inputs") == inputs
@@ -171,10 +139,7 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     store.resume(inputs)
     _draw_missing(scene, store, inputs)
     images, mattes = store.maps()
-    pictures = _Hasher(scene)
-    for timestep in range(scene.timesteps):
-        pictures.add(images[timestep], mattes[timestep])
-    content_hash = pictures.finish(scene)
+    content_hash = _hash_content(scene, images, mattes)
     recipe = scene.recipe
     if recipe.cameras == "front":
         write_video(folder / VIDEO_NAME, (frame[0] for frame in images), recipe.fps, recipe.detail.compression)
@@ -197,6 +162,19 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     del images, mattes
     remove_tree(folder / _WORK)
     return content_hash
+
+
+def _hash_content(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray) -> str:
+    """A hash over the bytes of all pictures and mattes, and of the truth.
+
+    It is the same for the same key on the same machine. Another processor may draw a pixel one grey level differently.
+    """
+    digest = hashlib.sha256(repr((scene.timesteps, scene.recipe.camera_ids)).encode())
+    for timestep in range(scene.timesteps):
+        digest.update(images[timestep].tobytes())
+        digest.update(mattes[timestep].tobytes())
+    hash_surface(digest, scene)
+    return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True)
