@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.tracking.constants import TRACKING
 from mien.tracking.settings import LandmarkSet
 
 LANDMARKS = 478
@@ -42,13 +43,17 @@ IBUG68 = (
 _CONTOUR = 17
 """Number of points of `IBUG68` on the contour; they come first."""
 
-_WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 5.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
-
 
 def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:
     """Weight of each landmark in a fit. It is 0 for landmarks outside the set, and the mean is 1."""
-    weights = torch.ones(LANDMARKS, dtype=torch.float64)
-    for group, weight in _WEIGHTS:
+    weights, known = torch.ones(LANDMARKS, dtype=torch.float64), TRACKING.landmarks
+    for group, weight in (
+        (OVAL, known.oval_weight),
+        (NOSE, known.nose_weight),
+        (LIPS, known.lips_weight),
+        (LEFT_EYELIDS + RIGHT_EYELIDS, known.eyelids_weight),
+        (LEFT_IRIS + RIGHT_IRIS, known.irises_weight),
+    ):
         weights[list(group)] = weight
     if landmarks == "ibug51":
         left_out = torch.ones(LANDMARKS, dtype=torch.bool)
