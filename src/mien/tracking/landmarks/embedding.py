@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
+from mien.capture.faces import LANDMARKS
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, Landmarks
@@ -21,7 +22,7 @@ from mien.progress import track_progress
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform
 from mien.tracking.constants import TRACKING
-from mien.tracking.landmarks.groups import IBUG68, LANDMARKS, LEFT_IRIS, RIGHT_IRIS
+from mien.tracking.landmarks.groups import IBUG68, LEFT_IRIS, RIGHT_IRIS
 
 _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "ears")
 _EYE_REGIONS = ("eyes", "irises")

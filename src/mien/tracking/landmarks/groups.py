@@ -4,11 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.capture.faces import LANDMARKS
 from mien.tracking.constants import TRACKING
 from mien.tracking.settings import LandmarkSet
-
-LANDMARKS = 478
-"""Number of landmarks: 468 of the face mesh and 5 of each iris."""
 
 OVAL = (
     10, 21, 54, 58, 67, 93, 103, 109, 127, 132, 136, 148, 149, 150, 152, 162, 172, 176, 234, 251, 284, 288, 297, 323,
