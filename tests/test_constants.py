@@ -10,7 +10,7 @@ import pytest
 
 import mien
 from mien.capture.constants import CAPTURE
-from mien.config import field_docs
+from mien.commands.help_text import field_docs
 from mien.driving.constants import DRIVING
 from mien.face.constants import FACE
 from mien.tracking.constants import TRACKING

@@ -15,7 +15,6 @@ REGIONS = (
 )  # fmt: skip
 """Region names. `skin` is the rest of the face, `eyes` the white of both eyeballs; `irises` includes the pupils."""
 
-BODY_PARTS = ("head", "neck", "mouth", "sockets")
 HELPERS = {
     "helper-l-eye": "left_eye",
     "helper-r-eye": "right_eye",

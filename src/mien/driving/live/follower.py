@@ -178,13 +178,12 @@ class Follower:
 
     def _new_smoothing(self) -> OneEuro:
         kinds = ["head"] * 3 + ["place"] * 3 + [_kind(name) for name in self._fit.names]
-        known = DRIVING
         cutoffs = {
-            "head": known.head_cutoff,
-            "place": known.place_cutoff,
-            "eye": known.eye_cutoff,
-            "mouth": known.mouth_cutoff,
-            "other": known.other_cutoff,
+            "head": DRIVING.head_cutoff,
+            "place": DRIVING.place_cutoff,
+            "eye": DRIVING.eye_cutoff,
+            "mouth": DRIVING.mouth_cutoff,
+            "other": DRIVING.other_cutoff,
         }
         cutoff, beta = np.array([cutoffs[kind] for kind in kinds]).T
         return OneEuro(cutoff, beta)

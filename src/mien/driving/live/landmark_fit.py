@@ -23,7 +23,7 @@ from mien.tracking.landmarks import EYE_CORNERS, NOSE, landmark_weights, read_re
 _OPENCV = np.diag([1.0, -1.0, -1.0])
 _DAMPING = 1e-6
 _LIMITED = ("jaw", "brow", "mouthSmile", "mouthPucker", "mouthFunnel")
-"""Beginnings of coefficients whose large values are motion. Those of all others always count as the person's shape."""
+"""Beginnings of coefficients that count as motion if they are large. All others but gazes are taken as shape."""
 _NEAR, _FAR = 0.1, 10.0
 """Bounds of the distance of a head, in metres."""
 
@@ -135,10 +135,9 @@ class LandmarkFit:
             fits.append(self(landmarks, width, height).coefficients)
         middle = torch.from_numpy(np.median(fits, axis=0))
         moved = torch.zeros_like(middle)
-        known = DRIVING
         for limits, starts in (
-            (known.live_expression_limits, _LIMITED),
-            (known.live_gaze_limits, ("left_eye", "right_eye")),
+            (DRIVING.live_expression_limits, _LIMITED),
+            (DRIVING.live_gaze_limits, ("left_eye", "right_eye")),
         ):
             ours = torch.tensor([name.startswith(starts) for name in self.names])
             moved = torch.where(ours, middle * (1 - kept_share(middle.abs(), limits)), moved)
