@@ -5,9 +5,6 @@ The log is docs/log.md, "Driving". "Not varied" means that the first value worke
 
 from dataclasses import dataclass
 
-Limits = tuple[float, float]
-"""Sizes up to which something belongs to the person, and from which on it is motion (`mien.driving.rest`)."""
-
 
 @dataclass(frozen=True)
 class DrivingConstants:
@@ -48,11 +45,11 @@ class DrivingConstants:
     11-23)."""
     live_first_steps: int = 12
     """Gauss-Newton steps from a face that looks ahead. Not varied."""
-    live_expression_limits: Limits = (0.4, 0.7)
+    live_expression_limits: tuple[float, float] = (0.4, 0.7)
     """Limits of the coefficients of jaw, brows, smiles and rounded lips of the face at rest. They are wider than those
     of a tracking, because the person's shape is unknown: in clips of seven people, medians of the fit are up to 0.34.
     For lids and other lips they are up to 0.9, so their part is always taken as shape."""
-    live_gaze_limits: Limits = (0.35, 0.5)
+    live_gaze_limits: tuple[float, float] = (0.35, 0.5)
     """The same of the angles of eyes, in radians. In clips of seven people, medians are up to 0.24."""
 
     # live/one_euro.py
@@ -72,16 +69,16 @@ class DrivingConstants:
     """Length of the beginning that --neutral first takes, in seconds. Not varied."""
 
     # rest.py
-    rest_expression: Limits = (0.3, 0.6)
+    rest_expression: tuple[float, float] = (0.3, 0.6)
     """Limits of a coefficient of ARKit: up to the first it belongs to the person, from the second on it is motion.
     Measured: calm tenths of nine real sequences have 0.22 at most, of ten drawn ones 0.28 (log, 11-25)."""
-    rest_head: Limits = (0.524, 0.785)
+    rest_head: tuple[float, float] = (0.524, 0.785)
     """The same for the angle between the head and the direction to the camera, in radians: 30 and 45 degrees. A camera
     aside is common, so these limits are wide. Measured: 18 degrees at most, 26 on drawn people."""
-    rest_gaze: Limits = (0.262, 0.384)
+    rest_gaze: tuple[float, float] = (0.262, 0.384)
     """The same for the angle of the gaze, in radians: 15 and 22 degrees. Eyes that look ahead or into the camera are at
     rest however the head is turned. Measured: 11 degrees at most, 12 on drawn people."""
-    rest_jaw: Limits = (0.12, 0.24)
+    rest_jaw: tuple[float, float] = (0.12, 0.24)
     """The same for a jaw that is a joint, in radians. Not varied."""
     rest_sigmas_of_one: float = 5.0
     """Standard deviations of a face model's coefficient that count as 1 of ARKit, so that the limits are 1.5 and 3. Not

@@ -16,11 +16,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.driving.constants import DRIVING, Limits
+from mien.driving.constants import DRIVING
 from mien.face import FaceModel, FaceParams
 from mien.face.params import most_frontal_camera
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
+Limits = tuple[float, float]
 _OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
 
