@@ -12,8 +12,9 @@ from mien.capture import read_capture_hash, write_capture
 from mien.commands.options import check_neutral
 from mien.commands.stages.driving import open_driver
 from mien.driving import drive, facing, rest_of, with_neutral
+from mien.driving.constants import DRIVING
 from mien.driving.drivers import Driver
-from mien.driving.rest import EXPRESSION, GAZE, HEAD, kept_share
+from mien.driving.rest import kept_share
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -119,7 +120,7 @@ def test_who_rests_is_transferred_as_before() -> None:
 
 
 def test_motion_grows_without_a_jump() -> None:
-    for limits in (EXPRESSION, HEAD, GAZE):
+    for limits in (DRIVING.rest_expression, DRIVING.rest_head, DRIVING.rest_gaze):
         sizes = torch.linspace(0, 2 * limits[1], 2001)
         moved = sizes * (1 - kept_share(sizes, limits))
         assert (moved.diff() >= 0).all()

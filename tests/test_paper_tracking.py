@@ -9,6 +9,7 @@ import torch
 
 from mien.adam import Moments
 from mien.tracking import Tracking, TrackingSettings, track, track_subject
+from mien.tracking.constants import TRACKING
 from mien.tracking.descent import epochs
 from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent
@@ -61,7 +62,8 @@ def test_it_says_how_it_was_made(by_descent):
 
 def test_the_same_with_any_number_of_threads(case, monkeypatch):
     """The number of threads does not change a bit."""
-    monkeypatch.setattr(epochs, "_BATCHES", 2)  # this way a batch has several frames
+    several_frames = replace(TRACKING.descent, most_batches=2)
+    monkeypatch.setattr(epochs, "TRACKING", replace(TRACKING, descent=several_frames))
     short, runs = replace(QUICK, epochs=1), []
     for threads in ("1", "2"):
         monkeypatch.setenv("MIEN_THREADS", threads)

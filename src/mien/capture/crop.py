@@ -6,16 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mien.capture.constants import CAPTURE
 from mien.capture.source import shrunk_size
-
-_MARGIN = 1.5
-"""Room around all positions of the face for hair, neck and shoulders, in face boxes (eyebrows to chin)."""
-_OUTLIERS = 1.0
-"""Percent of the frames at either end that may lie outside, so that a false detection does not decide the crop."""
-_MAX_ASPECT = 1.25
-"""A picture counts as a head crop already, and is kept whole, if its aspect ratio is at most this..."""
-_MIN_HEAD_SHARE = 0.7
-"""...and the chosen crop would take at least this part of its shorter side."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +56,12 @@ def choose_crop(boxes: Float[np.ndarray, "t 4"], width: int, height: int, size: 
     """
     pixels = boxes[np.isfinite(boxes).all(axis=1)] * np.array([width, height, width, height])
     assert len(pixels) > 0
-    left, top = np.percentile(pixels[:, :2], _OUTLIERS, axis=0)
-    right, bottom = np.percentile(pixels[:, 2:], 100 - _OUTLIERS, axis=0)
+    left, top = np.percentile(pixels[:, :2], CAPTURE.crop_outliers, axis=0)
+    right, bottom = np.percentile(pixels[:, 2:], 100 - CAPTURE.crop_outliers, axis=0)
     face = float(np.median(np.maximum(pixels[:, 2] - pixels[:, 0], pixels[:, 3] - pixels[:, 1])))
-    wanted = max(right - left, bottom - top) + _MARGIN * face
+    wanted = max(right - left, bottom - top) + CAPTURE.crop_margin * face
     shorter, longer = min(width, height), max(width, height)
-    if longer <= _MAX_ASPECT * shorter and wanted >= _MIN_HEAD_SHARE * shorter:
+    if longer <= CAPTURE.crop_most_aspect * shorter and wanted >= CAPTURE.crop_least_head_share * shorter:
         return whole_picture(width, height, size)
     side = min(round(wanted), shorter)
     crop_left = int(np.clip(round((left + right - side) / 2), 0, width - side))

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mien.capture.constants import CAPTURE
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 
 LANDMARKS = 478
-"""Points of MediaPipe's face mesh with irises."""
+"""Points of MediaPipe's face mesh with irises: 468 of the mesh and 5 of each iris."""
 MAX_FACES = 4
 """Most faces of a frame that are kept, the largest first."""
-_DETECTION_CONFIDENCE = 0.5
 
 
 class FaceFinder:
@@ -27,7 +27,7 @@ class FaceFinder:
         module = load_solution("face_detection")
         with quiet_mediapipe():
             self._detectors = [
-                module.FaceDetection(model_selection=model, min_detection_confidence=_DETECTION_CONFIDENCE)
+                module.FaceDetection(model_selection=model, min_detection_confidence=CAPTURE.face_confidence)
                 for model in (0, 1)
             ]
             blank = np.zeros((64, 64, 3), np.uint8)

@@ -13,6 +13,7 @@ from mien.camera import Camera
 from mien.capture.calibration import CalibratedCamera, match_sources, read_calibration
 from mien.capture.calibration_check import advise_on, landmarks_at, some_timesteps, warn_of_misfit
 from mien.capture.capture import Capture
+from mien.capture.constants import CAPTURE
 from mien.capture.crop import Crop
 from mien.capture.faces import LANDMARKS
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
@@ -46,8 +47,6 @@ from mien.storage import file_digest
 
 _MAX_RATE_ERROR = 0.01
 """Largest relative difference between the cameras' frame rates."""
-_MAX_ASTRAY = 1.0
-"""Largest distance between landmarks and the projected head, in sides of the landmarks' box."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,5 +361,5 @@ def _remove_astray(landmarks: Float[np.ndarray, "t c l 2"], path: HeadPath, came
         least, most = found.min(axis=1), found.max(axis=1)
         side = np.maximum((most - least).max(axis=1), 1.0)
         with np.errstate(invalid="ignore"):
-            is_astray = np.linalg.norm((least + most) / 2 - centers, axis=1) > _MAX_ASTRAY * side
+            is_astray = np.linalg.norm((least + most) / 2 - centers, axis=1) > CAPTURE.landmarks_most_astray * side
         found[is_astray] = np.nan

@@ -20,18 +20,17 @@ from jaxtyping import UInt8
 
 from mien.capture.camera_names import CameraName, remedy
 from mien.capture.colors import UNSPECIFIED
+from mien.capture.constants import CAPTURE
 from mien.capture.display import Display
+from mien.capture.video import DEFAULT_FPS
 from mien.capture.video_file import open_video, read_container_tags
 from mien.errors import UserError
 
-MOST_SIDE = 640
-"""Longest side in pixels of the pictures that are kept. MediaPipe looks at 192 x 192 pixels around the face."""
 _ASKED = {"framerate": "30", "video_size": "640x480"}
 """What a device is asked for first. One that cannot do it gives its own default."""
 _STREAM = {"flags": "low_delay", "timeout": "5000000"}
 """What a stream is asked for: no reordering, and an error after five seconds without an answer (in microseconds)."""
 _RETRY_SECONDS, _PATIENCE_SECONDS = 1.0, 2.0
-_FPS = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +148,7 @@ class LiveCamera:
     def _read(self, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
         """Keep each frame when it comes, until the end or an error of the device."""
         container = read_container_tags(Path(self.name.device))[0] if self.name.is_file else UNSPECIFIED
-        display = Display(str(self.name), 1.0, MOST_SIDE, container)
+        display = Display(str(self.name), 1.0, CAPTURE.live_side, container)
         began: float | None = None
         with contextlib.suppress(av.error.FFmpegError, OSError):
             for due, frame in frames:
@@ -192,7 +191,7 @@ class _Opened(contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFr
 @contextlib.contextmanager
 def _file(path: Path) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
     with open_video(path) as (container, stream):
-        fps = float(stream.average_rate or stream.guessed_rate or _FPS)
+        fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
         yield _timed(container, fps)
 
 
@@ -202,7 +201,7 @@ def _device(name: CameraName) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]
     with container:
         if not container.streams.video:
             raise UserError(f"--by {name}: has no pictures; {_remedy(name)}")
-        yield _timed(container, _FPS)
+        yield _timed(container, DEFAULT_FPS)
 
 
 def _open_device(name: CameraName) -> InputContainer:

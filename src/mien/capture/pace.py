@@ -5,14 +5,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mien.capture.constants import CAPTURE
 from mien.progress import say
 
-_RATE_TOLERANCE = 0.01
 _MAX_INTERVAL_RATIO = 1.5
 """Ratio of the longest to the median time between frames from which a clip's rate is called variable."""
-_STEADY_RATIO = 1.6
-"""Ratio to the median up to which times between frames count for the rate. Between this and 1.5 are films at 24 frames
-a second on a grid of 60, which alternate between two and three steps."""
 _PAUSE_SECONDS, _PAUSE_STEPS = 0.5, 2.5
 """Time between two frames from which it is called a pause: in seconds, and as a multiple of the median, so that a
 dropped frame of a slow clip is none."""
@@ -64,9 +61,9 @@ def frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
     usual = float(np.median(steps)) if len(steps) else 0.0
     if usual <= 0:
         return nominal
-    steady = (steps <= _STEADY_RATIO * usual) & (steps * _STEADY_RATIO >= usual)
+    steady = (steps <= CAPTURE.rate_steady_ratio * usual) & (steps * CAPTURE.rate_steady_ratio >= usual)
     if steady.all():
         measured = float(len(steps) / timestamps[-1])
     else:
         measured = 1 / float(steps[steady].mean() if steady.any() else usual)
-    return nominal if abs(measured - nominal) <= _RATE_TOLERANCE * nominal else measured
+    return nominal if abs(measured - nominal) <= CAPTURE.rate_tolerance * nominal else measured

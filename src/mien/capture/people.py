@@ -6,22 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mien.capture.constants import CAPTURE
 from mien.capture.survey import Survey
 
-_MAX_MOVE = 0.6
-"""A face moves by at most this many of its sides from one frame to the next..."""
-_MAX_GROWTH = 1.6
-"""...and grows or shrinks by at most this factor."""
-_MAX_GAP_SECONDS = 1.0
-"""Seconds without detection after which a face that comes back starts a new track."""
-_MAX_SIZE_RATIO = 2.5
-"""The same person's face is larger or smaller by at most this factor when it comes back..."""
-_MAX_COLOR_CHANGE = 0.12
-"""...and its mean colours (0..1) differ by at most this."""
 _MAX_CANDIDATES = 8
 """Number of tracks that are considered: those that fill the picture most."""
-_MIN_TRACK_FRAMES = 3
-"""Frames below which a track counts as a false detection, in clips of at least as many frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +52,8 @@ def choose_person(survey: Survey) -> Person:
     """
     tracks = _link(survey)
     boxes, others = np.full((len(survey.boxes), 4), np.nan), survey.boxes.copy()
-    lasting = [track for track in tracks if len(track.entries) >= min(_MIN_TRACK_FRAMES, len(survey.boxes))] or tracks
+    least = min(CAPTURE.person_least_frames, len(survey.boxes))
+    lasting = [track for track in tracks if len(track.entries) >= least] or tracks
     for track in tracks:
         if track not in lasting:
             frames, places = zip(*track.entries, strict=True)
@@ -97,13 +87,15 @@ def _link(survey: Survey) -> list[_Track]:
     for frame, (seconds, boxes) in enumerate(zip(survey.timestamps, survey.boxes, strict=True)):
         places = np.flatnonzero(np.isfinite(boxes[:, 0])).tolist()
         open_tracks = [
-            track for track in open_tracks if seconds - survey.timestamps[track.entries[-1][0]] <= _MAX_GAP_SECONDS
+            track
+            for track in open_tracks
+            if seconds - survey.timestamps[track.entries[-1][0]] <= CAPTURE.person_most_gap
         ]
         pairs = sorted(
             (frame - track.entries[-1][0], distance, index, place)
             for index, track in enumerate(open_tracks)
             for place in places
-            if (distance := _distance(survey.boxes[track.entries[-1]], boxes[place])) <= _MAX_MOVE
+            if (distance := _distance(survey.boxes[track.entries[-1]], boxes[place])) <= CAPTURE.person_most_move
         )
         taken: set[int] = set()
         for *_, index, place in pairs:
@@ -122,7 +114,7 @@ def _link(survey: Survey) -> list[_Track]:
 def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> float:
     """Distance between two faces in units of their side; infinite if their sizes differ too much."""
     size_before, size_now = (max(math.sqrt(max((b[2] - b[0]) * (b[3] - b[1]), 0)), 1e-6) for b in (before, now))
-    if not 1 / _MAX_GROWTH <= size_now / size_before <= _MAX_GROWTH:
+    if not 1 / CAPTURE.person_most_growth <= size_now / size_before <= CAPTURE.person_most_growth:
         return float("inf")
     centers = (before[:2] + before[2:] - now[:2] - now[2:]) / 2
     return float(np.abs(centers).max()) / max(size_before, size_now)
@@ -150,4 +142,5 @@ def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, co
     before = tuple(np.array([entry for other in accepted for entry in other.entries]).T)
     ratio = math.sqrt(float(np.median(areas[now])) / float(np.median(areas[before])))
     change = np.abs(np.median(colors[now], axis=0) - np.median(colors[before], axis=0)).mean()
-    return bool(1 / _MAX_SIZE_RATIO <= ratio <= _MAX_SIZE_RATIO and change <= _MAX_COLOR_CHANGE)
+    most = CAPTURE.person_most_size_ratio
+    return bool(1 / most <= ratio <= most and change <= CAPTURE.person_most_color_change)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt64
 
+from mien.capture.constants import CAPTURE
 from mien.capture.crop import Crop
 from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
@@ -27,12 +28,6 @@ from mien.storage import expect_whole, read_arrays, write_arrays
 
 _CHUNK = 256
 """Frames after which progress is saved. Detectors start again at each chunk, even if nothing is interrupted."""
-_LEAD_IN = 8
-"""Frames before a chunk that set up the detectors' state. After four of them, results differ by 0.05 px."""
-_MAX_DISTANCE = 0.6
-"""Largest distance between the centres of landmarks and of the followed face, as a part of the face's longer side."""
-_MAX_AGE = 12
-"""Frames for which the last landmarks predict the face's position if the survey did not find it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +94,7 @@ class LandmarkFollower:
         """Return the box where the face should be: the survey's, or else that of the last landmarks if recent."""
         if np.isfinite(self._boxes[timestep, 0]):
             return self._boxes[timestep]
-        if self._last is None or abs(timestep - self._last[0]) > _MAX_AGE:
+        if self._last is None or abs(timestep - self._last[0]) > CAPTURE.face_most_age:
             return None
         return _box(self._last[1])
 
@@ -110,7 +105,7 @@ class LandmarkFollower:
         centers = np.array([_center(_box(face)) for face in faces])
         distances = np.linalg.norm(centers - _center(expected), axis=1)
         best = int(np.argmin(distances))
-        if distances[best] > _MAX_DISTANCE * (expected[2:] - expected[:2]).max():
+        if distances[best] > CAPTURE.face_most_distance * (expected[2:] - expected[:2]).max():
             return None
         to_others = np.linalg.norm(centers[best] - (others[:, :2] + others[:, 2:]) / 2, axis=1)
         # Missing faces are NaN, which never compares as smaller.
@@ -135,13 +130,13 @@ class PartProcessor:
     def __init__(self, reel: Reel, part: Part, given: GivenInputs, done: int) -> None:
         """Prepare to process the part, skipping its first `done` frames."""
         self._path, self._part, self._given = reel.path, part, given
-        begin = done - _LEAD_IN if done >= _LEAD_IN else 0
+        begin = done - CAPTURE.lead_in if done >= CAPTURE.lead_in else 0
         left = part.timesteps - begin
         self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
-        self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=_LEAD_IN)
+        self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=CAPTURE.lead_in)
         """Timesteps and pictures of the latest frames; before the first frame, of the next ones in reverse order."""
         if begin == 0:
-            ahead = [self._cropped(frame) for frame in itertools.islice(self._stream, _LEAD_IN + 1)]
+            ahead = [self._cropped(frame) for frame in itertools.islice(self._stream, CAPTURE.lead_in + 1)]
             self._recent.extend((index, image) for index, (_, image) in reversed(list(enumerate(ahead))[1:]))
             self._pictures = itertools.chain(ahead, map(self._cropped, self._stream))
         else:

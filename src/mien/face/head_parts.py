@@ -8,19 +8,12 @@ from torch import Tensor
 
 from mien.face import FaceModel
 from mien.face.chart import find_outside
+from mien.face.constants import FACE
 from mien.face.mirror import triangle_geometry
 
 _FACE = ("skin", "face", "nose")
 _SKIN = (*_FACE, "ears", "eyelids", "eye_sockets")
 _PAINTED = ("lips", "brows")
-_MOUTH, _TEETH, _TONGUE = (0.30, 0.12, 0.11), (0.84, 0.80, 0.72), (0.62, 0.34, 0.33)
-"""Colours of the mouth's lining, of teeth and of the tongue at the lips, in daylight."""
-_MOUTH_FADE, _TEETH_FADE = 0.016, 0.030
-"""Depths in metres over which light falls to 1 / e: on the mouth's lining, and on teeth and tongue."""
-_LIPS = 0.012
-"""Depth behind the lips' front at which the inside of the mouth begins, in metres."""
-_DARKEST = 0.08
-"""Share of light that reaches the bottom of the mouth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +104,10 @@ def mouth_colors(parts: HeadParts, middles: Float[Tensor, "f 3"]) -> Float[Tenso
         parts: Parts of the face model.
         middles: Middles of the triangles of the neutral head, in metres.
     """
-    depth = (parts.front - _LIPS - middles[:, 2:3]).clamp_min(0)
-    fade = torch.where(parts.mouth[:, None], _MOUTH_FADE, _TEETH_FADE)
-    light = torch.exp(-depth / fade).clamp_min(_DARKEST)
-    colors = middles.new_tensor(_MOUTH).expand_as(middles)
-    for part, color in ((parts.teeth, _TEETH), (parts.tongue, _TONGUE)):
+    depth = (parts.front - FACE.lips_depth - middles[:, 2:3]).clamp_min(0)
+    fade = torch.where(parts.mouth[:, None], FACE.mouth_fade, FACE.teeth_fade)
+    light = torch.exp(-depth / fade).clamp_min(FACE.darkest_mouth)
+    colors = middles.new_tensor(FACE.mouth_color).expand_as(middles)
+    for part, color in ((parts.teeth, FACE.teeth_color), (parts.tongue, FACE.tongue_color)):
         colors = torch.where(part[:, None], middles.new_tensor(color), colors)
     return colors * light

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
+from mien.face.constants import FACE
 from mien.face.model import FaceModel
 
 Box = tuple[int, int, int, int]
@@ -13,13 +14,6 @@ PARTS = ("eyes", "mouth")
 """Names of the parts. The eyes are one part."""
 _REGIONS = {"eyes": ("eyelids", "eyes", "irises"), "mouth": ("lips",)}
 """Regions of the face model inside each part. Teeth show only between the lips."""
-_MARGINS = {"eyes": 0.12, "mouth": 0.2}
-"""Margin around the regions on each side, relative to the width of the part."""
-_MIN_COSINE = 0.3
-"""Smallest cosine between the direction from the head's middle to the part and that from the part to the camera at
-which the part counts as seen."""
-_MIN_SIDE = 8
-"""Smallest side of a box, in pixels. Smaller parts show nothing."""
 
 
 def part_boxes(face_model: FaceModel, vertices: Float[Tensor, "v 3"], camera: Camera) -> dict[str, Box]:
@@ -33,10 +27,11 @@ def part_boxes(face_model: FaceModel, vertices: Float[Tensor, "v 3"], camera: Ca
         vertices: Its vertices in world space, in metres.
         camera: The camera that sees them.
     """
+    margins: dict[str, float] = {"eyes": FACE.eyes_margin, "mouth": FACE.mouth_margin}
     found: dict[str, Box] = {}
     for name in PARTS:
         triangles = face_model.faces[face_model.region_mask(*_REGIONS[name])]
-        box = _box_of(vertices, triangles, camera, _MARGINS[name]) if len(triangles) else None
+        box = _box_of(vertices, triangles, camera, margins[name]) if len(triangles) else None
         if box is not None:
             found[name] = box
     return found
@@ -49,7 +44,7 @@ def _box_of(vertices: Float[Tensor, "v 3"], triangles: Tensor, camera: Camera, m
     outward, towards = middle - (vertices.amin(0) + vertices.amax(0)) / 2, camera.position - middle
     if not (depth > 0).all() or not torch.isfinite(points).all():
         return None
-    if float((outward * towards).sum()) < _MIN_COSINE * float(outward.norm() * towards.norm()):
+    if float((outward * towards).sum()) < FACE.part_least_cosine * float(outward.norm() * towards.norm()):
         return None
     low, high = points.amin(0), points.amax(0)
     beyond = margin * (high[0] - low[0])
@@ -57,6 +52,6 @@ def _box_of(vertices: Float[Tensor, "v 3"], triangles: Tensor, camera: Camera, m
     left, top = max(ends[0], 0), max(ends[1], 0)
     right, bottom = min(ends[2], camera.width), min(ends[3], camera.height)
     width, height = max(right - left, 0), max(bottom - top, 0)
-    if min(width, height) < _MIN_SIDE or 2 * width * height < (ends[2] - ends[0]) * (ends[3] - ends[1]):
+    if min(width, height) < FACE.part_least_side or 2 * width * height < (ends[2] - ends[0]) * (ends[3] - ends[1]):
         return None
     return left, top, width, height

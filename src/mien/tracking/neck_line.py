@@ -8,11 +8,10 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.face import FaceModel, FaceParams
+from mien.tracking.constants import TRACKING
 
 _CHUNK = 32
 """Number of timesteps posed at once."""
-_MIDDLE_OF_NECK = (0.4, 0.7)
-"""Range of the middle of the neck, as shares of the way from its base to its top."""
 
 
 def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
@@ -37,7 +36,7 @@ def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
         return bottom
     heights = face_model.template[neck, 1]
     base = face_model.template[bottom, 1].mean()
-    low, high = (base + share * (heights.max() - base) for share in _MIDDLE_OF_NECK)
+    low, high = (base + share * (heights.max() - base) for share in TRACKING.neck.middle)
     middle = neck[(heights >= low) & (heights <= high)]
     return middle if len(middle) > 0 else bottom
 

@@ -14,13 +14,9 @@ from mien.face import FaceModel, FaceParams
 from mien.picture_files import PictureStack
 from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh
+from mien.tracking.constants import TRACKING
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.tracking import Tracking
-
-_SILHOUETTE_MARGIN = 0.015
-"""Margin around the projected head, in its own widths, because tracking is not exact to the pixel."""
-_FAINT = 32
-"""Least opacity (of 255) of a pixel that counts for connection and for the crop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +73,11 @@ def cut_matte(
         keep: The share of the matte that is kept outside of the head, 0..1.
     """
     columns = np.flatnonzero(head.any(0))
-    margin = round(_SILHOUETTE_MARGIN * (columns[-1] - columns[0] + 1)) if len(columns) else 0
+    margin = round(TRACKING.neck.silhouette_margin * (columns[-1] - columns[0] + 1)) if len(columns) else 0
     if margin:
         head = cv2.dilate(head.astype(np.uint8), _disc(margin)).astype(bool)
     mask = np.round(matte * np.where(head, np.float32(1), keep)).astype(np.uint8)
-    _, labels = cv2.connectedComponents((mask >= _FAINT).astype(np.uint8))
+    _, labels = cv2.connectedComponents((mask >= TRACKING.neck.faint).astype(np.uint8))
     ours = np.unique(labels[head & (labels > 0)])
     faint_or_ours = (labels == 0) | np.isin(labels, ours)
     return np.where(faint_or_ours, mask, 0).astype(np.uint8)
@@ -89,7 +85,8 @@ def cut_matte(
 
 def head_crop(mask: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " 4"]:
     """Left, top, width and height of the box of the mask; the whole picture if the mask is empty."""
-    rows, columns = np.flatnonzero((mask >= _FAINT).any(1)), np.flatnonzero((mask >= _FAINT).any(0))
+    seen = mask >= TRACKING.neck.faint
+    rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
     if len(rows) == 0:
         return np.array([0, 0, mask.shape[1], mask.shape[0]])
     return np.array([columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1])

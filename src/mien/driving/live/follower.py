@@ -10,10 +10,11 @@ import torch
 from jaxtyping import Float
 
 from mien.avatar import as_array
+from mien.driving.constants import DRIVING
 from mien.driving.keeping import keep_to_filmed
 from mien.driving.live.landmark_fit import Fitted, LandmarkFit
 from mien.driving.live.one_euro import OneEuro
-from mien.driving.rest import HEAD, kept_share, rest_of
+from mien.driving.rest import kept_share, rest_of
 from mien.driving.transfer import drive
 from mien.face import FaceModel, FaceParams
 from mien.runtime import Face, Filmed
@@ -21,17 +22,6 @@ from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 State = Literal["waiting", "learning", "following", "resting"]
 """waiting: there was no face yet. learning: the face at rest is being learnt. following. resting: the face is away."""
-LEARN_SECONDS = 1.0
-"""Time over which the face at rest is learnt, in seconds."""
-_LEAST_FRAMES = 8
-AWAY_SECONDS = 0.4
-"""Time without a face after which the avatar goes to rest. Until then it keeps its face, because detectors miss some
-frames."""
-REST_SECONDS = 0.35
-"""Time in which the avatar goes two thirds of the way to rest, in seconds."""
-_CUTOFFS = {"head": (1.2, 12.0), "place": (1.0, 40.0), "eye": (2.5, 4.0), "mouth": (2.0, 4.0), "rest": (1.2, 2.0)}
-"""Cutoffs of the smoothing at rest in Hz, and their growth in Hz for a speed of 1 a second: of the head's angles in
-radians, its place in metres, eyes and lids, jaw and mouth, and the other coefficients."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,14 +122,14 @@ class Follower:
 
     def _learn(self, landmarks: Float[np.ndarray, "l 2"], width: int, height: int, seconds: float) -> None:
         self.state = "learning"
-        if self._learning and seconds - self._learning[-1][0] > AWAY_SECONDS:
+        if self._learning and seconds - self._learning[-1][0] > DRIVING.away_seconds:
             self._learning.clear()
         self._learning.append((seconds, landmarks))
-        if seconds - self._learning[0][0] < LEARN_SECONDS or len(self._learning) < _LEAST_FRAMES:
+        if seconds - self._learning[0][0] < DRIVING.learn_seconds or len(self._learning) < DRIVING.learn_least_frames:
             return
         seen = [one for _, one in self._learning]
         # A handful of frames says as much as all of them, and a picture must not wait.
-        seen = seen[:: max(1, len(seen) // _LEAST_FRAMES)]
+        seen = seen[:: max(1, len(seen) // DRIVING.learn_least_frames)]
         self._fit.learn_rest(seen, width, height, self._asked)
         poses = [self._fit.rest_pose(one, width, height) for one in seen]
         middle = poses[len(poses) // 2].rotation
@@ -147,7 +137,7 @@ class Follower:
         rotation = middle @ matrix_from_axis_angle(np.median(turns, axis=0)[None])[0]
         # A head far aside from the camera is turned, not at rest, unless the person says that it is.
         away = axis_angle_from_matrix(rotation[None])
-        share = float(kept_share(torch.tensor(np.linalg.norm(away)), HEAD))
+        share = float(kept_share(torch.tensor(np.linalg.norm(away)), DRIVING.rest_head))
         rotation = rotation if share == 1 or self._asked else matrix_from_axis_angle(share * away)[0]
         self._rest = _Pose(rotation, np.median([pose.translation for pose in poses], axis=0))
         self._learning.clear()
@@ -163,14 +153,14 @@ class Follower:
         self._values = self._smoothing(np.concatenate([turn, moved, fitted.coefficients]), seconds)
 
     def _without_face(self, seconds: float) -> None:
-        if self._seen_at is None or seconds - self._seen_at > AWAY_SECONDS:
+        if self._seen_at is None or seconds - self._seen_at > DRIVING.away_seconds:
             self.state = "waiting" if self._rest is None else "resting"
             self._fit.forget()
             self._towards_rest(seconds)
 
     def _towards_rest(self, seconds: float) -> None:
         """Go to rest gently. When the face is back, the smoothing starts from here."""
-        self._values = self._values * np.exp(-max(0.0, seconds - self._driven_at) / REST_SECONDS)
+        self._values = self._values * np.exp(-max(0.0, seconds - self._driven_at) / DRIVING.rest_seconds)
         self._smoothing = self._new_smoothing()
         self._smoothing(self._values, seconds)
 
@@ -188,7 +178,14 @@ class Follower:
 
     def _new_smoothing(self) -> OneEuro:
         kinds = ["head"] * 3 + ["place"] * 3 + [_kind(name) for name in self._fit.names]
-        cutoff, beta = np.array([_CUTOFFS[kind] for kind in kinds]).T
+        cutoffs = {
+            "head": DRIVING.head_cutoff,
+            "place": DRIVING.place_cutoff,
+            "eye": DRIVING.eye_cutoff,
+            "mouth": DRIVING.mouth_cutoff,
+            "other": DRIVING.other_cutoff,
+        }
+        cutoff, beta = np.array([cutoffs[kind] for kind in kinds]).T
         return OneEuro(cutoff, beta)
 
 
@@ -196,4 +193,4 @@ def _kind(name: str) -> str:
     lowered = name.lower()
     if "eye" in lowered:
         return "eye"
-    return "mouth" if lowered.startswith(("mouth", "jaw", "tongue")) else "rest"
+    return "mouth" if lowered.startswith(("mouth", "jaw", "tongue")) else "other"

@@ -11,31 +11,19 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from mien.driving.constants import DRIVING
 from mien.driving.rest import kept_share
 from mien.face import FaceModel, FaceParams
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import TrackingSettings
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import layout_of
 from mien.tracking.landmarks import EYE_CORNERS, NOSE, landmark_weights, read_response, reduce_face_model
 
-_STEP = 0.5
-"""Part of a coefficient over which landmarks are taken as linear; for joints, in radians, a quarter of that."""
-_MOST_TURN = 0.6
 _OPENCV = np.diag([1.0, -1.0, -1.0])
 _DAMPING = 1e-6
-_OUTLIER = 6.0
-_WIDE_OUTLIER = 40.0
-_FOCAL = 1.5
-"""Focal length of an unknown camera as a multiple of the longer side, as in `TrackingSettings.focal`."""
-_TRUE_STEPS, _FIRST_STEPS = 2, 12
-_LIMITS = (
-    ((0.4, 0.7), ("jaw", "brow", "mouthSmile", "mouthPucker", "mouthFunnel")),
-    ((0.35, 0.5), ("left_eye", "right_eye")),
-)
-"""Limits of `kept_share` for coefficients, and for angles of eyes in radians, of the face at rest. They are wider than
-those of a tracking, because the person's shape is unknown: in clips of seven people, medians of the fit are up to 0.34
-and 0.24. For lids and lips they are up to 0.9, so their part is always taken as shape.
-"""
+_LIMITED = ("jaw", "brow", "mouthSmile", "mouthPucker", "mouthFunnel")
+"""Beginnings of coefficients that count as motion if they are large. All others but gazes are taken as shape."""
 _NEAR, _FAR = 0.1, 10.0
 """Bounds of the distance of a head, in metres."""
 
@@ -71,8 +59,8 @@ class LandmarkFit:
         self.names = layout.names[6:]
         count = len(self.names)
         state = torch.zeros(count + 1, layout.size, dtype=torch.float64)
-        steps = torch.full((count,), _STEP, dtype=torch.float64)
-        steps[len(layout.expression_index) :] = 0.25 * _STEP
+        steps = torch.full((count,), DRIVING.live_step, dtype=torch.float64)
+        steps[len(layout.expression_index) :] = 0.25 * DRIVING.live_step
         state[1:, 6:] = torch.diag(steps)
         points = reduced.head_points(
             layout.face_params(state, person.identity.double().reshape(-1)), reduced.response.mean
@@ -105,13 +93,13 @@ class LandmarkFit:
             width: Width of the picture in pixels.
             height: Height of the picture in pixels.
         """
-        centered, focal = landmarks - (0.5 * width, 0.5 * height), _FOCAL * max(width, height)
+        centered, focal = landmarks - (0.5 * width, 0.5 * height), TRACKING.camera.focal * max(width, height)
         if self._last is None:
-            start = self._facing(centered, focal)
-            start = self._descend(start, centered, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
-            self._last = self._descend(start, centered, focal, self._weights, _WIDE_OUTLIER, _FIRST_STEPS)
+            start, outlier = self._facing(centered, focal), TRACKING.landmarks.first_outlier
+            start, steps = self._find_pose(start, centered, focal), DRIVING.live_first_steps
         else:
-            self._last = self._descend(self._last, centered, focal, self._weights, _OUTLIER, _TRUE_STEPS)
+            start, outlier, steps = self._last, DRIVING.live_outlier, DRIVING.live_steps
+        self._last = self._descend(start, centered, focal, self._weights, outlier, steps)
         return self._last
 
     def learn_rest(self, seen: list[Float[np.ndarray, "l 2"]], width: int, height: int, as_it_is: bool = False) -> None:
@@ -123,14 +111,14 @@ class LandmarkFit:
         self._bias, self._held = np.zeros_like(self._rest), np.zeros_like(self._held)
         if not as_it_is:
             self._held = self._expression_in(seen, width, height)
-        focal, size = _FOCAL * max(width, height), np.array((0.5 * width, 0.5 * height))
+        focal, size = TRACKING.camera.focal * max(width, height), np.array((0.5 * width, 0.5 * height))
         self._bias = np.zeros_like(self._rest)
         for _ in range(2):
             offsets = []
             for landmarks in seen:
                 centered = landmarks - size
                 start = replace(self._facing(centered, focal), coefficients=self._held)
-                pose = self._descend(start, centered, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
+                pose = self._find_pose(start, centered, focal)
                 points = self._points(pose)
                 turned = points @ pose.rotation.T + pose.translation
                 depth = -turned[:, 2]
@@ -147,16 +135,19 @@ class LandmarkFit:
             fits.append(self(landmarks, width, height).coefficients)
         middle = torch.from_numpy(np.median(fits, axis=0))
         moved = torch.zeros_like(middle)
-        for limits, starts in _LIMITS:
+        for limits, starts in (
+            (DRIVING.live_expression_limits, _LIMITED),
+            (DRIVING.live_gaze_limits, ("left_eye", "right_eye")),
+        ):
             ours = torch.tensor([name.startswith(starts) for name in self.names])
             moved = torch.where(ours, middle * (1 - kept_share(middle.abs(), limits)), moved)
         return moved.numpy()
 
     def rest_pose(self, landmarks: Float[np.ndarray, "l 2"], width: int, height: int) -> Fitted:
         """The head pose alone in a frame in which the person is at rest."""
-        centered, focal = landmarks - (0.5 * width, 0.5 * height), _FOCAL * max(width, height)
+        centered, focal = landmarks - (0.5 * width, 0.5 * height), TRACKING.camera.focal * max(width, height)
         start = replace(self._facing(centered, focal), coefficients=self._held)
-        return self._descend(start, centered, focal, self._rigid, _WIDE_OUTLIER, _FIRST_STEPS, pose_only=True)
+        return self._find_pose(start, centered, focal)
 
     def pixels(
         self,
@@ -168,7 +159,7 @@ class LandmarkFit:
     ) -> Float[np.ndarray, "l 2"]:
         """Where the landmarks of a face are in a picture: what `__call__` fits."""
         points = self._points(Fitted(rotation, translation, coefficients, 0.0))
-        projected = self._project(points @ rotation.T + translation, _FOCAL * max(width, height))
+        projected = self._project(points @ rotation.T + translation, TRACKING.camera.focal * max(width, height))
         return projected + (0.5 * width, 0.5 * height)
 
     def face_of(
@@ -180,7 +171,8 @@ class LandmarkFit:
         return replace(given, **{name: tensor.float() for name, tensor in given.tensors().items()})
 
     def _points(self, fitted: Fitted) -> Float[np.ndarray, "l 3"]:
-        turn = axis_angle_from_matrix(fitted.rotation[None])[0][:2].clip(-_MOST_TURN, _MOST_TURN)
+        most = TRACKING.landmarks.largest_turn
+        turn = axis_angle_from_matrix(fitted.rotation[None])[0][:2].clip(-most, most)
         shape = self._rest + self._bias + np.tensordot(turn, self._by_turn, 1)
         return shape + self._basis @ fitted.coefficients
 
@@ -196,6 +188,11 @@ class LandmarkFit:
         depth = float(np.clip(focal * size / max(spread, 1e-6), _NEAR, _FAR))
         place = np.array([middle[0] * depth / focal, -middle[1] * depth / focal, -depth])
         return Fitted(np.eye(3), place - points.mean(0), np.zeros(len(self.names)), np.inf)
+
+    def _find_pose(self, start: Fitted, centered: Float[np.ndarray, "l 2"], focal: float) -> Fitted:
+        """The head pose from landmarks that expressions hardly move."""
+        outlier, steps = TRACKING.landmarks.first_outlier, DRIVING.live_first_steps
+        return self._descend(start, centered, focal, self._rigid, outlier, steps, pose_only=True)
 
     def _descend(
         self,

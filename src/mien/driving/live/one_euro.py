@@ -8,8 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-_SPEED_CUTOFF = 3.0
-"""Cutoff of the low pass of the speeds, in Hz."""
+from mien.driving.constants import DRIVING
 
 
 class OneEuro:
@@ -34,7 +33,7 @@ class OneEuro:
         elif seconds > self._seconds:
             elapsed = seconds - self._seconds
             speed = (value - self._value) / elapsed
-            self._speed += _share(np.full(len(value), _SPEED_CUTOFF), elapsed) * (speed - self._speed)
+            self._speed += _share(np.full(len(value), DRIVING.speed_cutoff), elapsed) * (speed - self._speed)
             cutoff = self._cutoff + self._beta * np.abs(self._speed)
             self._value = self._value + _share(cutoff, elapsed) * (value - self._value)
         self._seconds = seconds

@@ -12,6 +12,7 @@ from torch import Tensor
 from mien.adam import Moments
 from mien.parallel import map_in_threads
 from mien.progress import Advance
+from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import RowStepper, apply_adam
 from mien.tracking.descent.scene import PaperScene, PaperState
 from mien.tracking.descent.terms import (
@@ -32,16 +33,8 @@ from mien.tracking.fitting import StageCache
 _PIECE = "descent"
 _RATES = {"lights": "light", "log_focals": "focal"}
 """Names of learning rates that differ from the names of their parameters."""
-_GLOBAL_RATE, _EPOCH_DECAY = 0.1, 0.9
-"""Factor of the initial learning rates in the first epoch, and decay from one epoch to the next."""
-_GOOD_COSINE = 0.5
-"""Least cosine of the viewing angle at which a triangle's texels count fully. Below it they count in proportion."""
-_BATCHES = 40
-"""Largest number of batches in an epoch. Frames err alike, so longer clips need no more steps of shared parameters."""
 _AT_ONCE = 16
 """Number of frames of a batch whose gradients are in memory together, about 60 MB."""
-_TEXTURE_EVERY = 4
-"""Fewest frames whose texture gradients are summed for one step. A step of the texture costs as much as a picture."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +83,7 @@ class Descent:
 
     def fit_epoch(self, epoch: int, advance: Advance, cache: StageCache) -> None:
         """Take one step of every frame in random order. Each batch of frames also moves the shared parameters."""
+        known = TRACKING.descent
         if self.done >= self.frames * (2 + epoch):
             return
         pairs = [(sequence, row) for sequence, rows in enumerate(self.state.frames) for row in range(len(rows))]
@@ -98,15 +92,16 @@ class Descent:
         for index in random.permutation(len(pairs)):
             sequence, row = pairs[index]
             drawn.append(_Place(sequence, row, int(random.choice(self.cameras(sequence, row)))))
-        batches = np.array_split(np.arange(len(drawn)), min(_BATCHES, len(drawn)))
-        scale = _GLOBAL_RATE * _EPOCH_DECAY**epoch
+        batches = np.array_split(np.arange(len(drawn)), min(known.most_batches, len(drawn)))
+        scale = known.global_rate * known.epoch_decay**epoch
         texture_gradient, seen = torch.zeros_like(self.state.texture), 0
         for batch in batches:
             gradients = self._step_frames([drawn[index] for index in batch], scale)
             texture_gradient, seen = texture_gradient + gradients.pop("texture"), seen + len(batch)
             self._step_shared(gradients, scale, 1 / len(batches), len(batch))
-            if seen >= _TEXTURE_EVERY:
-                mean = texture_gradient / seen + roughness_gradient(self.scene, self.state.texture) / _TEXTURE_EVERY
+            if seen >= known.texture_every:
+                roughness = roughness_gradient(self.scene, self.state.texture)
+                mean = texture_gradient / seen + roughness / known.texture_every
                 self._step("texture", self.state.texture, mean, scale * self.scene.settings.rates.texture)
                 texture_gradient, seen = torch.zeros_like(texture_gradient), 0
             advance(len(batch), status=f"epoch {epoch + 1}")
@@ -199,7 +194,7 @@ class Descent:
 
     def trusted(self) -> Float[Tensor, " f"]:
         """Weight of the texels of each triangle, 0..1, by how frontally the triangle was seen."""
-        return self.scene.used * (self.state.visibility / _GOOD_COSINE).clamp_max(1.0)
+        return self.scene.used * (self.state.visibility / TRACKING.descent.good_cosine).clamp_max(1.0)
 
 
 def pack(

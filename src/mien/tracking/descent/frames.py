@@ -8,6 +8,7 @@ import torch
 
 from mien.adam import Moments
 from mien.progress import Advance
+from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent
 from mien.tracking.descent.terms import (
@@ -24,26 +25,12 @@ from mien.tracking.descent.terms import (
 )
 from mien.tracking.fitting import StageCache
 
-_LAST_RATE = 0.1
-"""Factor of the learning rates at the last of a frame's steps."""
-_MIN_GAIN = 0.15
-"""A frame must see a triangle more frontally than earlier frames by this cosine for its texels to be learned again."""
-_MIN_COSINE = 0.1
-_TEXTURE_FRAMES, _TEXTURE_ROUNDS = 40, 6
-"""Frames of each sequence, and steps at each, from which texture and light are fitted before the epochs."""
-_LOST = 3.0
-"""Landmarks are lost if they are farther off than in their own fit by more than this many standard deviations."""
-_LIGHT_EVERY = 10
-"""Steps between estimates of the unexplained light of a picture."""
-_OTHER_FIRST = 5
-"""The first frames of further sequences get the first frame's number of steps divided by this."""
-
 
 def fit_appearance(descent: Descent) -> None:
     """Fit texture and light again, all else fixed, to frames spread over the sequences, in random order."""
     chosen = _some_frames(descent)
     moments: dict[str, Moments] = {}
-    order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), _TEXTURE_ROUNDS))
+    order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), TRACKING.descent.texture_rounds))
     for number, index in enumerate(order):
         sequence, row = chosen[index]
         cameras = descent.cameras(sequence, row)
@@ -63,7 +50,8 @@ def measure_visibility(descent: Descent) -> None:
 def _some_frames(descent: Descent) -> list[tuple[int, int]]:
     chosen = []
     for sequence, rows in enumerate(descent.state.frames):
-        several = torch.linspace(0, len(rows) - 1, min(len(rows), _TEXTURE_FRAMES)).round().long().unique()
+        count = min(len(rows), TRACKING.descent.texture_frames)
+        several = torch.linspace(0, len(rows) - 1, count).round().long().unique()
         chosen += [(sequence, row) for row in several.tolist()]
     return chosen
 
@@ -126,7 +114,8 @@ def _is_lost(descent: Descent, target: Target) -> bool:
     scene, moving = descent.scene, descent.moving(target, ())[0]
     start = descent.start[target.sequence][target.row]
     now, then = (float(landmark_terms(scene, target, at)) for at in (moving, replace(moving, row=start)))
-    return now - then > _LOST**2 * float(scene.sequences[target.sequence].terms[target.row].weights.sum())
+    weight = float(scene.sequences[target.sequence].terms[target.row].weights.sum())
+    return now - then > TRACKING.descent.lost_landmarks**2 * weight
 
 
 def _fit_first(descent: Descent, target: Target, first_of_all: bool) -> None:
@@ -134,7 +123,7 @@ def _fit_first(descent: Descent, target: Target, first_of_all: bool) -> None:
     settings, weights = scene.settings, scene.used
     if first_of_all:
         guess_texture(scene, target, descent.moving(target, ())[0], descent.state.texture)
-    steps = settings.first_steps if first_of_all else settings.first_steps // _OTHER_FIRST
+    steps = settings.first_steps if first_of_all else settings.first_steps // TRACKING.descent.further_start_divisor
     appearance = {"texture": descent.state.texture, "light": descent.state.lights[target.sequence]}
     moments = {name: Moments.zeros(value) for name, value in appearance.items()}
     stepper = descent.stepper(target.sequence, target.row, past_only=True)
@@ -161,7 +150,7 @@ def _fit_row(descent: Descent, target: Sequence[Target], steps: int) -> None:
     for step in range(steps):
         index = step % len(target)
         moving, leaves = descent.moving(target[index], ("row",))
-        if step % (_LIGHT_EVERY * len(target)) < len(target):
+        if step % (TRACKING.descent.light_every * len(target)) < len(target):
             even[index] = without_smooth_difference(descent.scene, target[index], moving, weights)
         loss = descent.frame_cost(even[index], moving, weights, past_only=True)
         (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
@@ -170,10 +159,11 @@ def _fit_row(descent: Descent, target: Sequence[Target], steps: int) -> None:
 
 def _learn_texture(descent: Descent, target: Target) -> None:
     """Learn the texels of triangles that this frame shows more frontally than the frames before it."""
+    known = TRACKING.descent
     scene, state = descent.scene, descent.state
     with torch.no_grad():
         visibility = visibility_of(scene, target, descent.moving(target, ())[0])
-        better = (visibility > state.visibility + _MIN_GAIN) & (visibility > _MIN_COSINE)
+        better = (visibility > state.visibility + known.texture_gain) & (visibility > known.texture_least_cosine)
     if target.row > 0 and better.any():
         moments, steps = Moments.zeros(state.texture), scene.settings.texture_steps
         for step in range(steps):
@@ -182,10 +172,10 @@ def _learn_texture(descent: Descent, target: Target) -> None:
             loss = color_term(scene, target, moving, vertices, scene.used * better)
             (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
             apply_adam(moments, state.texture, gradient, 3 * scene.settings.rates.texture * _fading(step, steps))
-    seen = visibility > _MIN_COSINE
+    seen = visibility > known.texture_least_cosine
     state.visibility = torch.where(better | (seen & (state.visibility == 0)), visibility, state.visibility)
 
 
 def _fading(step: int, steps: int) -> float:
     """Factor of the learning rate at a step."""
-    return 1 - (1 - _LAST_RATE) * step / max(steps - 1, 1)
+    return 1 - (1 - TRACKING.descent.last_rate) * step / max(steps - 1, 1)

@@ -9,17 +9,9 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.face import FaceModel
 from mien.render.mesh import rasterize_mesh
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import HIDING_REGIONS, ParameterLayout
 from mien.tracking.landmarks import LEFT_EYELIDS, LEFT_LID_PAIRS, RIGHT_EYELIDS, RIGHT_LID_PAIRS
-
-_LIDS_REACH, _AROUND_REACH = 1.3, 3.5
-"""Distances from an eyeball's centre that contain its lids, and everything that may hide it, in radii."""
-_STEPS = 64
-"""Number of equal steps of a coefficient. Lids touch at the first step at which the least of the eyeball is seen."""
-_MAX_CLOSING = 1.25
-"""A coefficient closes an eye if the lids meet within this multiple of its upper bound."""
-_OTHERS_SHARE = 0.2
-"""A coefficient is not an eye's own if it moves the other eye's lids by more than this share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +80,8 @@ def _coefficient(
 ) -> tuple[int, float] | None:
     """The free coefficient that closes an eye with the least motion elsewhere, and its upper bound; or None."""
     bounds = model.expression_bounds[layout.expression_index]
-    able = (closing * _MAX_CLOSING * bounds[:, 1] >= 1) & (of_other.abs() < _OTHERS_SHARE * closing)
+    known = TRACKING.eyelids
+    able = (closing * known.most_closing * bounds[:, 1] >= 1) & (of_other.abs() < known.others_share * closing)
     if not able.any():
         return None
     moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")
@@ -111,8 +104,8 @@ def _eye(
     center = own.mean(0)
     radius = (own - center).norm(dim=1).max()
     distance = (model.template - center).norm(dim=1)
-    lids = (distance < _LIDS_REACH * radius)[model.faces].any(1) & ~ball
-    around = (distance < _AROUND_REACH * radius)[model.faces].any(1) & ~ball & ~lids
+    lids = (distance < TRACKING.eyelids.lids_reach * radius)[model.faces].any(1) & ~ball
+    around = (distance < TRACKING.eyelids.around_reach * radius)[model.faces].any(1) & ~ball & ~lids
     forward = torch.nn.functional.normalize(middle - center, dim=0)
     parts = [part.nonzero()[:, 0] for part in (ball, lids, around)]
     triangles = torch.cat(parts)
@@ -146,6 +139,7 @@ def _where_lids_touch(
         seen = rasterize_mesh(rest + amount * motion, eye.moving, camera).face_index
         return int(((seen >= 0) & (seen < eye.ball)).sum())
 
-    amounts = [eye.closed * step / _STEPS for step in range(_STEPS + 1)]
+    steps = TRACKING.eyelids.closing_steps
+    amounts = [eye.closed * step / steps for step in range(steps + 1)]
     areas = [left(amount) for amount in amounts]
     return amounts[areas.index(min(areas))]

@@ -17,33 +17,12 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.parallel import map_in_threads
+from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids.colors import EyeColors, learn_colors
 from mien.tracking.eyelids.crops import EyeCrop, eye_crop
 from mien.tracking.eyelids.eyes import Eye, eyes_of
 from mien.tracking.fitting import Fit, SequenceFit, Shot
 from mien.tracking.landmarks import LandmarkModel
-
-_POSITIONS = np.linspace(-0.4, 1.2, 13)
-"""Positions of the lids that are tried: 0 is at rest, 1 is closed, below 0 is wider open than at rest."""
-_BAND = 4
-"""Width of the lashes and the edge of the upper lid, in positions; a generous estimate."""
-_FINE, _BLUR = 0.01, 0.08
-"""Step of the fine positions that costs are interpolated to, and standard deviation of the smoothing kernel."""
-_DOUBT = 8.0
-"""Divisor of the costs, because errors of neighbouring pixels are correlated."""
-_DISAGREEMENT = 0.07
-"""Largest upper quartile, over the frames, of the cost of the fit's lids above the best one, as a share of the range
-of costs. If it is larger, the colours are misleading and count less."""
-_SIGMA = 0.12
-"""Standard deviation of the lids of a good fit."""
-_FAR = 0.4
-"""Wider standard deviation of the fit's lids, for the estimate of the usual offset between colours and fit."""
-_LEARNED_FROM = 100
-"""Largest number of pictures that colours are learned from."""
-_MIN_PICTURES = 10
-"""Fewest pictures that must show an eye for its lids to be placed."""
-_MIN_FACING = 0.35
-"""Smallest cosine between an eye's direction and the direction to the camera."""
 
 
 def place_lids(
@@ -98,7 +77,7 @@ class _Sequence:
         positions: list[float],
     ) -> EyeCrop | None:
         middle = corners[0].mean(0)
-        capture, best, facing = self.shot.capture, None, _MIN_FACING
+        capture, best, facing = self.shot.capture, None, TRACKING.eyelids.least_facing
         for index in self.shot.views.seen_by(row):
             K, viewmat = self.own.cameras.K[index].float(), self.own.cameras.viewmat[index].float()
             camera = Camera(K, viewmat, capture.width, capture.height)
@@ -115,17 +94,17 @@ class _Sequence:
 
 def _place(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
     state = sequence.own.state.clone()
-    colors = _learn(sequence)
+    colors, positions = _learn(sequence), _positions().tolist()
 
     def of_row(row: int) -> list[Float[np.ndarray, " k"] | None]:
-        crops = sequence.crops(row, _POSITIONS.tolist())
+        crops = sequence.crops(row, positions)
         return [_costs(*pair) for pair in zip(crops, colors, strict=True)]
 
     costs = map_in_threads(of_row, list(range(len(state))))
     for number, eye in enumerate(sequence.eyes):
         of_eye = [row[number] for row in costs]
         seen = np.array([cost is not None for cost in of_eye])
-        if seen.sum() >= _MIN_PICTURES:
+        if seen.sum() >= TRACKING.eyelids.least_pictures:
             known = np.stack([cost for cost in of_eye if cost is not None])
             before = state[torch.from_numpy(seen), eye.column].numpy() / eye.closed
             state[torch.from_numpy(seen), eye.column] = (
@@ -134,14 +113,19 @@ def _place(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
     return sequence.model.layout.bounds.clip(state)
 
 
+def _positions() -> Float[np.ndarray, " k"]:
+    return np.linspace(*TRACKING.eyelids.position_range, TRACKING.eyelids.positions)
+
+
 def _costs(crop: EyeCrop | None, colors: EyeColors | None) -> Float[np.ndarray, " k"] | None:
-    return None if crop is None or colors is None else colors.costs(crop, _BAND)
+    return None if crop is None or colors is None else colors.costs(crop, TRACKING.eyelids.edge_band)
 
 
 def _learn(sequence: _Sequence) -> list[EyeColors | None]:
     """The colours of each eye, or None for an eye that is seen too little."""
-    rows = torch.linspace(0, len(sequence.own.state) - 1, min(_LEARNED_FROM, len(sequence.own.state)))
-    ends = [float(_POSITIONS[0])]
+    timesteps = len(sequence.own.state)
+    rows = torch.linspace(0, timesteps - 1, min(TRACKING.eyelids.learning_pictures, timesteps))
+    ends = [TRACKING.eyelids.position_range[0]]
     crops = map_in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
     return [
         learn_colors([crop for row in crops if (crop := row[number]) is not None])
@@ -158,20 +142,22 @@ def weigh_positions(
     at the usual position and vanishes where the lids meet. If the colours contradict the fit in many frames, they count
     for little in all frames.
     """
-    fine = np.arange(_POSITIONS[0], _POSITIONS[-1] + _FINE / 2, _FINE)
-    near = np.exp(-0.5 * ((fine[:, None] - _POSITIONS) / _BLUR) ** 2)
+    known = TRACKING.eyelids
+    positions = _positions()
+    fine = np.arange(positions[0], positions[-1] + known.fine_step / 2, known.fine_step)
+    near = np.exp(-0.5 * ((fine[:, None] - positions) / known.cost_blur) ** 2)
     costs = costs @ (near / near.sum(1, keepdims=True)).T
-    at = np.round((tracked - fine[0]) / _FINE).astype(int).clip(0, len(fine) - 1)
+    at = np.round((tracked - fine[0]) / known.fine_step).astype(int).clip(0, len(fine) - 1)
     above = (costs[np.arange(len(costs)), at] - costs.min(1)) / np.ptp(costs, axis=1).clip(1e-9)
-    costs = costs * (weight / _DOUBT / max(1.0, float(np.quantile(above, 0.75)) / _DISAGREEMENT) ** 4)
+    costs = costs * (weight / known.cost_divisor / max(1.0, float(np.quantile(above, 0.75)) / known.disagreement) ** 4)
 
     usual = np.median(tracked)
     often = tracked < usual + 0.1
-    middle = fine[(costs + 0.5 * ((fine - tracked[:, None]) / _FAR) ** 2).argmin(1)]
+    middle = fine[(costs + 0.5 * ((fine - tracked[:, None]) / known.offset_sigma) ** 2).argmin(1)]
     shift = np.median((middle - tracked)[often])
     share = ((1 - fine) / max(1 - np.median(tracked[often]), 0.3)).clip(0, 1.2)
     # If the most open position is the best one, the pixels do not show an eye but hair, a brow or a hand.
     costs[costs[:, 0] <= costs.min(1)] = 0
     corrected = fine - shift * share
-    far = np.log1p(((corrected - tracked[:, None]) / _SIGMA) ** 2)
+    far = np.log1p(((corrected - tracked[:, None]) / known.fit_sigma) ** 2)
     return corrected[(costs + far).argmin(1)]

@@ -15,10 +15,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.face import FaceModel
+from mien.tracking.constants import TRACKING
 
 _COMMAND = "python -m mien.lab.synthetic.detector_calibration"
-_MAX_TURN = 0.6
-"""Largest turn that was measured, in radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,7 @@ class DetectorResponse:
 
     def of_turns(self, head_rotation: Float[Tensor, "b 3"]) -> Float[Tensor, "b l 3"]:
         """The part of the offsets that depends on how far the head turns away from the camera."""
-        turns = head_rotation[:, :2].clamp(-_MAX_TURN, _MAX_TURN)
+        turns = head_rotation[:, :2].clamp(-TRACKING.landmarks.largest_turn, TRACKING.landmarks.largest_turn)
         return (turns @ self.by_turn.flatten(1)).reshape(len(turns), *self.mean.shape)
 
     def of_person(self, person: Float[Tensor, " k"]) -> Float[Tensor, "l 3"]:

@@ -14,25 +14,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
+from mien.capture.faces import LANDMARKS
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, Landmarks
 from mien.progress import track_progress
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform
-from mien.tracking.landmarks.groups import IBUG68, LANDMARKS, LEFT_IRIS, RIGHT_IRIS
+from mien.tracking.constants import TRACKING
+from mien.tracking.landmarks.groups import IBUG68, LEFT_IRIS, RIGHT_IRIS
 
 _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "ears")
 _EYE_REGIONS = ("eyes", "irises")
-_SCALP_FRONT = 0.06
-"""Landmarks may lie on the scalp only farther ahead of the head frame's origin than this, in metres."""
-_MIN_SEEN = 0.25
-"""Landmarks may lie on a triangle only if it is seen in at least this share of the pictures."""
 _WALL = (0.6, 0.6, 0.6)
-_SUBDIVISIONS = 12
-"""Number of steps along a triangle's side between the points that are tried."""
-_COARSE_VIEWS, _COARSE_SUBDIVISIONS, _BEST_TRIANGLES = 16, 3, 16
-"""Views and subdivisions of the coarse search over all triangles, and the number of triangles that it passes on."""
 
 
 @dataclass(frozen=True)
@@ -198,24 +192,25 @@ def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> C
 def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
     mask = model.region_mask(*regions)
     assert mask.any(), f"{model.name} has none of the regions {', '.join(regions)}"
-    mask &= ~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > _SCALP_FRONT)
+    mask &= ~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > TRACKING.embedding.scalp_front)
     # Hidden triangles, such as the inner side of a lid, may project nearer in every picture and still be wrong.
-    return mask & (seen >= _MIN_SEEN)
+    return mask & (seen >= TRACKING.embedding.least_seen)
 
 
 def _best_point(
     views: DetectedViews, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
+    known = TRACKING.embedding
     # First try few points of all triangles in some of the views, then all points of the best triangles in all views.
     some = DetectedViews(
-        *(part[:: max(1, len(part) // _COARSE_VIEWS)] for part in (views.vertices, views.depth, views.detected))
+        *(part[:: max(1, len(part) // known.coarse_views)] for part in (views.vertices, views.depth, views.detected))
     )
     everywhere = allowed.nonzero()[:, 0]
-    rough = _errors(some, faces[everywhere], _triangle_grid(_COARSE_SUBDIVISIONS), landmark)
+    rough = _errors(some, faces[everywhere], _triangle_grid(known.coarse_subdivisions), landmark)
     scores = rough.clamp_max(4 * clamp).sum(0).amin(1)
-    triangles = everywhere[scores.topk(min(_BEST_TRIANGLES, len(scores)), largest=False).indices]
-    weights = _triangle_grid(_SUBDIVISIONS)
+    triangles = everywhere[scores.topk(min(known.best_triangles, len(scores)), largest=False).indices]
+    weights = _triangle_grid(known.subdivisions)
     error = _errors(views, faces[triangles], weights, landmark)
     best = int(error.clamp_max(clamp).sum(0).argmin())
     triangle, point = divmod(best, len(weights))

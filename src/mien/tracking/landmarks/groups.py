@@ -4,10 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.capture.faces import LANDMARKS
+from mien.tracking.constants import TRACKING
 from mien.tracking.settings import LandmarkSet
-
-LANDMARKS = 478
-"""Number of landmarks: 468 of the face mesh and 5 of each iris."""
 
 OVAL = (
     10, 21, 54, 58, 67, 93, 103, 109, 127, 132, 136, 148, 149, 150, 152, 162, 172, 176, 234, 251, 284, 288, 297, 323,
@@ -42,13 +41,17 @@ IBUG68 = (
 _CONTOUR = 17
 """Number of points of `IBUG68` on the contour; they come first."""
 
-_WEIGHTS = ((OVAL, 0.15), (NOSE, 3.0), (LIPS, 3.0), (LEFT_EYELIDS + RIGHT_EYELIDS, 5.0), (LEFT_IRIS + RIGHT_IRIS, 4.0))
-
 
 def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:
     """Weight of each landmark in a fit. It is 0 for landmarks outside the set, and the mean is 1."""
-    weights = torch.ones(LANDMARKS, dtype=torch.float64)
-    for group, weight in _WEIGHTS:
+    weights, known = torch.ones(LANDMARKS, dtype=torch.float64), TRACKING.landmarks
+    for group, weight in (
+        (OVAL, known.oval_weight),
+        (NOSE, known.nose_weight),
+        (LIPS, known.lips_weight),
+        (LEFT_EYELIDS + RIGHT_EYELIDS, known.eyelids_weight),
+        (LEFT_IRIS + RIGHT_IRIS, known.irises_weight),
+    ):
         weights[list(group)] = weight
     if landmarks == "ibug51":
         left_out = torch.ones(LANDMARKS, dtype=torch.bool)

@@ -7,15 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.rotation import axis_angle_from_matrix
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import CameraBatch, Subject, Views, minimize_frames, pose_only
 from mien.tracking.landmarks.groups import rigid_weights
 from mien.tracking.landmarks.model import LandmarkModel
 from mien.tracking.landmarks.term import LandmarkTerm, landmark_term
 from mien.tracking.settings import TrackingSettings
-
-_ITERATIONS = 15
-_OUTLIER = 40.0
-"""Outlier threshold in sigmas. It is wide because a turned head is far from the frontal start."""
 
 
 def fit_head_pose(
@@ -50,7 +47,8 @@ def _wide(
     cameras: CameraBatch,
     settings: TrackingSettings,
 ) -> LandmarkTerm:
-    return replace(landmark_term(model, views, weights, state, cameras, settings), outlier=_OUTLIER)
+    term = landmark_term(model, views, weights, state, cameras, settings)
+    return replace(term, outlier=TRACKING.landmarks.first_outlier)
 
 
 def _minimize(
@@ -59,7 +57,7 @@ def _minimize(
     layout = term.model.layout
     return minimize_frames(
         lambda state: term.equations(state, subject, cameras), lambda state: term.cost(state, subject, cameras),
-        start, layout.bounds, _ITERATIONS,
+        start, layout.bounds, TRACKING.landmarks.pose_iterations,
     )  # fmt: skip
 
 

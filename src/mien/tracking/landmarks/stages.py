@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.progress import progress_bar
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import (
     CameraBatch,
     Course,
@@ -32,12 +33,8 @@ from mien.tracking.landmarks.shared_fit import fit_bias, fit_shared
 from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, unknown_subject
 from mien.tracking.settings import TrackingSettings
 
-_FRAME_ITERATIONS = 12
 _FRAMES_AT_ONCE = 512
 """Number of timesteps fitted in one batch, which takes about 100 MB of memory."""
-_ROUNDS = 2
-_SEQUENCE_ITERATIONS = 10
-"""Largest number of iterations of the fit over time, in all rounds together."""
 _LINE_SEARCH = (1.0, 0.5, 0.25, 0.1)
 _COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
 """Relative duration of each stage per timestep, for the progress bar, as in a clip of 15,000; multiples of ten."""
@@ -123,7 +120,7 @@ def _fit_motion(
     course.show("sequence", lambda: alone)
     smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
                   for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
-    advance = partial(_advance, course, "sequence", _SEQUENCE_ITERATIONS)
+    advance = partial(_advance, course, "sequence", TRACKING.landmarks.sequence_iterations)
     return fit_sequences(terms, alone, smoothness, advance, cache, fixed_subject)
 
 
@@ -170,7 +167,7 @@ def fit_frames(
         state = minimize_frames(
             lambda state: part.equations(state, subject, own.cameras),
             lambda state: part.cost(state, subject, own.cameras),
-            own.state[rows], term.model.layout.bounds, _FRAME_ITERATIONS,
+            own.state[rows], term.model.layout.bounds, TRACKING.landmarks.frame_iterations,
         )  # fmt: skip
         return {"state": state}
 
@@ -190,8 +187,8 @@ def fit_sequences(
 ) -> Fit:
     """Fit all timesteps of each sequence together under its smoothness cost, in turn with the landmarks' bias.
 
-    `advance` receives the number of finished timesteps in each of the `_SEQUENCE_ITERATIONS` iterations. If the subject
-    is fixed, the bias stays as it is.
+    `advance` receives the number of finished timesteps in each of the iterations. If the subject is fixed, the bias
+    stays as it is.
     """
     cache = cache or StageCache()
 
@@ -201,7 +198,7 @@ def fit_sequences(
         chains = tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts)
         return replace(fit, sequences=chains).tensors()
 
-    for number in range(_ROUNDS):
+    for number in range(TRACKING.landmarks.sequence_rounds):
         fit = fit_of(cache.get_or_compute(f"sequence-{number}", partial(round_from, fit)))
     return fit
 
@@ -213,7 +210,8 @@ def _fit_chain(
     smoothness: Smoothness,
     advance: Callable[[int], None],
 ) -> SequenceFit:
-    bounds, iterations = term.model.layout.bounds, _SEQUENCE_ITERATIONS // _ROUNDS
+    bounds, known = term.model.layout.bounds, TRACKING.landmarks
+    iterations = known.sequence_iterations // known.sequence_rounds
 
     def cost(state: Float[Tensor, "v p"]) -> float:
         return float(term.cost(state, subject, own.cameras).sum() + smoothness.cost(state))

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.rotation import matrix_from_axis_angle
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import CameraBatch, NormalEquations, SequenceFit, SharedEquations, Subject, Views
 from mien.tracking.landmarks.detector_response import DetectorResponse
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS, landmark_weights
@@ -18,8 +19,6 @@ _CHUNK = 48
 """Number of pictures linearised at once, which takes about 100 MB of memory."""
 _PROJECTED = 512
 """Number of pictures projected at once, which takes about as much memory."""
-_SIDEWAYS = 0.3
-"""Angle between the direction of the face and the camera at which a picture counts half, in radians."""
 
 
 def move_subject(subject: Subject, step: Float[Tensor, " s"], response: DetectorResponse) -> Subject:
@@ -226,6 +225,6 @@ def trust_of(views: Views, state: Float[Tensor, "v p"], cameras: CameraBatch) ->
     ahead = matrix_from_axis_angle(state[:, :3])[views.row, :, 2]
     sight = cameras.centers[views.camera] - state[views.row, 3:6]
     angle = ((ahead * sight).sum(-1) / sight.norm(dim=-1)).clamp(-1, 1).acos()
-    trust = 1 / (1 + (angle / _SIDEWAYS) ** 4)
+    trust = 1 / (1 + (angle / TRACKING.landmarks.sideways_angle) ** 4)
     best = torch.zeros_like(state[:, 0]).scatter_reduce(0, views.row, trust, "amax")
     return trust / best[views.row]

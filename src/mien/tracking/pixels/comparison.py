@@ -11,16 +11,13 @@ from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.render.mesh import vertex_normals
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import CameraBatch, batch_of
 from mien.tracking.pixels.pictures import Picture, Pictures
 from mien.tracking.pixels.surface import PosedSurface
 from mien.tracking.pixels.texture import Sighting, SkinTexture, texture_space
 from mien.tracking.tracking import Appearance, Tracking
 
-_OUTLIER = 10.0
-"""Beyond this many standard deviations a pixel hardly counts for `Comparison.rms`."""
-_MIN_PIXELS = 100.0
-"""Fewest pixels of a comparison. Fewer show nothing of a face."""
 _MARGIN, _MIN_WINDOW = 3, 8
 """Margin around a mesh and least size of a window, in pixels."""
 
@@ -84,7 +81,7 @@ class ModelPictures:
         radius = max(round(self.appearance.light_extent * float(view.K[0, 0]) / max(depth, 1e-3)), 2)
         seen = Sighting(posed, picture, self.appearance.light.contiguous()).arrays()
         cost, weight = _native.align_mesh(self.surface, seen, radius, None, residual, None)
-        rms = self.appearance.sigma * cost**0.5 if weight >= _MIN_PIXELS else float("nan")
+        rms = self.appearance.sigma * cost**0.5 if weight >= TRACKING.pixels.least_pixels else float("nan")
         return Comparison(window, picture.image - residual, residual.norm(dim=-1), rms)
 
 
@@ -94,5 +91,5 @@ def model_pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) 
     if appearance is None:
         return None
     texture = SkinTexture(appearance.texture.contiguous(), appearance.trust.contiguous(), appearance.sigma)
-    surface = texture_space(face_model, len(texture.albedo)).native(texture, _OUTLIER)
+    surface = texture_space(face_model, len(texture.albedo)).native(texture, TRACKING.pixels.comparison_outlier)
     return ModelPictures(Pictures(capture, 1), batch_of(tracking.cameras), appearance, surface, face_model)

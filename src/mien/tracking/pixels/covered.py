@@ -17,43 +17,15 @@ from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import HIDING_REGIONS, batch_of
 from mien.tracking.landmarks import BROWS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 from mien.tracking.pixels.comparison import window_of
 from mien.tracking.pixels.pictures import Picture, Pictures
 from mien.tracking.tracking import PARTS, Tracking
 
-_PLACES = {"mouth": (LIPS, 0.014), "nose": (NOSE, 0.008), "eyes": (LEFT_EYELIDS + RIGHT_EYELIDS + BROWS, 0.010)}
-"""Landmarks of each part, and the distance from them up to which triangles belong to it, in metres."""
-_SIZE = 256
-"""Shorter side of the pictures that are compared, in pixels."""
-_LIGHT = 0.012
-"""Standard deviation of the blur that counts as light and is left out, in metres on the face."""
-_MIN_COSINE = 0.3
-"""Least cosine between the surface's normal and the direction to the camera of a point that counts."""
-_MIN_SEEN = 0.4
-"""Least share of a part's points that a picture must show."""
-_LEAST = 0.35
-"""Correlation with the usual look of a part below which something covers it. A drawn hand reaches 0.29 at most. Seven
-real clips without hands have 0.43 or more, except for one frame of a grimace with 0.22, which `_LASTING` leaves out."""
-_LASTING = 0.05
-"""Half of the least time that something covers a part, in seconds. A grimace is shorter than a hand."""
-_ALIKE = 0.5
-"""Correlation with the usual look above which a frame has a part in it."""
-_FLAT = 0.05
-"""Share of the usual contrast below which a picture is flat, such as a phone's back: it correlates with nothing."""
-_USUAL = 0.3
-"""Share of the pictures that the usual look comes from. Fewer could be those of a hand that rests."""
-_MANY, _CLEARLY = 0.25, 0.1
-"""From this share of odd pictures on they may be the face itself. What moves in front of it is less alike from picture
-to picture, by this difference of correlations."""
-_ROUNDS = 5
-"""Rounds in which the usual look is made of all pictures that are like it."""
-_MIN_PICTURES = 8
-"""Fewest pictures of a part that can tell what is usual."""
-_LOOK_EVERY, _MIN_LOOKS = 0.2, 60
-"""Seconds between the frames that are looked at first, and their least number. A clip in which these show nothing odd
-is not looked at further."""
+_PLACES = {"mouth": LIPS, "nose": NOSE, "eyes": LEFT_EYELIDS + RIGHT_EYELIDS + BROWS}
+"""Landmarks of each part."""
 
 
 def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -> Bool[Tensor, "t c p"]:
@@ -64,13 +36,14 @@ def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -
     what moves in front of it does not look alike from frame to frame. A picture that hardly correlates with it is
     covered. The result depends on no texture and on no landmark of a covered part.
     """
+    known = TRACKING.covered
     seen = torch.from_numpy(np.asarray(capture.valid)) & tracking.valid[:, None]
     found = torch.zeros(*seen.shape, len(PARTS), dtype=torch.bool)
     places = _points_of(face_model)
-    pictures = Pictures(capture, max(round(min(capture.width, capture.height) / _SIZE), 1))
+    pictures = Pictures(capture, max(round(min(capture.width, capture.height) / known.picture_size), 1))
     for camera in range(seen.shape[1]):
         timesteps = seen[:, camera].nonzero()[:, 0]
-        stride = max(min(round(_LOOK_EVERY * capture.fps), len(timesteps) // _MIN_LOOKS), 1)
+        stride = max(min(round(known.look_every * capture.fps), len(timesteps) // known.least_looks), 1)
         first = timesteps[::stride]
         looks = _looks(pictures, tracking, face_model, places, camera, first)
         usual = [usual_look(*part) for part in looks]
@@ -80,7 +53,9 @@ def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -
             first = timesteps
             looks = _looks(pictures, tracking, face_model, places, camera, first)
             odd = [_unlike(look, *part) for look, part in zip(usual, looks, strict=True)]
-        found[first, camera] = torch.from_numpy(_lasting(np.stack(odd, axis=1), 2 * int(_LASTING * capture.fps) + 1))
+        found[first, camera] = torch.from_numpy(
+            _lasting(np.stack(odd, axis=1), 2 * int(known.lasting * capture.fps) + 1)
+        )
     return found
 
 
@@ -93,20 +68,21 @@ def usual_look(
         values: Colours of the points of a part without the light; 0 where a picture does not show a point.
         weights: 1 where a picture shows a point.
     """
-    enough = weights.mean(1) >= _MIN_SEEN
-    if enough.sum() < _MIN_PICTURES:
+    known = TRACKING.covered
+    enough = weights.mean(1) >= known.least_seen
+    if enough.sum() < known.least_pictures:
         return None
     values, weights = values[enough], weights[enough]
     flat, wide = values.reshape(len(values), -1), weights.repeat(3, axis=1)
     power = (flat**2) @ wide.T
-    power += _FLAT * np.quantile(power.diagonal(), 0.9) + 1e-9
+    power += known.flat * np.quantile(power.diagonal(), 0.9) + 1e-9
     alike = flat @ flat.T / np.sqrt(power * power.T)
-    count = max(round(_USUAL * len(flat)), 3)
+    count = max(round(known.usual_share * len(flat)), 3)
     center = np.sort(alike, axis=1)[:, -count].argmax()
     members = alike[center] >= np.sort(alike[center])[-count]
     look = _mean(values[members], weights[members])
-    for _ in range(_ROUNDS):
-        members = _likeness(look, values, weights) >= _ALIKE
+    for _ in range(known.usual_rounds):
+        members = _likeness(look, values, weights) >= known.alike
         if members.sum() < count:
             return None
         look = _mean(values[members], weights[members])
@@ -125,13 +101,13 @@ def the_face(
     Then a hand rests, or the light changed, and nothing says which of the two looks is the face.
     """
     odd = _unlike(look, values, weights)
-    if look is None or odd.mean() < _MANY:
+    if look is None or odd.mean() < TRACKING.covered.many:
         return look
     other = usual_look(values[odd], weights[odd])
     if other is None:
         return look
     own = np.median(_likeness(look, values[~odd], weights[~odd]))
-    return None if np.median(_likeness(other, values[odd], weights[odd])) > own - _CLEARLY else look
+    return None if np.median(_likeness(other, values[odd], weights[odd])) > own - TRACKING.covered.clearly else look
 
 
 def _likeness(
@@ -139,7 +115,7 @@ def _likeness(
 ) -> Float[np.ndarray, " n"]:
     """The correlation of each picture with the usual look, over the points that it shows."""
     flat, expected = values.reshape(len(values), -1), weights @ (look**2).sum(1) + 1e-9
-    return flat @ look.reshape(-1) / np.sqrt(((flat**2).sum(1) + _FLAT * expected) * expected)
+    return flat @ look.reshape(-1) / np.sqrt(((flat**2).sum(1) + TRACKING.covered.flat * expected) * expected)
 
 
 def _unlike(
@@ -147,7 +123,8 @@ def _unlike(
 ) -> Bool[np.ndarray, " n"]:
     if look is None:
         return np.zeros(len(values), bool)
-    return (_likeness(look, values, weights) < _LEAST) & (weights.mean(1) >= _MIN_SEEN)
+    known = TRACKING.covered
+    return (_likeness(look, values, weights) < known.least_likeness) & (weights.mean(1) >= known.least_seen)
 
 
 def _lasting(odd: Bool[np.ndarray, "n p"], frames: int) -> Bool[np.ndarray, "n p"]:
@@ -160,9 +137,10 @@ def _points_of(face_model: FaceModel) -> list[Int[Tensor, " _"]]:
     marks = face_model.landmark_positions(face_model.template, "mediapipe")
     middle = face_model.template[face_model.faces].mean(1)
     free, places = ~face_model.region_mask(*HIDING_REGIONS), []
+    known = TRACKING.covered
+    reaches = {"mouth": known.mouth_reach, "nose": known.nose_reach, "eyes": known.eyes_reach}
     for name in PARTS:
-        group, reach = _PLACES[name]
-        near = free & (torch.cdist(middle, marks[list(group)]).amin(1) < reach)
+        near = free & (torch.cdist(middle, marks[list(_PLACES[name])]).amin(1) < reaches[name])
         free = free & ~near
         places.append(near.nonzero()[:, 0])
     return places
@@ -210,12 +188,12 @@ def _sampled(
     mask = mask * ((shown >= 0) & skin.numpy()[shown])
     points = vertices[triangles].mean(1)
     at, depth = camera.project(points)
-    sigma = _LIGHT * float(camera.K[0, 0]) / max(float(depth.mean()), 1e-3)
+    sigma = TRACKING.covered.light_extent * float(camera.K[0, 0]) / max(float(depth.mean()), 1e-3)
     light = cv2.GaussianBlur(image * mask[..., None], (0, 0), sigma)
     light /= cv2.GaussianBlur(mask, (0, 0), sigma).clip(1e-3)[..., None]
     normals = torch.nn.functional.normalize(vertex_normals(vertices, face_model.faces)[triangles].mean(1), dim=1)
     cosine = (normals * torch.nn.functional.normalize(camera.position - points, dim=1)).sum(1).numpy()
     x, y = np.split((at - 0.5).numpy().astype(np.float32), 2, axis=1)
-    seen = (cv2.remap(mask, x, y, cv2.INTER_LINEAR)[:, 0] > 0.5) & (cosine > _MIN_COSINE)
+    seen = (cv2.remap(mask, x, y, cv2.INTER_LINEAR)[:, 0] > 0.5) & (cosine > TRACKING.covered.least_cosine)
     colors = cv2.remap(image - light, x, y, cv2.INTER_LINEAR)[:, 0]
     return colors * seen[:, None], seen.astype(np.float32)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mien.parallel import map_in_threads
 from mien.progress import progress_bar, say
+from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids import place_lids
 from mien.tracking.fitting import (
     Course,
@@ -42,18 +43,11 @@ from mien.tracking.pixels.texture import (
 )
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 
-_DAMPING = 1e-3
-_WORSE = 1.02
-"""A step of a frame is undone if it multiplies the frame's cost by this factor or more."""
 _FRAMES_AT_ONCE = 256
 """Number of timesteps whose equations are stored as one piece: a few seconds of work, about 10 MB."""
 _SHARED_COST, _APPEARANCE_COST, _LIDS_PART = 100, 40, 4
 """Costs for the progress bar. The first two are the durations of a step of identity and an estimate of the
 appearance, in timesteps of a step of all frames. The third is how many times longer such a step takes than the lids."""
-_MIN_KEYFRAMES = 3
-"""Fewest keyframes for any number of cameras, because the mouth must be seen open and closed."""
-_MIN_SHARE = 0.03
-"""Least weight of a frame in the texture, however far from the middle pose. It may be the only one to show an ear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +67,7 @@ class _Round:
     def keyframes(self) -> int:
         """Number of keyframes of each sequence for the steps of the shared parameters."""
         pictures = 2 * self.settings.keyframes // max(shot.capture.valid.shape[1] for shot in self.shots)
-        return min(self.settings.keyframes, max(pictures, _MIN_KEYFRAMES))
+        return min(self.settings.keyframes, max(pictures, TRACKING.pixels.least_keyframes))
 
     def pictures(self, shot: Shot) -> Pictures:
         """The pictures of a sequence at this round's size."""
@@ -125,7 +119,7 @@ class _Round:
         pictures, timesteps = self.pictures(shot), shot.valid.nonzero()[:, 0]
         middle = own.state[:, :3].median(0).values
         away = (own.state[:, :3] - middle).norm(dim=1) / self.settings.reference_angle
-        shares = 1 / (1 + away**4) + _MIN_SHARE if len(own.cameras) == 1 else torch.ones_like(away)
+        shares = 1 / (1 + away**4) + TRACKING.pixels.least_share if len(own.cameras) == 1 else torch.ones_like(away)
 
         def sight(row: int) -> list[Sighting]:
             posed = self.model.pose(own.state[row], identity, derive=False)
@@ -352,9 +346,9 @@ def _step(
     """Move all timesteps by one Gauss-Newton step, except those that it makes worse; also returns which ones moved."""
     bounds, state = term.layout.bounds, own.state
     equations = _equations(term, subject, own, cache, name, advance)
-    damping = torch.diag_embed(_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
+    damping = torch.diag_embed(TRACKING.pixels.frame_damping * equations.hessian.diagonal(dim1=1, dim2=2))
     held = bounds.held(state, equations.gradient + smoothness.gradient(state))
     damped = replace(equations, hessian=equations.hessian + damping)
     candidate = bounds.clip(state + solve_chain(damped, smoothness, state, held))
-    better = term.costs(candidate, subject, own.cameras) < _WORSE * equations.cost
+    better = term.costs(candidate, subject, own.cameras) < TRACKING.pixels.worse * equations.cost
     return torch.where(better[:, None], candidate, state), better

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import (
     Fit,
     SequenceFit,
@@ -20,14 +21,6 @@ from mien.tracking.fitting import (
 from mien.tracking.landmarks import move_subject
 from mien.tracking.pixels.outline import OutlineTerm
 from mien.tracking.pixels.term import PhotometricTerm
-
-_DAMPING = 1e-6
-"""Damping of a step. It is tiny, because the effect that separates focal length from depth is a thousandth of the
-effect of either alone."""
-_SMOOTHING = 0.3
-"""Ridge regularisation of the affine map from poses to pose steps, in keyframes."""
-_FOCAL_STEP = 0.2
-"""Largest change of the logarithm of a focal length in one step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +49,7 @@ def step_shared(
     A texture that was estimated with these very poses hardly resists a change that shifts all views alike, but it
     resists a change that the views contradict. So the step gains depth, from parallax. Outlines show the perspective.
     """
+    known = TRACKING.pixels
     subject, bounds = fit.subject, terms[0].layout.bounds
     rows = [choose_keyframes(own.state[:, :6], keyframes) for own in fit.sequences]
     frames, shared = [], []
@@ -71,12 +65,13 @@ def step_shared(
     state = torch.cat([own.state[chosen] for own, chosen in zip(fit.sequences, rows, strict=True)])
     held = bounds.held(state, equations.gradient)
     held[:, 6:] = True  # An expression that all frames share belongs to identity, but would drift here.
-    step, shared_step = solve_arrow(equations, join_shared(shared).with_prior(precision, values), held, _DAMPING)
+    with_prior = join_shared(shared).with_prior(precision, values)
+    step, shared_step = solve_arrow(equations, with_prior, held, known.shared_damping)
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
     for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, prior.lenses, strict=True):
         longer = 0.0 if lens is None else float(shared_step[len(subject.shared) + lens])
-        factor = math.exp(min(max(longer, -_FOCAL_STEP), _FOCAL_STEP))
+        factor = math.exp(min(max(longer, -known.focal_step), known.focal_step))
         sequences.append(SequenceFit(own.cameras.with_focal(factor), move_like_keyframes(own.state, chosen, own_step)))
     response = terms[0].landmarks.model.response
     return Fit(move_subject(subject, shared_step[: len(subject.shared)], response), tuple(sequences))
@@ -93,7 +88,7 @@ def move_like_keyframes(
     middle, scale = pose[chosen].mean(0), pose[chosen].std(0, correction=0).clamp_min(1e-3)
     features = torch.cat([torch.ones_like(pose[:, :1]), (pose - middle) / scale], dim=1)
     keys = features[chosen]
-    ridge = _SMOOTHING * torch.eye(7).to(pose)
+    ridge = TRACKING.pixels.pose_smoothing * torch.eye(7).to(pose)
     ridge[0, 0] = 0
     slopes = torch.linalg.solve(keys.T @ keys + ridge, keys.T @ step[:, :6])
     return torch.cat([pose + features @ slopes, state[:, 6:]], dim=1)

@@ -8,14 +8,12 @@ from torch import Tensor
 
 from mien import _native
 from mien.parallel import map_in_threads
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import CameraBatch, NormalEquations, ParameterLayout, SharedEquations, Subject, join_frames
 from mien.tracking.landmarks import LandmarkTerm
 from mien.tracking.pixels.pictures import Pictures
 from mien.tracking.pixels.surface import PosedSurface, SurfaceModel, by_log_focal
 from mien.tracking.pixels.texture import Sighting
-
-_MIN_PIXELS = 100.0
-"""Fewest pixels of a comparison. Fewer show nothing of a face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,7 @@ class PhotometricTerm:
                 picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
                 seen = Sighting(posed, picture, self.light).arrays()
                 cost, weight = _native.align_mesh(self.surface, seen, self.light_radius, None, None, None)
-                if weight >= _MIN_PIXELS:
+                if weight >= TRACKING.pixels.least_pixels:
                     found[row, camera] = self.sigma * cost**0.5
 
         map_in_threads(of_row, list(range(len(state))))

@@ -15,20 +15,10 @@ from mien import _native
 from mien.camera import Camera
 from mien.face import FaceModel
 from mien.render.mesh import MeshFragments, rasterize_mesh
+from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import HIDING_REGIONS, Fit, fit_of
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.surface import PosedSurface
-
-_MIN_COSINE = 0.25
-"""Least cosine between the surface's normal and the direction to the camera."""
-_MIN_WEIGHT = 0.05
-"""Least total weight of a texel's sightings (each the squared cosine) for the texel to be known."""
-_FIRST_SIGMA, _SIGMAS = 0.1, (0.01, 0.1)
-"""Expected colour difference before anything is known, and its bounds afterwards."""
-_ROUNDS = 3
-"""Number of rounds of albedo and light in turn."""
-_LIGHT_STIFFNESS = 0.02
-"""Weight of the prior that pulls the light towards an even one, relative to the evidence of the pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +68,7 @@ class TextureSpace:
         """The surface with a texture, for the native core."""
         return _native.AlignSurface(
             self.faces, self.corners, self.used.to(torch.uint8), texture.albedo, texture.trust,
-            texture.sigma, outlier, _MIN_COSINE,
+            texture.sigma, outlier, TRACKING.pixels.least_cosine,
         )  # fmt: skip
 
 
@@ -103,7 +93,7 @@ def even_light() -> Float[Tensor, "9 3"]:
 def unknown_texture(space: TextureSpace) -> SkinTexture:
     """The appearance before any picture: no texel is known."""
     size = space.fragments.face_index.shape
-    return SkinTexture(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
+    return SkinTexture(torch.zeros(*size, 3), torch.zeros(size), TRACKING.pixels.first_sigma)
 
 
 def estimate_appearance(
@@ -122,7 +112,7 @@ def estimate_appearance(
     """
     texture, known = start, bool((start.trust > 0).any())
     lights = [own[0].light for own in sightings]
-    for turn in range(_ROUNDS):
+    for turn in range(TRACKING.pixels.light_rounds):
         texture = _bake(space, sightings, lights, texture, outlier)
         if not texture.trust.any():
             return texture, lights
@@ -162,10 +152,11 @@ def _bake(
         for sighting in own:
             seen = replace(sighting, light=light).weighted().arrays()
             _native.bake_texture(surface, seen, space.fragments.face_index, space.fragments.barycentric, sums)
-    known = weight > _MIN_WEIGHT
+    known = weight > TRACKING.pixels.least_weight
     albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
     variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
-    sigma = float(variance[known].median().sqrt().clamp(*_SIGMAS)) if known.any() else texture.sigma
+    bounds = TRACKING.pixels.sigma_bounds
+    sigma = float(variance[known].median().sqrt().clamp(*bounds)) if known.any() else texture.sigma
     trust = known * (sigma**2 / (0.5 * sigma**2 + variance)).clamp_max(1.0)
     return SkinTexture(albedo, trust, sigma)
 
@@ -173,7 +164,7 @@ def _bake(
 def _one_color(texture: SkinTexture) -> SkinTexture:
     """The texture with its median colour in all known texels. At the start, all variation counts as light."""
     median = texture.albedo[texture.trust > 0].median(0).values
-    return replace(texture, albedo=(texture.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
+    return replace(texture, albedo=(texture.trust > 0)[..., None] * median, sigma=TRACKING.pixels.first_sigma)
 
 
 def _fit_light(
@@ -188,7 +179,8 @@ def _fit_light(
     for sighting in sightings:
         _native.light_equations(surface, replace(sighting, light=light).arrays(), hessian, right)
     hessian = hessian + hessian.triu(1).mT
-    stiffness = _LIGHT_STIFFNESS * hessian.diagonal(dim1=1, dim2=2).amax(1)[:, None].expand(3, 9).clone() + 1e-9
+    most = hessian.diagonal(dim1=1, dim2=2).amax(1)
+    stiffness = TRACKING.pixels.light_stiffness * most[:, None].expand(3, 9).clone() + 1e-9
     hessian = hessian + torch.diag_embed(stiffness)
     right = right + stiffness * even_light().T.double()
     return torch.linalg.solve(hessian, right).T.float().contiguous()
