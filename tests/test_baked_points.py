@@ -12,10 +12,8 @@ from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, Attrib
 from mien.runtime import posing
 from mien.runtime.baked import BlendSkinned
 from plain_settings import plain_mono_gaussian_avatar
-from test_point_network import NETWORKS, Sizes, arguments, isa, layers_of, point_network
+from test_point_network import NETWORKS, Sizes, arguments, layers_of, point_network
 from toy_scene import runtime_face, toy_face, toy_face_model
-
-__all__ = ["isa"]
 
 
 @pytest.mark.parametrize("sizes", NETWORKS, ids=lambda sizes: f"{sizes[0]} points")
