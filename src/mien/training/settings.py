@@ -55,6 +55,10 @@ class TrainSettings:
     no picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes;
     and alpha is compared with the matte (weight 0.2 or more). Auto: filled if one camera filmed, trained if there are
     several. Methods that bind no Gaussians to triangles train all sides in either case."""
+    mesh: Literal["tracked", "fitted"] = "tracked"
+    """The mesh that Gaussians are bound to. Tracked: as tracking left it. Fitted: before training, what stands out
+    beyond the person's mattes, such as a skull above the hair or an ear that hangs too low, is drawn into them. Try
+    fitted where an avatar has a cap above its hair or grey lobes beside its ears."""
     side_weight: Annotated[float, NOT_NEGATIVE] = 0.1
     """Weight of the views from the side and of raised expressions, in which filled heads are compared with the
     completed mesh."""

@@ -28,7 +28,7 @@ from mien.avatar import (
 )
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
-from mien.face import FaceModel, concatenate
+from mien.face import FaceModel, FaceParams, concatenate
 from mien.face.checks import check_face_params
 from mien.locks import hold
 from mien.perceptual import load_training_features
@@ -63,6 +63,7 @@ from mien.training.losses import train_psnr
 from mien.training.parts import Preparation, Step, passed
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.settings import TrainSettings
+from mien.training.whole_head import fitted_faces
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
@@ -228,11 +229,13 @@ def start(
     like: Tensor | None = None,
 ) -> TrainingState:
     """The state before the first step, with the float dtype and device of `like` (default: float32 on the CPU)."""
-    faces = [sequence.tracking.face for sequence in sequences]
-    face, frames = concatenate(faces), training_frames(sequences, settings)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
-        avatar = method_named(method_of(method_config)).avatar(method_config, face_model, face)
+    faces, frames = [sequence.tracking.face for sequence in sequences], training_frames(sequences, settings)
+    avatar = _first_avatar(method_config, face_model, concatenate(faces), settings)
+    fitted = fitted_faces(face_model, sequences, frames, settings, bound=avatar.surface() is not None)
+    if fitted is not None:
+        faces = fitted
+        avatar = _first_avatar(method_config, face_model, concatenate(faces), settings)
+    face = concatenate(faces)
     starts = [sum(map(len, faces[:index])) for index in range(len(faces))]
     trained = face[[starts[frame.sequence] + frame.timestep for frame in frames]]
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
@@ -256,6 +259,13 @@ def start(
     tuning = tuning_for(method_config.face_tuning, sequences)
     track = FaceTrack(face, tuning, lengths, face_model.expression_bounds, away)
     return TrainingState(avatar, Adam(), strategy, track, {}, parts, covered=given.known_coverage)
+
+
+def _first_avatar(config: MethodConfig, face_model: FaceModel, face: FaceParams, settings: TrainSettings) -> Avatar:
+    """The avatar before the first step. The same settings give the same bytes."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        return method_named(method_of(config)).avatar(config, face_model, face)
 
 
 def tuning_for(tuning: FaceTuning, sequences: Items[Sequence]) -> FaceTuning:

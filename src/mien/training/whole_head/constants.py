@@ -149,6 +149,30 @@ class WholeHeadConstants:
     spread_hold: float = 4.0
     """Weight of a known value against the mean of its neighbours while values spread. Not varied."""
 
+    # outline_fit.py
+    outline_frames: int = 48
+    """Largest number of frames whose outlines are looked at. Not varied."""
+    outline_frames_at_once: int = 6
+    """Number of frames in one round of the descent. Not varied."""
+    outline_rounds: int = 160
+    """Number of rounds. Measured: 240 leave as much of the mesh outside (log, 11-26)."""
+    outline_rate: float = 0.0012
+    """First step of the descent in metres. It falls to 0. Chosen with the number of rounds."""
+    outline_free: float = 1.0
+    """Distance in pixels from the matte up to which a vertex counts as inside. Not varied."""
+    outline_robust: float = 0.003
+    """Distance in metres beyond which the pull on a vertex grows no more. A frame can be tracked wrongly. Not
+    varied."""
+    outline_reach: float = 0.014
+    """Distance in metres over which the mesh moves together (standard deviation of a Gaussian). Geometry: an ear has
+    60 by 35 mm. Not varied."""
+    outline_spacing: float = 0.012
+    """Distance in metres between the points that are moved. Not varied."""
+    outline_shift_weight: float = 0.5
+    """Weight of the mean square of all shifts in metres, against the mean pull. It makes the smallest change win.
+    Measured: 2 leaves 0.2 to 0.5 % of the mesh outside on s18, d14 and d6, 0.5 leaves 0.1 to 0.3 %, 0.1 leaves 0.02 to
+    0.1 % and moves an ear by 12 mm (log, 11-26)."""
+
     # unseen.py
     unseen_confidence: float = 0.02
     """Confidence below which a triangle is made up. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to

@@ -1,0 +1,113 @@
+"""A tracked mesh that stands out beyond the mattes is drawn into them before training."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mien.avatar import DEFAULT_METHOD, FaceTuning
+from mien.face import FaceModel
+from mien.face.head_parts import head_parts
+from mien.render.mesh import rasterize_mesh
+from mien.training import Sequence, TrainSettings
+from mien.training.footage import Frame
+from mien.training.trainer import start
+from mien.training.whole_head import fitted_faces
+from mien.training.whole_head.outline_fit import fit_to_outlines, smooth_weights
+from plain_settings import plain_config, plain_run
+from test_hair_height import _TIMESTEPS, _sequence
+from toy_scene import toy_sequence
+
+_SLACK = 0.004
+"""Largest shift in metres where nothing is wrong: a pixel and a half. The rim of an ear is thinner than a pixel."""
+_FRAMES = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
+
+
+def _outside(model: FaceModel, sequence: Sequence, offsets: torch.Tensor | None) -> float:
+    """The share of the mesh's pixels that lie outside of the mattes, over all frames."""
+    out = drawn = 0
+    for frame in _FRAMES:
+        face = replace(sequence.tracking.face[frame.timestep], vertex_offsets=offsets)
+        mesh = rasterize_mesh(model(face)[0], model.faces, sequence.tracking.cameras[0]).face_index.numpy() >= 0
+        out += int((mesh & (sequence.capture.mattes[frame[1:]] < 128)).sum())
+        drawn += int(mesh.sum())
+    return out / drawn
+
+
+def _fitted(model: FaceModel, sequence: Sequence) -> torch.Tensor:
+    return fit_to_outlines(model, [sequence], [sequence.tracking.face], _FRAMES, threads=1)
+
+
+@pytest.fixture(scope="module")
+def low(anny: FaceModel) -> tuple[Sequence, torch.Tensor]:
+    """A person whose skull is 12 mm lower than the tracked one, and the fitted offsets."""
+    sequence = _sequence(anny, -0.012)
+    return sequence, _fitted(anny, sequence)
+
+
+def test_a_skull_that_is_too_high_sinks_into_the_outline(anny: FaceModel, low: tuple[Sequence, torch.Tensor]) -> None:
+    sequence, offsets = low
+    before, after = _outside(anny, sequence, None), _outside(anny, sequence, offsets)
+    assert before > 0.02
+    assert after < 0.25 * before
+    crown = anny.template[:, 1].argmax()
+    assert -0.016 < float(offsets[crown, 1]) < -0.008, "the crown sinks by what it was too high"
+
+
+def test_what_lies_inside_of_the_outline_stays(anny: FaceModel, low: tuple[Sequence, torch.Tensor]) -> None:
+    """The face of a person with a low skull does not move, and hair beyond a mesh that is right draws nothing."""
+    _, offsets = low
+    face = anny.faces[head_parts(anny).face].long().flatten()
+    assert float(offsets[face].norm(dim=1).mean()) < 0.0005
+    hairy = _fitted(anny, _sequence(anny, 0.03))
+    assert float(hairy.norm(dim=1).max()) < _SLACK
+
+
+def test_offsets_that_tracking_found_are_kept(anny: FaceModel) -> None:
+    own = torch.full_like(anny.template, 0.001)
+    sequence = _sequence(anny, 0.02)
+    tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, vertex_offsets=own))
+    found = _fitted(anny, replace(sequence, tracking=tracking))
+    assert float((found - own).norm(dim=1).max()) < _SLACK
+
+
+def test_smooth_weights_are_shares_of_near_points() -> None:
+    line = torch.linspace(0, 0.1, 101)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    weights = smooth_weights(line, reach=0.01, spacing=0.008)
+    torch.testing.assert_close(weights.sum(1), torch.ones(101))
+    shift = weights @ torch.linspace(0, 1, weights.shape[1])[torch.randperm(weights.shape[1])]
+    assert float((shift[1:] - shift[:-1]).abs().max()) < 0.2, "neighbours move alike"
+    assert weights.shape[1] < 30
+
+
+@pytest.mark.parametrize(
+    ("mesh", "unseen", "bound", "fits"),
+    [
+        ("fitted", "filled", True, True),
+        ("fitted", "trained", True, True),
+        ("tracked", "filled", True, False),
+        ("fitted", "filled", False, False),
+    ],
+)
+def test_which_meshes_are_fitted(mesh: str, unseen: str, bound: bool, fits: bool) -> None:
+    model, sequence = toy_sequence(timesteps=3, size=32)
+    settings = replace(TrainSettings(), mesh=mesh, unseen=unseen)
+    faces = fitted_faces(model, [sequence], [Frame(0, 0, 0)], settings, bound=bound)
+    assert (faces is not None) is fits
+
+
+def test_training_starts_from_the_fitted_mesh() -> None:
+    """The avatar, the track and all that is made from the mesh have the same offsets."""
+    model, sequence = toy_sequence(timesteps=3, size=32)
+    config = plain_config(DEFAULT_METHOD, face_tuning=FaceTuning(enabled=True))
+    # Nobody is in the pictures, so every vertex is drawn to the nearest pixel of a person in a corner.
+    mattes = np.zeros_like(sequence.capture.mattes)
+    mattes[:, :, :8, :8] = 255
+    away = Sequence(sequence.name, replace(sequence.capture, mattes=mattes), sequence.tracking, sequence.scoring)
+    state = start([away], model, config, plain_run(mesh="fitted", split="none"))
+    offsets = state.avatar.subject.vertex_offsets
+    assert offsets is not None
+    assert float(offsets.norm(dim=1).max()) > 0.002
+    assert state.track.face(1).vertex_offsets is not None
+    assert torch.equal(state.track.params().vertex_offsets, offsets)  # type: ignore[arg-type]
