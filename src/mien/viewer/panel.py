@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -206,8 +205,7 @@ class Panel:
                 self.move_sliders()
 
     def _add_expressions(self) -> None:
-        gui, session = self._server.gui, self._session
-        portable = session.avatar.portable
+        gui, portable = self._server.gui, self._session.avatar.portable
         bounds = dict(zip(portable.expression_names, portable.expression_bounds, strict=True))
         rest = dict(zip(portable.expression_names, portable.neutral.expression.tolist(), strict=True))
         groups, folders = grouped(portable.expression_names, portable.expression_bounds), {}
@@ -218,9 +216,7 @@ class Panel:
                 with folders[title]:
                     for name in names:
                         low, high = (float(bound) for bound in bounds[name])
-                        self._add_slider(
-                            name, readable(name), low, high, rest[name], partial(session.set_expression, name)
-                        )
+                        self._add_slider(name, readable(name), low, high, rest[name], self._expression_setter(name))
 
         @search.on_update
         async def _(event: Any) -> None:
@@ -230,17 +226,22 @@ class Panel:
                     self._sliders[name].visible = visible
                 folders[title].visible = any(found)
 
+    def _expression_setter(self, name: str) -> Callable[[float], None]:
+        return lambda value: self._session.set_expression(name, value)
+
     def _add_joints(self) -> None:
-        gui, session = self._server.gui, self._session
-        avatar = session.avatar
+        gui, avatar = self._server.gui, self._session.avatar
         if not avatar.joint_names:
             return
         with gui.add_folder("Joints", expand_by_default=False):
             for name, angles in zip(avatar.joint_names, avatar.portable.neutral.joints.tolist(), strict=True):
                 for axis, angle in enumerate(angles):
                     label = f"{readable(name)} {_AXES[axis]}"
-                    take = partial(session.set_joint, name, axis)
-                    self._add_slider(f"{name}_{'xyz'[axis]}", label, -MAX_ANGLE, MAX_ANGLE, angle, take)
+                    setter = self._joint_setter(name, axis)
+                    self._add_slider(f"{name}_{'xyz'[axis]}", label, -MAX_ANGLE, MAX_ANGLE, angle, setter)
+
+    def _joint_setter(self, name: str, axis: int) -> Callable[[float], None]:
+        return lambda value: self._session.set_joint(name, axis, value)
 
     def _add_slider(
         self, name: str, label: str, low: float, high: float, value: float, take: Callable[[float], None]
