@@ -1,10 +1,13 @@
 """Principal components of people have unit variance, no rigid motion, and keep the scale."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mien.face import anny_identity
 from mien.face.anny_identity import principal_components
+from mien.face.constants import FACE
 
 DIRECTIONS = 4
 
@@ -12,7 +15,7 @@ DIRECTIONS = 4
 @pytest.fixture
 def points(monkeypatch):
     """Return a symmetric cloud whose vertex i mirrors onto i ^ 1."""
-    monkeypatch.setattr(anny_identity, "COMPONENTS", 2 * DIRECTIONS)
+    monkeypatch.setattr(anny_identity, "FACE", replace(FACE, anny_components=2 * DIRECTIONS))
     half = np.random.default_rng(0).normal(size=(20, 3)) * 0.05
     return np.stack([half, half * [-1, 1, 1]], axis=1).reshape(-1, 3)
 
