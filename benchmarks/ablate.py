@@ -35,7 +35,7 @@ UNCHANGED = "unchanged"
 
 
 class Figures(NamedTuple):
-    """What a run got on its held-out frames: means over its protocols, PSNR in dB, and seconds of training."""
+    """Scores of a run on its held-out frames: means over its protocols, PSNR in dB, and seconds of training."""
 
     change: str
     capture: str

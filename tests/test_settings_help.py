@@ -1,4 +1,4 @@
-"""What the help says of settings and presets, and what presets may hold."""
+"""The help tells settings and presets with their ranges, and presets hold only what they may."""
 
 import re
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.
 
 
 def about_options(help_text: str) -> dict[str, str]:
-    """What the help says of each option, in one line."""
+    """The help of each option, in one line."""
     about: dict[str, str] = {}
     option = ""
     for line in help_text.replace("│", " ").splitlines():

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CameraConstants:
-    """What is assumed of a camera, and which landmarks are averaged before the fit: `fitting/shot.py`."""
+    """Assumptions about a camera, and landmarks that are averaged before the fit: `fitting/shot.py`."""
 
     focal: float = 1.5
     """Focal length of an unknown camera, in larger sides of the source picture. It lies between a phone's wide lens and
@@ -426,7 +426,7 @@ class DescentConstants:
 
 @dataclass(frozen=True)
 class NeckConstants:
-    """Where the head ends: `neck_line.py`, `neck_cut.py`, `scoring.py`. They decide what is trained and scored."""
+    """The lower end of the head: `neck_line.py`, `neck_cut.py`, `scoring.py`. It decides what is trained and scored."""
 
     # neck_line.py
     middle: tuple[float, float] = (0.4, 0.7)
@@ -470,7 +470,7 @@ class TrackingConstants:
     descent: DescentConstants = DescentConstants()
     """The schedule `paper`."""
     neck: NeckConstants = NeckConstants()
-    """Where the head ends."""
+    """The lower end of the head."""
 
 
 TRACKING = TrackingConstants()

@@ -168,7 +168,7 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
 
 
 def _of_runs(swings: Bool[Tensor, "t c"]) -> Bool[Tensor, "t c"]:
-    """Which swings belong to a run that is long enough."""
+    """Return which swings belong to a run that is long enough."""
     whole = swings.unfold(0, TRACKING.camera.swing_frames, 1).all(-1)
     kept = torch.zeros_like(swings)
     for shift in range(TRACKING.camera.swing_frames):
