@@ -20,6 +20,7 @@ from mien.camera import Camera
 from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
 from mien.parallel import stream_in_threads
+from mien.threads import one_torch_thread
 from mien.training.footage import Frame, Sequence, spread_frames
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.constants import WHOLE_HEAD
@@ -61,7 +62,8 @@ def fitted_faces(
     if not bound or settings.mesh != "fitted":
         return None
     faces = [sequence.tracking.face for sequence in sequences]
-    offsets = fit_to_outlines(face_model, sequences, faces, frames)
+    with one_torch_thread():  # so that the bytes do not depend on the number of threads
+        offsets = fit_to_outlines(face_model, sequences, faces, frames)
     return [replace(face, vertex_offsets=offsets) for face in faces]
 
 
