@@ -44,6 +44,7 @@ def make_experiment(timesteps: int = 50, split: Split = "blocks", seed: int = 0)
         training_frames=tuple(f for f in frames if not test[f.timestep]),
         held_out_frames=tuple(f for f in frames if test[f.timestep]),
         split=split,
+        edges="filmed",  # they hold no background
     )
 
 

@@ -43,6 +43,21 @@ def test_target_is_the_picture_inside_the_mask_over_white(experiment: Experiment
     torch.testing.assert_close(target[torch.from_numpy(alpha == 255)], image[torch.from_numpy(alpha == 255)])
 
 
+def test_the_truth_at_soft_edges_is_the_person_without_the_wall(experiment: Experiment) -> None:
+    """Each picture becomes one that was filmed before a green wall. Its soft pixels hold some of the wall."""
+    sequence, frame, wall = experiment.sequences[0], experiment.held_out_frames[0], np.array([0.0, 255.0, 0.0])
+    share = sequence.capture.mattes[..., None] / 255.0
+    filmed = np.rint(share * sequence.capture.images + (1 - share) * wall).astype(np.uint8)
+    before = replace(experiment, sequences=(replace(sequence, capture=replace(sequence.capture, images=filmed)),))
+    person, soft = target_image(experiment, frame), (share[frame[1:]] > 0.1) & (share[frame[1:]] < 0.9)
+    held, left = (
+        float((target_image(replace(before, edges=edges), frame) - person)[torch.from_numpy(soft[..., 0])].abs().mean())
+        for edges in ("filmed", "cleaned")
+    )
+    assert held > 0.1
+    assert left < 0.35 * held
+
+
 def test_the_box_of_some_frames_holds_their_crops_with_a_margin(experiment: Experiment) -> None:
     """Crops from (10, 20) to (60, 80) and from (30, 5) to (110, 45) span 100 x 75 pixels. The margin is 5 % of 100."""
     crops = experiment.scorings[0].crops.copy()

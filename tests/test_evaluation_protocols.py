@@ -199,11 +199,16 @@ def test_comparison_ranks_runs_of_the_same_frames(scored: dict[str, dict], root:
     assert [line.split("  ")[0] for line in lines] == ["short", "longer", "mean training picture", "coloured mesh"]
 
 
+@pytest.mark.parametrize("other_in", ["mask", "edges"])
 def test_comparison_warns_of_other_frames_masks_and_missing_runs(
-    scored: dict[str, dict], root: Path, tmp_path: Path
+    scored: dict[str, dict], root: Path, tmp_path: Path, other_in: str
 ) -> None:
     content = read_metrics(root / "runs" / "short")
-    content["protocols"]["self_reenactment"]["scored_on"]["talk"]["mask"] = "another"
+    entry = content["protocols"]["self_reenactment"]
+    if other_in == "mask":
+        entry["scored_on"]["talk"]["mask"] = "another"
+    else:
+        entry["edges"] = "filmed"
     other = tmp_path / "other"
     other.mkdir()
     write_json(other / "metrics.json", "mien.metrics", 1, content)
@@ -211,7 +216,7 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(
     comparison = compare_runs({"short": root / "runs" / "short", "other": other, "never": tmp_path / "never"})
     assert len(comparison.tables) == 2
     warnings = "\n".join(comparison.warnings)
-    assert "not scored on the same frames, pictures and masks: short | other" in warnings
+    assert "not scored on the same frames, pictures, soft edges and masks: short | other" in warnings
     assert "never: was not evaluated" in warnings
     with pytest.raises(UserError, match="no evaluated run"):
         compare_runs({"never": tmp_path / "never"})

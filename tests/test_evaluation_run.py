@@ -69,6 +69,7 @@ def test_what_is_scored_is_known_to_be(workspace: tuple[Path, Path]) -> None:
     evaluate(run_dir, [folder], quick)
     assert is_evaluated(run_dir, [folder], quick)
     assert not is_evaluated(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))
+    assert not is_evaluated(run_dir, [folder], replace(quick, edges="filmed"))
     (run_dir / "report.html").unlink()
     assert not is_evaluated(run_dir, [folder], quick)
     evaluate(run_dir, [folder])

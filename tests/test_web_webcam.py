@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mien.driving.live import OneEuro
 from mien.export import find_webcam_files, write_packed, write_page
 from mien.export.webcam import TEMPLATE, VERSION
 from test_web_element import served
@@ -355,6 +356,15 @@ def test_smoothing_calms_what_is_still_and_follows_what_is_fast(built: Path) -> 
     ]
     assert late[0] > 0.95
     assert late[0] > late[1]
+
+
+def test_smoothing_is_that_of_the_viewer(built: Path) -> None:
+    values, step = np.random.default_rng(1).standard_normal(40), 1 / 30
+    smooth = {"smoothing": {"rest": 1.5, "follow": 6}, "values": values.tolist(), "step": step}
+    smoothed = np.array(followed(built, False, [], smooth=smooth)["smoothed"])
+    smoother = OneEuro(np.array([1.5]), np.array([6.0]))
+    expected = [smoother(np.array([value]), index * step)[0] for index, value in enumerate(values)]
+    np.testing.assert_allclose(smoothed, expected, rtol=1e-9, atol=1e-12)
 
 
 CLASS = """(async () => {

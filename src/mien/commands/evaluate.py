@@ -39,6 +39,9 @@ class Command:
     """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
     perceptual_frames: int = 24
     """Largest number of frames, evenly spread, on which ST-LPIPS is computed. 0 means all frames."""
+    edges: Literal["cleaned", "filmed"] = "cleaned"
+    """Truth at soft edges of the matte: colours of the person alone (cleaned), or pictures as they were filmed, which
+    hold some of the background there (filmed), for figures beside those of other programs."""
     fit_faces: bool = False
     """Also score the avatar with expression and pose fitted to each held-out frame by its colours: a third figure
     beside those as tracked and corrected, never the headline. It takes longer."""
@@ -69,6 +72,8 @@ class Command:
             raise UserError(f"--fit-steps {self.fit_steps}: give a number from 1 to 10000")
         if self.fit_faces and (self.compare or self.images is not None):
             raise UserError("--fit-faces: is for one run, without --compare and --images; leave it out")
+        if self.edges == "filmed" and (self.compare or self.images is not None):
+            raise UserError("--edges filmed: is for one run, without --compare and --images; leave it out")
         if self.images is not None or self.truth is not None:
             self._check_images()
         elif not self.workspaces:
@@ -97,6 +102,7 @@ class Command:
             perceptual=self.perceptual,
             perceptual_frames=self.perceptual_frames,
             pictures=self.pictures,
+            edges=self.edges,
             fit_faces=self.fit_faces,
             fit_steps=self.fit_steps,
         )

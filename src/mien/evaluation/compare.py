@@ -123,7 +123,7 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
             sets = " | ".join(", ".join(run.label for run in group) for group in groups.values())
             warnings.append(
                 f"{protocol}: these runs have separate tables, because they were not scored on the same frames, "
-                f"pictures and masks: {sets}"
+                f"pictures, soft edges and masks: {sets}"
             )
     for table in tables:
         warnings += _differences(table)
@@ -131,10 +131,10 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
 
 
 def _ground(entry: Mapping[str, Any]) -> str:
-    """Two runs can be compared if they share these: the scored frames, pictures and masks."""
+    """Two runs can be compared if they share these: the scored frames, pictures, soft edges and masks."""
     frames = entry["per_frame"]
     keys = ("sequence", "timestep", "camera_id")
-    return repr([entry["scored_on"], entry["pixels"], *(frames[key] for key in keys)])
+    return repr([entry["scored_on"], entry["edges"], entry["pixels"], *(frames[key] for key in keys)])
 
 
 def _differences(table: Table) -> list[str]:

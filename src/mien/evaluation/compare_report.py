@@ -104,9 +104,10 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> lis
     columns: list[list[tuple[Picture, Picture]]] = []
     truths: list[Picture] = []
     captions: list[str] = []
+    edges = table.rows[0].entry["edges"]
     for run in track_progress(runs, f"pictures {table.protocol}", len(runs)):
         # One run's avatar and sequences at a time, so that memory does not grow with the number of runs.
-        experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir]).get(table.protocol)
+        experiment = load_experiments(run.run_dir, sequence_dirs[run.run_dir], edges).get(table.protocol)
         if experiment is None or len(experiment.held_out_frames) != count:
             raise UserError(
                 f"{run.run_dir / 'metrics.json'}: has figures of other frames than the run held out; evaluate the "

@@ -23,7 +23,7 @@ from mien.ranges import check_ranges
 from mien.storage import file_digest, write_json
 from mien.training import read_coverage, read_curves, read_run_config, read_training_summary
 
-_RECIPE = 3
+_RECIPE = 4
 """Version of the scoring. It is raised whenever the same frame would get other figures."""
 
 
@@ -58,7 +58,7 @@ def _evaluate(
     run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings, driver_dirs: Items[Path]
 ) -> dict[str, Any]:
     summary = read_training_summary(run_dir)
-    experiments = load_experiments(run_dir, sequence_dirs)
+    experiments = load_experiments(run_dir, sequence_dirs, settings.edges)
     if not experiments and not driver_dirs:
         raise UserError(
             f"{run_dir}: no frame was held out, so nothing can be scored; train with `--split blocks` or "
@@ -109,7 +109,7 @@ def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: Evaluation
         known = read_metrics(run_dir).get("fingerprints")
     except UserError:
         return False
-    experiments = load_experiments(run_dir, sequence_dirs)
+    experiments = load_experiments(run_dir, sequence_dirs, settings.edges)
     expected = {name: _fingerprint(run_dir, name, each, settings) for name, each in experiments.items()}
     return bool(expected) and known == expected and (run_dir / "report.html").is_file()
 
@@ -127,7 +127,7 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
     content = [
         _RECIPE, protocol, file_digest(run_dir / "avatar" / "avatar.safetensors"),
         file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,
-        settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone,
+        settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone, settings.edges,
     ]  # fmt: skip
     if settings.fit_faces:
         content.append(settings.fit_steps)

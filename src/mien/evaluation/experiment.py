@@ -16,13 +16,16 @@ from mien.pictures import Box
 from mien.render import rasterize
 from mien.render.validation import drawable
 from mien.tracking import Scoring
-from mien.training.footage import Frame, Sequence, composite
+from mien.training.footage import Frame, Sequence, composite, foreground_colors
 
 FaceSource = Literal["as_tracked", "corrected"]
 """Face parameters of held-out frames: as the tracker left them, or corrected by what training changed in neighbouring
 frames; a held-out sequence takes the mean change of the head's pose. Corrections never use the pixels of held-out
 frames."""
 
+Edges = Literal["cleaned", "filmed"]
+"""Colours of the truth where the matte is soft: those of the person alone (`foreground_colors`), or as filmed, with
+a share of the background behind the person."""
 
 _HEAD_MARGIN = 0.05
 
@@ -42,6 +45,7 @@ class Experiment:
     held_out_frames: tuple[Frame, ...]
     split: str
     """Name of the split: `blocks`, `tail`, `sequences`, `cameras`."""
+    edges: Edges = "cleaned"
     digests: tuple[dict[str, str], ...] = ()
     """The hashes of the `pictures` and the `mask` of each sequence. Empty if nothing was read from disk."""
 
@@ -80,8 +84,11 @@ def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:
 
 
 def target_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
-    """The target of a rendering, at 8 bits: the picture inside the frozen scoring mask, over white."""
-    picture = np.asarray(experiment.sequences[frame.sequence].capture.images[frame[1:]])
+    """The target of a rendering, at 8 bits: the person inside the frozen scoring mask, over white."""
+    capture = experiment.sequences[frame.sequence].capture
+    picture = np.asarray(capture.images[frame[1:]])
+    if experiment.edges == "cleaned":
+        picture = foreground_colors(picture, np.asarray(capture.mattes[frame[1:]]))
     mask = np.asarray(experiment.scorings[frame.sequence].masks[frame[1:]])
     return torch.from_numpy(composite(picture, mask, np.full(3, 255, np.uint8))).float() / 255
 

@@ -10,7 +10,7 @@ from mien.avatar import load_avatar
 from mien.capture import read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
-from mien.evaluation.experiment import Experiment, FaceSource
+from mien.evaluation.experiment import Edges, Experiment, FaceSource
 from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.tracking import read_scoring, read_scoring_hash
@@ -18,14 +18,14 @@ from mien.training import Sequence, TrainSettings, check_data, read_face_track, 
 from mien.training.footage import Frame, held_out, sequence_of, training_frames
 
 
-def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Experiment]:
+def load_experiments(run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "cleaned") -> dict[str, Experiment]:
     """The experiments of a run, by protocol. The result is empty if nothing was held out.
 
     - `self_reenactment` (`self_reenactment_tail` for that split): held-out timesteps of the training sequences.
     - `self_reenactment_sequence`: whole held-out sequences, with the mean correction of the head's pose.
     - `novel_view`: held-out cameras, at timesteps that were trained with other cameras.
 
-    The first two include all cameras, also held-out ones.
+    The first two include all cameras, also held-out ones. `edges` says what the truth is at soft edges.
 
     Raises:
         UserError: the run is not finished, or the sequences are not those that it was trained on.
@@ -58,6 +58,7 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path]) -> dict[str, Exp
         training_frames=tuple(training_frames(sequences, settings)),
         held_out_frames=(),
         split=settings.split,
+        edges=edges,
         digests=digests,
     )
     return {

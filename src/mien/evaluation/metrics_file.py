@@ -3,8 +3,9 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from mien.evaluation.experiment import Edges
 from mien.evaluation.scoring import METRICS
 from mien.face import PARTS
 from mien.inside import is_one_line
@@ -78,6 +79,7 @@ def figure(entry: Mapping[str, Any], part: str | None, metric: str) -> float | N
 def _check_protocol(entry: Mapping[str, Any]) -> None:
     _check_row(entry)
     _require(is_one_line(entry["split"]) and entry["face_params"] in FACE_SOURCE_NAMES, "split or face_params")
+    _require(entry["edges"] in get_args(Edges), "edges")
     _number(entry, "frames", whole=True)
     _number(entry, "seconds_per_frame")
     if "covered_frames" in entry:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
-from mien.evaluation.experiment import Experiment, avatar_image, scored_on, target_image
+from mien.evaluation.experiment import Edges, Experiment, avatar_image, scored_on, target_image
 from mien.evaluation.fitting import LOSS, FittedFaces
 from mien.evaluation.metrics import psnr
 from mien.evaluation.partial import PartialScores
@@ -49,6 +49,8 @@ class EvaluationSettings(ScoreSettings):
     """Largest number of frames in each side-by-side video. 0 makes no videos."""
     pictures: bool = False
     """Whether to write every scored picture and its truth as png as well."""
+    edges: Edges = "cleaned"
+    """Colours of the truth at soft edges of the matte: cleaned of the background, or as filmed."""
     fit_faces: bool = False
     """Whether to score the avatar a third time, with expression and pose fitted to each held-out frame's picture."""
     fit_steps: Annotated[int, Range(1, 10_000)] = 20
@@ -175,6 +177,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "perceptual_frames": sum("perceptual" in row for row in own_rows),
         "split": experiment.split,
         "mask": _MASK,
+        "edges": experiment.edges,
         "crop": _CROP,
         "part_crops": _PART_CROPS,
         "ssim_window": SSIM_WINDOW,

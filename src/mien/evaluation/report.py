@@ -153,6 +153,8 @@ def _tables(protocols: Mapping[str, Any]) -> list[DataTable]:
             f"{entry['training_frames']['psnr']:.2f} dB, head crop {entry['training_frames']['head']['psnr']:.2f} dB"
             f" · ST-LPIPS on {entry['perceptual_frames']} evenly spread frames"
         )
+        if entry["edges"] == "filmed":
+            caption += " · soft edges as they were filmed"
         if "covered_frames" in entry:
             caption += f" · in {entry['covered_frames']} of the held-out frames something covers a part of the face"
         head = [[Cell("", "blank"), *metric_groups()], [Cell(""), *metric_headings()]]

@@ -38,8 +38,7 @@ class TrainSettings:
     """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
     avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
     backgrounds. Cleaned: the colours of the person alone, as estimated from what is solid nearby. Auto: cleaned where
-    sides are filled (`--training.unseen`), else filmed. Pictures are scored as they were filmed in either case, which
-    costs a cleaned avatar some tenths of a decibel."""
+    sides are filled (`--training.unseen`), else filmed. Scores do not depend on it (`mien evaluate --edges`)."""
     frame_order: Literal["even", "rare"] = "even"
     """How often frames are drawn: each equally often, or those with a rare expression up to four times as often as
     those with a common one."""

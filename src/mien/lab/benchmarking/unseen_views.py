@@ -26,7 +26,7 @@ from mien.progress import track_progress
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
 from mien.tracking import NeckParts, head_crop, head_cutter
-from mien.training.footage import composite, measure_coverage
+from mien.training.footage import composite, foreground_colors, measure_coverage
 from mien.training.whole_head import complete_colors, vertex_means
 
 AVATAR, MESH = "avatar", "mesh"
@@ -187,9 +187,9 @@ def score_side_views(
         camera = camera_beside(cameras[view.camera], face.behind(ahead))
         gaussians = experiment.avatar.pose(used[timestep]).gaussians.timestep(0)
         place = (view.moment, view.camera)
-        mask = head_cutter(model, neck, used[timestep])(np.asarray(pictures.capture.mattes[place]), camera)
-        white = np.full(3, 255, np.uint8)
-        picture = composite(np.asarray(pictures.capture.images[place]), mask, white)
+        matte, white = np.asarray(pictures.capture.mattes[place]), np.full(3, 255, np.uint8)
+        mask = head_cutter(model, neck, used[timestep])(matte, camera)
+        picture = composite(foreground_colors(np.asarray(pictures.capture.images[place]), matte), mask, white)
         vertices = model(used[timestep])[0]
         images = {
             AVATAR: rasterize(gaussians, camera, torch.ones(3)).image.clamp(0, 1),

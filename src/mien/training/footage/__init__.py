@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         with_shown_angles,
         write_coverage,
     )
+    from mien.training.footage.foreground import foreground_colors
     from mien.training.footage.frames import (
         Frame,
         FrameOrder,
@@ -74,6 +75,7 @@ __all__ = [
     "evenly_spread",
     "expression_rarity",
     "filmed_words",
+    "foreground_colors",
     "held_out",
     "hidden_triangles",
     "inside_triangles",

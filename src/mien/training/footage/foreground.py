@@ -55,13 +55,16 @@ def _mean(
     colors: UInt8[np.ndarray, "h w 3"], weights: UInt8[np.ndarray, "h w"], window: int
 ) -> Float[np.ndarray, "h w 3"]:
     """Weighted mean of the colours around each pixel; 0 where all weights are 0."""
-    weighted = np.multiply(colors, weights[..., None], dtype=np.float32)
-    # Products and sums are integers, which a double holds exactly, so their order does not matter.
+    weighted = cv2.multiply(colors, cv2.merge([weights] * 3), dtype=cv2.CV_16U)
+    # Products and sums are integers, which both types hold exactly, so their order does not matter.
+    depth, summed = cv2.CV_32S, (weighted, weights)
+    if window * window * 255 * 255 >= 1 << 31:
+        depth, summed = cv2.CV_64F, (weighted.astype(np.float32), weights.astype(np.float32))
     total, weight = (
-        cv2.boxFilter(values, cv2.CV_64F, (window, window), normalize=False, borderType=cv2.BORDER_REFLECT)
-        for values in (weighted, weights.astype(np.float32))
+        cv2.boxFilter(values, depth, (window, window), normalize=False, borderType=cv2.BORDER_REFLECT)
+        for values in summed
     )
-    return total.astype(np.float32) / np.maximum(weight, 1).astype(np.float32)[..., None]
+    return cv2.divide(total.astype(np.float32), cv2.merge([np.maximum(weight, 1).astype(np.float32)] * 3))
 
 
 def _rounded(colors: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
