@@ -86,6 +86,8 @@ def test_smooth_weights_are_shares_of_near_points() -> None:
     [
         ("fitted", "filled", True, True),
         ("fitted", "trained", True, True),
+        ("auto", "filled", True, True),
+        ("auto", "trained", True, False),
         ("tracked", "filled", True, False),
         ("fitted", "filled", False, False),
     ],

@@ -141,7 +141,7 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
     assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
 
 
-@pytest.mark.parametrize(("filled", "expected"), [(True, "random"), (False, "white")])
+@pytest.mark.parametrize(("filled", "expected"), [(True, "mixed"), (False, "white")])
 def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> None:
     assert resolved(TrainSettings(background="auto"), filled=filled).background == expected
     assert resolved(TrainSettings(background="white"), filled=filled).background == "white"

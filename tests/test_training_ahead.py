@@ -65,7 +65,7 @@ def test_every_integer_is_the_rounded_one() -> None:
 
 
 @pytest.mark.parametrize("resolution", [0, 21])
-@pytest.mark.parametrize("background", ["white", "random"])
+@pytest.mark.parametrize("background", ["white", "mixed", "random"])
 def test_the_queue_gives_the_targets_of_the_steps(resolution: int, background: str) -> None:
     sequence = toy_sequence(6, 32)[1]
     settings = replace(SETTINGS, background=background)

@@ -65,7 +65,7 @@ class TargetQueue:
         kept = targets.kept(frame.timestep, frame.camera, background)
         if kept is not None:
             return kept
-        keep = self._settings.background != "random"
+        keep = self._settings.background == "white"
         return self._worker.submit(targets.composed, frame.timestep, frame.camera, background, keep)
 
 

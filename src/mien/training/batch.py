@@ -59,7 +59,7 @@ class TrainingData:
         if self.ahead is not None:
             return targets.moved(self.ahead.target(step))
         background = background_at(settings, step)
-        return targets.target(frame.timestep, frame.camera, background, keep=settings.background != "random")
+        return targets.target(frame.timestep, frame.camera, background, keep=settings.background == "white")
 
     def goal(
         self, target: Target, perceptual: PerceptualLoss, step: int, settings: TrainSettings

@@ -167,18 +167,20 @@ class FrameOrder:
 
 
 def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
-    """The settings without `auto`: filled sides have random backgrounds and cleaned edges, others white and filmed."""
+    """The settings without `auto`: filled sides have mixed backgrounds and cleaned edges, others white and filmed."""
     if settings.background == "auto":
-        settings = replace(settings, background="random" if filled else "white")
+        settings = replace(settings, background="mixed" if filled else "white")
     return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
 
 
 def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:
     """The background colour of a step, 0 to 255."""
-    if settings.background != "random":
-        return np.full(3, 255, dtype=np.uint8)
     generator = random_at(settings.seed, _BACKGROUND, step)
-    return torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)
+    color = torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)
+    drawn = settings.background == "random" or (
+        settings.background == "mixed" and float(torch.rand((), generator=generator)) < FOOTAGE.mixed_share
+    )
+    return color if drawn else np.full(3, 255, dtype=np.uint8)
 
 
 def density_random(settings: TrainSettings, step: int) -> torch.Generator:

@@ -24,6 +24,7 @@ from mien.threads import one_torch_thread
 from mien.training.footage import Frame, Sequence, spread_frames
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.constants import WHOLE_HEAD
+from mien.training.whole_head.unseen import fills_sides
 
 _FIRST, _SECOND = 0.8, 0.95
 """Decay of the running means of the gradient and of its square (Adam; Kingma and Ba 2015)."""
@@ -59,7 +60,8 @@ def fitted_faces(
 
     `bound` says whether the avatar's Gaussians are bound to the mesh. To others it does not matter.
     """
-    if not bound or settings.mesh != "fitted":
+    wanted = settings.mesh == "fitted" or (settings.mesh == "auto" and fills_sides(frames, settings, bound=bound))
+    if not (bound and wanted):
         return None
     faces = [sequence.tracking.face for sequence in sequences]
     with one_torch_thread():  # so that the bytes do not depend on the number of threads
