@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from mien.avatar import METHODS, has_method, method_named, method_names
+from mien.avatar import METHODS, has_method, method_named, method_names, method_of
 from mien.avatar.methods import Method
 from mien.cli import main
 from mien.errors import UserError
-from mien.plugins import plugin, plugin_names
+from mien.plugins import plugin_names
 from test_new_dataset import cache, puppet, write
 from toy_package import blocks, entry_points, install, mien
+from toy_workspace import write_toy_workspace
 
 __all__ = ["cache"]
 RECIPES = ("Add a method", "Add a format", "Add a dataset")
@@ -67,6 +68,78 @@ def test_one_package_adds_one_of_each(tmp_path: Path, cache: str) -> None:  # no
     assert "or install the package that adds it" in gone.stderr
 
 
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("place") / "W"
+    write_toy_workspace(folder)
+    return folder
+
+
+BROKEN = "[mien.formats]\nnone9 = mien_none9:IT\n[mien.datasets]\nnone9 = mien_none9:IT\n"
+"""Entry points of a package whose module cannot be imported."""
+
+
+@pytest.mark.parametrize("code", ["from mien.formats import NO_SUCH_NAME as IT", "raise SystemExit(3)"])
+def test_a_broken_package_is_named_and_everything_else_works(workspace: Path, tmp_path: Path, code: str) -> None:
+    install(tmp_path, "mien_none9", code, BROKEN)
+    (good,) = blocks(RECIPES[1], "python")
+    install(tmp_path, "mien_xyz9", good.replace("xyz", "xyz9"), entry_points(RECIPES[1]).replace("xyz", "xyz9"))
+    (tmp_path / "F").mkdir()
+    (tmp_path / "F/point_cloud.ply").touch()
+    out = ("export", str(workspace), "--out")
+    quiet = (("create", "--help"), (*out, str(tmp_path / "me.ply"), "--format", "ply"))
+    named = (("export", "--help"), ("import", "--help"), (*out, str(tmp_path / "me.xyz9")))
+    for line in (*quiet, *named):
+        done = mien(tmp_path, *line)
+        told = [text for text in done.stderr.splitlines() if text.startswith("warning: ")]
+        assert done.returncode == 0, done.stderr
+        assert len(told) == (line in named)
+        assert all("mien_none9:IT: mien-none9 adds it to mien." in text for text in told)
+        assert all(text.endswith("; update or uninstall mien-none9; mien goes on without it") for text in told)
+    assert (tmp_path / "me.xyz9").exists()
+    for line in (
+        (*out, str(tmp_path / "a.none9"), "--format"),
+        ("import", str(tmp_path / "F"), "--out", "O", "--dataset"),
+    ):
+        refused = mien(tmp_path, *line, "none9")
+        (told,) = refused.stderr.splitlines()
+        assert (refused.returncode, told[:39]) == (2, "mien: mien_none9:IT: mien-none9 adds it")
+
+
+def test_a_dataset_that_fails_to_look_is_named(tmp_path: Path) -> None:
+    code = (
+        "from mien.datasets import Dataset\nIT = Dataset('none9', 'none', 'avatar', lambda path: path.nothing, print)\n"
+    )
+    install(tmp_path, "mien_none9", code, "[mien.datasets]\nnone9 = mien_none9:IT\n")
+    (tmp_path / "F").mkdir()
+    done = mien(tmp_path, "import", str(tmp_path / "F"), "--out", str(tmp_path / "O"))
+    warning, told = done.stderr.splitlines()
+    assert done.returncode == 2
+    assert warning.startswith(f"warning: {tmp_path / 'F'}: the dataset 'none9' fails (AttributeError(")
+    assert "is no dataset that mien knows" in told
+
+
+def test_a_method_without_its_classes_is_named_and_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = (
+        "from dataclasses import dataclass\nfrom mien.avatar import Method, MethodConfig\n\n\n"
+        "@dataclass(frozen=True)\nclass ToyConfig(MethodConfig):\n    pass\n\n\n"
+        "A, B = (Method(f'mien_toys_c:{name}', f'mien_toys_c:{name}Config') for name in ('Typo', 'Toy'))\n"
+    )
+    install(tmp_path, "mien_toys_c", code, "[mien.methods]\ntoy_a = mien_toys_c:A\ntoy_b = mien_toys_c:B\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    _forget()
+    try:
+        assert method_of(method_named("toy_b").config()) == "toy_b"
+        with pytest.raises(UserError, match="^mien_toys_c:TypoConfig: cannot be imported .*; update or uninstall"):
+            print(method_named("toy_a").config)
+        with pytest.raises(UserError, match="^mien_toys_c:Typo: cannot be imported .*; update or uninstall"):
+            print(method_named("toy_a").avatar)
+    finally:
+        _forget()
+
+
 def puppet_vertices() -> list[int]:
     from toy_scene import toy_face_model
 
@@ -92,7 +165,8 @@ def test_methods_of_packages_are_found_by_name(tmp_path: Path, monkeypatch: pyte
         install(tmp_path, "mien_toys_b", code, "[mien.methods]\ntoy_a = mien_toys_b:OWN\n")
         _forget()
         with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'toy_a' to mien.methods; uninstall"):
-            method_names()
+            method_named("toy_a")
+        assert method_names() == [*METHODS, "toy_a", "wrong"], "others go on working"
     finally:
         _forget()
 
@@ -111,6 +185,6 @@ def _forget() -> None:
     """Read entry points again."""
     from mien import plugins
 
-    plugin.cache_clear()
+    plugins._loaded.cache_clear()
     plugins._points.cache_clear()
     assert plugin_names is plugins.plugin_names

@@ -1,6 +1,8 @@
 """Additions of other packages to the registries: entry points (`importlib.metadata`) of groups such as `mien.formats`.
 
 Entry points are read at their first use, because that takes 30 ms, which most commands do not need.
+
+A faulty addition stops only what asks for it by name. Lists leave it out, with a warning that names its package.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -8,6 +10,7 @@ from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
 from mien.errors import UserError
+from mien.terminal import tell
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -16,15 +19,10 @@ _T = TypeVar("_T")
 
 
 def plugin_names(group: str) -> list[str]:
-    """Return the names of what installed packages add to a registry, sorted. Nothing of theirs is imported.
-
-    Raises:
-        UserError: two packages use the same name.
-    """
+    """Return the names of what installed packages add to a registry, sorted. Nothing of theirs is imported."""
     return list(_points(group))
 
 
-@cache
 def plugin(group: str, name: str, kind: type[_T]) -> _T | None:
     """Return what an installed package adds to a registry under a name; None if none does.
 
@@ -34,64 +32,83 @@ def plugin(group: str, name: str, kind: type[_T]) -> _T | None:
         kind: Class of the object that the entry point names.
 
     Raises:
-        UserError: the entry point cannot be imported, or is something else. It names the package.
+        UserError: the entry point cannot be imported, or is something else, or two packages use the name. It names the
+            package.
     """
-    point = _points(group).get(name)
-    if point is None:
-        return None
-    package = _package(point)
-    remedy = f"update or uninstall {package}"
-    try:
-        loaded = point.load()
-    except Exception as error:  # whatever the code of another package raises
-        raise UserError(f"{point.value}: {package} adds it to {group}; it fails ({error!r}); {remedy}") from error
-    if not isinstance(loaded, kind):
-        raise UserError(f"{point.value}: {package} adds it to {group}, and it is no {kind.__name__}; {remedy}")
+    loaded = _loaded(group, name, kind)
+    if isinstance(loaded, UserError):
+        raise loaded
     return loaded
 
 
 def plugins(group: str, kind: type[_T]) -> dict[str, _T]:
     """Return all that installed packages add to a registry, by name and sorted by it.
 
-    Raises:
-        UserError: as for `plugin` and `plugin_names`.
+    What `plugin` refuses is left out, with a warning.
     """
-    found = ((name, plugin(group, name, kind)) for name in plugin_names(group))
-    return {name: loaded for name, loaded in found if loaded is not None}
+    found = {name: _loaded(group, name, kind) for name in plugin_names(group)}
+    for loaded in found.values():
+        if isinstance(loaded, UserError):
+            warn(str(loaded))
+    return {name: loaded for name, loaded in found.items() if isinstance(loaded, kind)}
 
 
 def with_plugins(group: str, kind: type[_T], own: Sequence[_T], words: Callable[[_T], Iterable[str]]) -> list[_T]:
     """Return a registry: mien's own objects, then those of other packages.
 
+    What `plugin` refuses is left out, with a warning, and so is an object that has a word of one before it.
+
     Args:
         group: Group of entry points, such as "mien.formats".
         kind: Class of the objects.
         own: Mien's own objects.
-        words: Function that returns the words by which an object is found. No two objects may share one.
-
-    Raises:
-        UserError: as for `plugin`, or an object of another package has a word of one before it.
+        words: Function that returns the words by which an object is found.
     """
     found = list(own)
     for name, added in plugins(group, kind).items():
         taken = {word for each in found for word in words(each)}
         if clash := taken & set(words(added)):
-            one = kind.__name__.lower()
-            raise UserError(f"the {one} {name!r}: {min(clash)} is taken by another {one}; uninstall its package")
-        found.append(added)
+            one, package = kind.__name__.lower(), _package(_points(group)[name][0])
+            warn(f"the {one} {name!r}: {min(clash)} is taken by another {one}; update or uninstall {package}")
+        else:
+            found.append(added)
     return found
 
 
 @cache
-def _points(group: str) -> "dict[str, EntryPoint]":
+def warn(fault: str) -> None:
+    """Tell that something is left out of a registry, once in a process."""
+    tell(f"warning: {fault}; mien goes on without it")
+
+
+@cache
+def _loaded(group: str, name: str, kind: type[_T]) -> _T | UserError | None:
+    """Return what an entry point names, or what is wrong with it. A module that fails is imported only once."""
+    points = _points(group).get(name, ())
+    if len(points) > 1:
+        packages = " and ".join(map(_package, points))
+        return UserError(f"{packages} both add {name!r} to {group}; uninstall one of them")
+    for point in points:
+        package = _package(point)
+        remedy = f"update or uninstall {package}"
+        try:
+            loaded = point.load()
+        except (Exception, SystemExit) as error:  # whatever the code of another package raises
+            return UserError(f"{point.value}: {package} adds it to {group}; it fails ({error!r}); {remedy}")
+        if isinstance(loaded, kind):
+            return loaded
+        return UserError(f"{point.value}: {package} adds it to {group}, and it is no {kind.__name__}; {remedy}")
+    return None
+
+
+@cache
+def _points(group: str) -> "dict[str, list[EntryPoint]]":
+    """Return the entry points of a group by name, sorted by it. Two packages may use one name."""
     from importlib.metadata import entry_points  # takes 20 ms
 
-    found: dict[str, EntryPoint] = {}
+    found: dict[str, list[EntryPoint]] = {}
     for point in sorted(entry_points(group=group), key=lambda each: each.name):
-        if point.name in found:
-            packages = f"{_package(found[point.name])} and {_package(point)}"
-            raise UserError(f"{packages} both add {point.name!r} to {group}; uninstall one of them")
-        found[point.name] = point
+        found.setdefault(point.name, []).append(point)
     return found
 
 

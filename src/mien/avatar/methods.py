@@ -7,6 +7,7 @@ This file needs no torch, because the command line lists the methods' settings a
 
 import importlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Method:
-    """A method: the class of its avatars, and its settings. Both are imported at their first use."""
+    """A method: the class of its avatars, and its settings. Both are imported at their first use.
+
+    That raises UserError, in one line that names the class, if it belongs to another package and cannot be imported.
+    """
 
     avatar_class: str
     """"MODULE:CLASS"; see `avatar`."""
@@ -32,7 +36,8 @@ class Method:
     @property
     def config(self) -> type[MethodConfig]:
         """The class of the method's settings. Its defaults are the preset `standard`."""
-        return named(self.config_class)
+        with _imports(self.config_class):
+            return named(self.config_class)
 
     @property
     def presets(self) -> Mapping[str, Differences]:
@@ -41,13 +46,27 @@ class Method:
         Every method has `draft` and `standard`. The module of its settings adds to the former, and adds others, by
         `PRESETS`.
         """
-        own = getattr(importlib.import_module(self.config_class.split(":")[0]), "PRESETS", {})
+        with _imports(self.config_class):
+            own = getattr(importlib.import_module(self.config_class.split(":")[0]), "PRESETS", {})
         return {"draft": {}, "standard": {}, **own}
 
     @property
     def avatar(self) -> "type[Avatar]":
         """The class of the method's avatars. Its arguments are (config, face_model, face)."""
-        return named(self.avatar_class)
+        with _imports(self.avatar_class):
+            return named(self.avatar_class)
+
+
+@contextmanager
+def _imports(place: str) -> Iterator[None]:
+    """Import the class at a place "MODULE:CLASS". What fails in another package is not reported as a bug in mien."""
+    try:
+        yield
+    except Exception as error:  # whatever the code of another package raises
+        if place.startswith("mien."):
+            raise
+        remedy = "update or uninstall the package of this method"
+        raise UserError(f"{place}: cannot be imported ({error!r}); {remedy}") from error
 
 
 METHODS = {
@@ -98,7 +117,15 @@ def method_named(name: str) -> Method:
 
 def method_of(config: MethodConfig) -> str:
     """The name of the method that a config belongs to."""
-    return next(name for name, method in _all_methods() if method.config is type(config))
+    return next(name for name, method in _all_methods() if _is_of(method, config))
+
+
+def _is_of(method: Method, config: MethodConfig) -> bool:
+    """Whether a config belongs to a method. None belongs to a method of a package that cannot be imported."""
+    try:
+        return method.config is type(config)
+    except UserError:
+        return False
 
 
 def _all_methods() -> Iterator[tuple[str, Method]]:

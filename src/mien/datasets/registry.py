@@ -8,26 +8,29 @@ from pathlib import Path
 from mien.datasets.dataset import Dataset
 from mien.datasets.gaussian_avatars import GAUSSIAN_AVATARS
 from mien.errors import UserError
-from mien.plugins import with_plugins
+from mien.plugins import plugin, warn, with_plugins
 
 _OWN = (GAUSSIAN_AVATARS,)
+_GROUP = "mien.datasets"
+"""Group of entry points of other packages."""
 
 
 def datasets() -> list[Dataset]:
     """Return all datasets: mien's own first, then those of other packages.
 
-    Raises:
-        UserError: a dataset of another package cannot be imported, or has the name of one before it.
+    A dataset is left out, with a warning, if it cannot be imported, or has the name of one before it.
     """
-    return with_plugins("mien.datasets", Dataset, _OWN, lambda each: (each.name,))
+    return with_plugins(_GROUP, Dataset, _OWN, lambda each: (each.name,))
 
 
 def find_dataset(name: str) -> Dataset:
     """Return a dataset by its name.
 
     Raises:
-        UserError: there is none of this name.
+        UserError: there is none of this name, or that of another package cannot be imported.
     """
+    if all(each.name != name for each in _OWN):
+        plugin(_GROUP, name, Dataset)
     found = next((each for each in datasets() if each.name == name), None)
     if found is None:
         raise UserError(f"--dataset {name}: there is no such dataset; choose one of {known_datasets()}")
@@ -40,13 +43,24 @@ def recognised(path: Path) -> tuple[Dataset, str]:
     Raises:
         UserError: no dataset recognises the path, or several do.
     """
-    found = [(each, told) for each in datasets() if (told := each.recognises(path)) is not None]
+    found = [(each, told) for each in datasets() if (told := _told(each, path)) is not None]
     if not found:
         raise UserError(f"{path}: is no dataset that mien knows; give one of {known_datasets()}")
     if len(found) > 1:
         names = " and ".join(each.name for each, _ in found)
         raise UserError(f"{path}: is recognised as {names}; choose one with --dataset NAME")
     return found[0]
+
+
+def _told(dataset: Dataset, path: Path) -> str | None:
+    """Return what a dataset finds at a path. One of another package that raises finds nothing, and is named."""
+    if dataset in _OWN:
+        return dataset.recognises(path)
+    try:
+        return dataset.recognises(path)
+    except Exception as error:  # whatever the code of another package raises
+        warn(f"{path}: the dataset {dataset.name!r} fails ({error!r}); update or uninstall its package")
+        return None
 
 
 def known_datasets() -> str:

@@ -3,6 +3,7 @@
 Other packages add formats by entry points of the group `mien.formats`.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 from mien.formats.format import Format
@@ -14,18 +15,20 @@ from mien.formats.ply import PLY
 from mien.formats.sog import SOG
 from mien.formats.spz import SPZ
 from mien.formats.usd import USD
-from mien.plugins import with_plugins
+from mien.plugins import plugin, with_plugins
 
 _OWN = (MIEN, PAGE, PACKED, GLB, PLY, SPZ, SOG, USD, GAUSSIAN_AVATARS)
+
+_GROUP = "mien.formats"
+"""Group of entry points of other packages. They are imported only for lists, and for formats that mien lacks."""
 
 
 def formats() -> list[Format]:
     """Return all formats: mien's own first, then those of other packages.
 
-    Raises:
-        UserError: a format of another package cannot be imported, or has the name or an ending of one before it.
+    A format is left out, with a warning, if it cannot be imported, or has the name or an ending of one before it.
     """
-    return with_plugins("mien.formats", Format, _OWN, lambda each: (each.name, *each.endings))
+    return with_plugins(_GROUP, Format, _OWN, lambda each: (each.name, *each.endings))
 
 
 def endings(only_from_files: bool = False) -> list[str]:
@@ -35,12 +38,25 @@ def endings(only_from_files: bool = False) -> list[str]:
 
 def format_of(path: Path) -> Format | None:
     """Return the format of a file by its ending, in any case; None if there is none."""
-    return next((each for each in formats() if path.suffix.lower() in each.endings), None)
+    ending = path.suffix.lower()
+    return _first(lambda each: ending in each.endings) if ending else None
 
 
 def find_format(name: str) -> Format | None:
-    """Return a format by its name, or by an ending without its dot; None if there is none."""
-    return next((each for each in formats() if each.name == name or f".{name}" in each.endings), None)
+    """Return a format by its name, or by an ending without its dot; None if there is none.
+
+    Raises:
+        UserError: a package adds a format of that name, and it cannot be imported.
+    """
+    if all(each.name != name for each in _OWN):
+        plugin(_GROUP, name, Format)
+    return _first(lambda each: each.name == name or f".{name}" in each.endings)
+
+
+def _first(fits: Callable[[Format], bool]) -> Format | None:
+    """Return the first format that fits. Other packages are asked only if it is none of mien's own."""
+    own = next(filter(fits, _OWN), None)
+    return own or next(filter(fits, formats()), None)
 
 
 def numbered(path: Path, index: int) -> Path:
