@@ -55,8 +55,8 @@ class TrainOptions:
     subject: str | None = None
     """Subject of --split gaussian-avatars, for example 306 (default: the number in the workspace's name)."""
     background: Literal["white", "mixed", "random", "auto"] = "auto"
-    """Background of the training pictures. random: no white in outlines, for 0.2 to 0.6 dB. mixed: random in three of
-    ten steps. auto: mixed where sides are filled, else white."""
+    """Background of the training pictures; mixed is random in three of ten steps. auto: mixed where sides are filled,
+    else white."""
     steps: int = 0
     """Number of optimiser steps, over which all schedules stretch. 0 means the preset's number."""
     seed: int = 0
