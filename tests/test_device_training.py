@@ -16,7 +16,7 @@ from torch import Tensor
 import mien.devices
 import train_toy
 from mien import _native
-from mien.avatar import load_avatar
+from mien.avatar import GaussianAvatarsConfig, load_avatar
 from mien.cli import main
 from mien.commands import render
 from mien.devices import choose_device, like_on
@@ -49,7 +49,7 @@ def train_some(
     face_model, sequence = scene
     order = FrameOrder(training_frames([sequence], settings), settings.seed)
     data = TrainingData(order, (Targets(sequence, settings.resolution, like=like),))
-    state = start([sequence], face_model, train_toy.CONFIG, settings, like)
+    state = start([sequence], face_model, config, settings, like)
     for _ in range(settings.steps):
         step(state, data, settings)
     return state
@@ -133,6 +133,18 @@ def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
     store = on_gpu.avatar.gaussian_store()
     assert all(store[name].is_cuda for name in store.names())
     assert_alike(on_gpu, native)
+
+
+@pytest.mark.parametrize("device", ["float64", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_a_whole_head_is_trained_on_a_device(scene: Scene, device: str) -> None:
+    """By default, with sides that are filled and features. Steps reach a correction of the hair and a prune."""
+    like = like_on("cuda") if device == "cuda" else torch.zeros((), dtype=torch.float64)
+    config = replace(GaussianAvatarsConfig(), appearance="features")
+    settings = TrainSettings(steps=16, split="none", unseen="filled", mesh="fitted", record_every=1)
+    state = train_some(scene, like, config, settings)
+    store = state.avatar.gaussian_store()
+    assert all(store[name].device.type == like.device.type for name in store.names())
+    assert all(torch.isfinite(store[name]).all() for name in store.trained)
 
 
 @pytest.mark.gpu

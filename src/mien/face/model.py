@@ -134,7 +134,7 @@ class FaceModel:
     def region_mask(self, *names: str) -> Bool[Tensor, " f"]:
         """Return which triangles belong to any of the named regions. Names that the model lacks match nothing."""
         wanted = [index for index, name in enumerate(self.region_names) if name in names]
-        return torch.isin(self.face_regions, torch.tensor(wanted, dtype=self.face_regions.dtype))
+        return torch.isin(self.face_regions, self.face_regions.new_tensor(wanted))
 
     def __call__(self, face: FaceParams) -> Float[Tensor, "b v 3"]:
         """Return vertices in world space, in metres.
