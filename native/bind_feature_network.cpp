@@ -101,7 +101,8 @@ struct GradientArrays {
     require(has_shape(outputs, own.count(), own.bias2.shape(0) - 1) && has_shape(last, own.count()),
             "outputs must have one row per Gaussian");
     require(same_shape(features, own.neutral) && same_shape(weight1, own.weight1) && same_shape(bias1, own.bias1) &&
-                same_shape(weight2, own.weight2) && same_shape(bias2, own.bias2) && has_shape(inputs, inputs_count),
+                same_shape(weight2, own.weight2) && same_shape(bias2, own.bias2) &&
+                (inputs.shape(0) == 0 || has_shape(inputs, inputs_count)),
             "a gradient must have the shape of its array");
   }
 };
@@ -143,7 +144,8 @@ void feature_network_backward(const Group<NetworkArrays>& group, const Bases& ba
   mien::feature_network_backward(network, {items.data(), static_cast<int64_t>(items.size())},
                                  {kept.features.data(), kept.hidden.data()},
                                  {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(),
-                                  out.bias1.data(), out.weight2.data(), out.bias2.data(), out.inputs.data()});
+                                  out.bias1.data(), out.weight2.data(), out.bias2.data(),
+                                  out.inputs.shape(0) == 0 ? nullptr : out.inputs.data()});
 }
 
 void factored_update(const Out<-1, -1, -1>& values, const In<-1, -1>& rows, const In<-1>& columns,

@@ -10,7 +10,6 @@ import torch
 import train_toy
 from mien import runtime
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, make_portable
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.ops.feature_network import Layers, feature_network_reference
 from mien.avatar.settings import GradientSettings
 from mien.errors import UserError
@@ -61,16 +60,15 @@ def test_starts_as_without_features() -> None:
 
 
 def test_color_and_opacity_change_by_the_network() -> None:
-    """By the plain formula from the activations, the features and the triangles' places, in float64."""
+    """By the plain formula from the activations and the features, in float64."""
     avatar, face = new_avatar(), toy_face(5)[2]
     assert avatar.appearance is not None
     store, (activations,) = avatar.store, avatar.activations(face)
-    vertices = avatar.face_model.head_vertices(avatar.subject)[0]
-    places = positional_encoding(vertices[avatar.face_model.faces.long()].mean(1) / 0.05, 4)[store["face_index"]]
     layers = avatar.appearance._layers()
     exact = Layers(*(tensor.double() for tensor in layers))
     bases, neutral = store["feature_bases"].double(), store["neutral_features"].double()
-    color, opacity = feature_network_reference(bases, activations.double(), neutral, places.double(), exact)
+    nothing = neutral.new_zeros(len(neutral), 0)
+    color, opacity = feature_network_reference(bases, activations.double(), neutral, nothing, exact)
     posed, still = avatar.pose(face).gaussians, replace(CONFIG, expression_rank=RANK, appearance="static")
     static = GaussianAvatars(still, toy_face_model(), toy_face(5))
     static.store.load_state_dict({name: store.state_dict()[name] for name in static.store.state_dict()})
@@ -99,16 +97,27 @@ def test_baked_avatars_pose_alike(settings: dict[str, Rate], far: float, tmp_pat
             )
 
 
-def test_gradients_reach_features_network_and_face() -> None:
+def test_a_gaussian_without_features_never_changes() -> None:
+    avatar = new_avatar()
+    for name in ("feature_bases", "neutral_features"):
+        values = avatar.store[name].detach().clone()
+        values[0] = 0
+        avatar.store.assign(name, values)
+    changes = avatar.pose(toy_face(5)).aux
+    for name in ("feature_color", "feature_opacity"):
+        assert not changes[name][:, 0].any()
+        assert changes[name][:, 1].any()
+
+
+def test_gradients_reach_features_and_network() -> None:
     avatar, face = new_avatar(), toy_face(5)[1]
     assert avatar.appearance is not None
-    face = replace(face, expression=face.expression.clone().requires_grad_())
     posed = avatar.pose(face).gaussians
     (posed.sh.square().sum() + posed.opacities.sum()).backward()
     ((rows, columns),) = avatar.appearance._gradient.take()
     assert rows.abs().sum() > 0
     torch.testing.assert_close(columns, avatar.activations(face)[0])
-    parameters = [avatar.store["neutral_features"], *avatar.appearance.parameters(), face.expression]
+    parameters = [avatar.store["neutral_features"], *avatar.appearance.parameters()]
     assert all(tensor.grad is not None and tensor.grad.abs().sum() > 0 for tensor in parameters)
 
 

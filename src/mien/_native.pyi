@@ -416,7 +416,7 @@ class FeatureGradients(NamedTuple):
     weight2: Tensor
     bias2: Tensor
     inputs: Tensor
-    """Of the inputs of all bases, in their order."""
+    """Of the inputs of all bases, in their order. Empty if it is not wanted."""
 
 def feature_network(
     network: FeatureNetwork, bases: Sequence[FeatureBases], kept: FeatureKept | None, outputs: Tensor, last: Tensor

@@ -55,9 +55,8 @@ class GaussianAvatars(Avatar):
         self.appearance = None
         if config.appearance == "features":
             trained |= feature_tensors(trained["means"], self._activation_count, config.appearance_features)
-            vertices = face_model.head_vertices(self.subject)[0]
             widths = (config.appearance_features, config.appearance_hidden)
-            self.appearance = FeatureAppearance(vertices, face_model.faces, *widths)
+            self.appearance = FeatureAppearance(like[:, 0], *widths)
         if self._changes:
             self.activations = ExpressionActivations(face, self.subject, self._activation_count)
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})

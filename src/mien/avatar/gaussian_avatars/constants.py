@@ -10,12 +10,6 @@ from dataclasses import dataclass
 class GaussianAvatarsConstants:
     """The constants of this room, by the file that uses them. `benchmarks/ablate.py` measures what one is worth."""
 
-    # feature_appearance.py
-    feature_bands: int = 4
-    """Octaves of the encoding of a place. As in HeadGaS; not varied here."""
-    feature_length: float = 0.05
-    """Unit of this encoding, in metres. As in HeadGaS; not varied here."""
-
     # hair_strands.py
     strands_per_area: float = 150_000.0
     """Strands per square metre of scalp. Set by eye (log, 11-24)."""

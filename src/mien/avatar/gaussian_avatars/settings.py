@@ -102,12 +102,12 @@ class GaussianAvatarsConfig(MethodConfig):
     appearance: Literal["static", "features"] = "static"
     """Whether a Gaussian's colour and opacity stay as they are, as in the paper, or also change with features that the
     activations of the face blend and one small network reads, as in HeadGaS."""
-    appearance_directions: Annotated[int, Range(1, 64)] = 20
+    appearance_directions: Annotated[int, Range(1, 64)] = 12
     """Number of activations of the face that blend the features, with `appearance` features. It is at least
     `expression_rank`."""
-    appearance_features: Annotated[int, Range(1, 256)] = 32
+    appearance_features: Annotated[int, Range(1, 256)] = 16
     """Number of features of each Gaussian, with `appearance` features."""
-    appearance_hidden: Annotated[int, Range(1, 1024)] = 64
+    appearance_hidden: Annotated[int, Range(1, 1024)] = 32
     """Width of the only hidden layer of the features' network."""
     appearance_rate: Rate = Rate(2.5e-3)
     """Learning rate of the features, per step."""

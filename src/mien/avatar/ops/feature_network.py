@@ -129,7 +129,8 @@ class _Network(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, by_others: Tensor, by_last: Tensor) -> tuple[Tensor | None, ...]:
         bases, inputs, neutral, own, *layers = ctx.saved_tensors[:8]
-        by_features, by_inputs = recycled(*neutral.shape), torch.empty_like(inputs)
+        by_features = recycled(*neutral.shape)
+        by_inputs = torch.empty(len(inputs) if ctx.needs_input_grad[2] else 0)
         by_layers = [torch.empty_like(tensor) for tensor in layers]
         _native.feature_network_backward(
             _native.FeatureNetwork(*unpacked(neutral, own, *layers)),
@@ -141,4 +142,4 @@ class _Network(torch.autograd.Function):
         )
         if ctx.needs_input_grad[1]:
             ctx.gradient.terms.append((by_features, inputs))
-        return None, None, by_inputs, by_features, None, *by_layers
+        return None, None, by_inputs if len(by_inputs) else None, by_features, None, *by_layers
