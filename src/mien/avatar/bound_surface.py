@@ -5,6 +5,7 @@ that close a head, move its hair or fill its mouth work on it alone, and never k
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from jaxtyping import Bool, Float, Int
@@ -88,6 +89,13 @@ class BoundSurface(ABC):
     @abstractmethod
     def raise_by(self, shift: Float[Tensor, " f"]) -> None:
         """Move Gaussians along the normals of their triangles, by metres."""
+
+    @abstractmethod
+    def change_penalty(self, changes: Mapping[str, Tensor]) -> Float[Tensor, ""] | None:
+        """The method's own penalty of changes with the expression that the mesh does not make (`Posed.aux`).
+
+        None if there are none.
+        """
 
     @abstractmethod
     def fill_interior(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:

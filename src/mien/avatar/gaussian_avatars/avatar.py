@@ -14,6 +14,7 @@ from torch import Tensor
 from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import GradientDensity, highest_opacities_seen
+from mien.avatar.gaussian_avatars.changes import BASES, change_penalties
 from mien.avatar.gaussian_avatars.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.surface import GaussianSurface
@@ -26,11 +27,6 @@ from mien.face import FaceModel, FaceParams
 from mien.gaussians import stack_timesteps
 from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
-
-_FEATURES = ("feature_color", "feature_opacity")
-"""Names of the changes by features."""
-_BASES = ("color_basis", "opacity_basis", "offset_basis")
-"""Names of the bases of changes with the expression."""
 
 
 class GaussianAvatars(Avatar):
@@ -92,7 +88,7 @@ class GaussianAvatars(Avatar):
     def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shapes of a Gaussian's bases of changes with the expression, by name: those that the settings ask for."""
         rank, rates = self.config.expression_rank, self._basis_rates()
-        wanted = [name for name in _BASES if rank > 0 and rates[name].start > 0]
+        wanted = [name for name in BASES if rank > 0 and rates[name].start > 0]
         return {name: (rank,) if name == "opacity_basis" else (3, rank) for name in wanted}
 
     @property
@@ -112,7 +108,7 @@ class GaussianAvatars(Avatar):
     def _basis_rates(self) -> dict[str, Rate]:
         config = self.config
         rates = (config.expression_color_rate, config.expression_opacity_rate, config.expression_offset_rate)
-        return dict(zip(_BASES, rates, strict=True))
+        return dict(zip(BASES, rates, strict=True))
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units.
@@ -127,13 +123,7 @@ class GaussianAvatars(Avatar):
             thresholds=(config.position_threshold, config.scale_threshold),
             weights=(config.position_weight, config.scale_weight),
         )
-        losses = {"position": position, "scale": scale}
-        kinds = (("expression", _BASES, config.expression_weight), ("appearance", _FEATURES, config.appearance_weight))
-        for loss, names, weight in kinds:
-            squares = [posed.aux[name].square().mean() for name in names if name in posed.aux]
-            if squares:
-                losses[loss] = weight * torch.stack(squares).sum()
-        return losses
+        return {"position": position, "scale": scale, **change_penalties(config, posed.aux)}
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group per tensor."""
@@ -189,7 +179,7 @@ class GaussianAvatars(Avatar):
             return None
         features = None if self.appearance is None else self.appearance.bake(self.store)
         fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
-        bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in _BASES)
+        bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in BASES)
         rank = self.config.expression_rank
         basis_columns = rank if self._basis_shapes() and rank < self._activation_count else None
         return ExpressionChanges(*fixed, *bases, features=features, basis_columns=basis_columns)

@@ -49,8 +49,9 @@ class SurfaceLimits:
 class GaussianAvatarsConfig(MethodConfig):
     """Settings of GaussianAvatars. The defaults suit one fixed camera and runs of some thousand steps.
 
-    They add to the paper: places that change with the expression (`expression_rank`), a loss of alpha, more weight and
-    a perceptual loss for eyes and mouth, and tuned poses that stay where they are on average.
+    They add to the paper: places, colours and opacities that change with the expression (`expression_rank`,
+    `appearance`), a loss of alpha, more weight and a perceptual loss for eyes and mouth, and tuned poses that stay
+    where they are on average.
     """
 
     photometric: Photometric = Photometric(
@@ -99,7 +100,7 @@ class GaussianAvatarsConfig(MethodConfig):
     If its start is 0, places do not change."""
     expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
     """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
-    appearance: Literal["static", "features"] = "static"
+    appearance: Literal["static", "features"] = "features"
     """Whether a Gaussian's colour and opacity stay as they are, as in the paper, or also change with features that the
     activations of the face blend and one small network reads, as in HeadGaS."""
     appearance_directions: Annotated[int, Range(1, 64)] = 12
@@ -145,6 +146,7 @@ frame, by about the rate. The paper's subjects have nine sequences, so some 1,00
 
 _PUBLISHED: dict[str, Any] = {
     "photometric": {"alpha_weight": 0.0, "part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}},
+    "appearance": "static",
     "expression_rank": 0,
     "expression_color_rate": {"start": 1e-3},
     "expression_opacity_rate": {"start": 0.01},
@@ -176,10 +178,15 @@ _PAPER: dict[str, Any] = _PUBLISHED | {
 """The paper's settings (docs/paper_preset.md). Times are fractions, so that they fit runs of any length."""
 
 PRESETS: dict[str, Differences] = {
-    "draft": {"method": {"photometric": {"part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}}}},
+    "draft": {
+        "method": {
+            "appearance": "static",
+            "photometric": {"part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}},
+        }
+    },
     "paper": {"method": _PAPER, "settings": {"steps": _STEPS}},
 }
-"""How presets differ from the defaults. `draft` lacks some losses, and is a shorter run."""
+"""How presets differ from the defaults. `draft` lacks features and some losses, and is a shorter run."""
 
 
 def as_published() -> GaussianAvatarsConfig:

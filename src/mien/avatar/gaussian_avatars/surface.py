@@ -1,5 +1,7 @@
 """The surface of GaussianAvatars: one or more Gaussians on each triangle, in the frame of the triangle."""
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -7,6 +9,7 @@ from torch import Tensor
 from mien.avatar.avatar import Avatar
 from mien.avatar.bound_surface import BoundSurface, SurfacePrior
 from mien.avatar.constants import AVATAR
+from mien.avatar.gaussian_avatars.changes import change_penalties
 from mien.avatar.gaussian_avatars.constants import GAUSSIAN_AVATARS
 from mien.avatar.gaussian_avatars.hair_strands import shell_growth, strand_gaussians
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
@@ -133,6 +136,11 @@ class GaussianSurface(BoundSurface):
         """Move Gaussians along the second axis of their triangles' frames, which is the normal."""
         bound = self._store["face_index"]
         self._store["means"].detach()[:, 1] += (shift / self.sizes)[bound]
+
+    def change_penalty(self, changes: Mapping[str, Tensor]) -> Float[Tensor, ""] | None:
+        """The sum of `change_penalties`."""
+        penalties = change_penalties(self._config, changes)
+        return torch.stack(list(penalties.values())).sum() if penalties else None
 
     @property
     def sizes(self) -> Float[Tensor, " f"]:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.avatar import Avatar, Progress
+from mien.avatar import Avatar, Posed, Progress
 from mien.camera import Camera
 from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
@@ -75,11 +75,12 @@ class SideViews:
         background = torch.rand(3, generator=random)
         picture, alpha, compared = self._target(face, small, background)
         like = face.expression
-        seen = rasterize(avatar.pose(face, progress).gaussians.timestep(0), small, background.to(like))
+        posed = avatar.pose(face, progress)
+        seen = rasterize(posed.gaussians.timestep(0), small, background.to(like))
         difference = (seen.image - picture.to(like)).abs()
         if raised:
             difference = (difference - WHOLE_HEAD.raised_free_difference).clamp_min(0) * compared.to(like)[..., None]
-            return self.weight * difference.mean()
+            return self.weight * difference.mean() + _held_back(avatar, posed)
         outline = WHOLE_HEAD.side_views_outline_weight * (seen.alpha - alpha.to(like)).abs().mean()
         return self.weight * (difference.mean() + outline)
 
@@ -137,6 +138,16 @@ def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideV
     like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
     assert prior.colors is not None
     return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
+
+
+def _held_back(avatar: Avatar, posed: Posed) -> Float[Tensor, ""] | float:
+    """What holds changes with the expression back where nothing was filmed, because the mesh is a better guess there.
+
+    Filmed expressions come together: without this, raising one of them alone turns others' shadows on.
+    """
+    surface = avatar.surface()
+    penalty = None if surface is None else surface.change_penalty(posed.aux)
+    return 0.0 if penalty is None else WHOLE_HEAD.raised_change_weight * penalty
 
 
 def turned_to_side(face: FaceParams, angle: float) -> FaceParams:
