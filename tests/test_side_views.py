@@ -19,6 +19,7 @@ from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame, resolved
 from mien.training.whole_head.side_views import SideViews, side_views, turned_to_side
 from mien.training.whole_head.unseen import fills_sides
+from plain_settings import plain_gaussian_avatars
 from test_runtime import new_avatar
 from toy_scene import surface_of
 
@@ -82,6 +83,20 @@ def test_transparent_sides_cost(anny):
     avatar.store.assign("opacity_logits", torch.full_like(avatar.store["opacity_logits"], -4.0))
     opened = views.loss(avatar, _face(anny), _camera(), _PROGRESS, 0, _random())
     assert float(opened.detach()) > 3 * closed
+
+
+def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
+    """By 8 times the method's own penalty, whatever the weight of the picture."""
+    face = _face(anny)
+    avatar = GaussianAvatars(plain_gaussian_avatars(expression_rank=2, expression_weight=3.0), anny, face)
+    avatar.store.assign("offset_basis", torch.ones_like(avatar.store["offset_basis"]))
+    avatar.activations.directions.fill_(1.0)
+    avatar.activations.reach.fill_(1.0)
+    views = replace(_views(anny), weight=0.0)
+    turned, raised = (views.loss(avatar, face, _camera(), _PROGRESS, step, _random()).detach() for step in (0, 4))
+    assert float(turned) == 0
+    # The random numbers raise coefficients until the activations, 2 alike, have the length that they approach.
+    assert 0 < float(raised) <= 8 * 3 * 2 * 1.1**2
 
 
 def test_gradients_reach_gaussians_and_not_the_face(anny):

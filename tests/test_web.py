@@ -53,9 +53,11 @@ def posed_by_node(built: Path, path: Path, portable: runtime.PortableAvatar, fac
 
 
 @pytest.mark.parametrize("form", ["mien", "packed"])
-@pytest.mark.parametrize(("rank", "columns"), [(0, None), (3, None), (5, 2)])
-def test_faces_are_posed_as_in_python(built: Path, tmp_path: Path, form: str, rank: int, columns: int | None) -> None:
-    portable = drawn_head(2000, rank, columns=columns)
+@pytest.mark.parametrize(("rank", "columns", "features"), [(0, None, 0), (3, None, 0), (5, 2, 0), (5, 2, 16)])
+def test_faces_are_posed_as_in_python(
+    built: Path, tmp_path: Path, form: str, rank: int, columns: int | None, features: int
+) -> None:
+    portable = drawn_head(2000, rank, columns=columns, features=features)
     path = tmp_path / f"head.{form}"
     if form == "mien":
         runtime.write_portable(path, portable)

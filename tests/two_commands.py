@@ -152,7 +152,7 @@ class Studio:
     """Options of `create` with which everything up to the tracking is current and training is short."""
 
 
-RANK = ["--method.expression-rank", "0"]
+RANK = ["--method.expression-rank", "0", "--method.appearance", "static"]
 """Options without changes with the expression, which GaussianAvatars' own files cannot hold."""
 
 

@@ -16,6 +16,7 @@ import torch
 from mien import runtime
 from mien.avatar import GaussianAvatars, HeadGas, HeadGasConfig, make_portable
 from mien.face import load_face_model
+from mien.runtime.baked import FeatureChanges
 from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES, NO_TASKS_VISION
 from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera
@@ -90,11 +91,12 @@ def browse(
 
 
 def drawn_head(
-    count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head", columns: int | None = None
+    count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head", columns: int | None = None, features: int = 0
 ) -> runtime.PortableAvatar:
     """Return `count` Gaussians in random colours on the mean head of anny, 0.9 m in front of the camera.
 
-    Their changes have `rank` activations, of which the bases take the first `columns` (None: all).
+    Their changes have `rank` activations, of which the bases take the first `columns` (None: all). They have as many
+    `features`, without numbers of their own and biases.
     """
     model = load_face_model("anny")
     portable = make_portable(
@@ -114,7 +116,11 @@ def drawn_head(
         rest, reach = np.zeros(inputs, np.float32), np.ones(1, np.float32)
         taken = columns or rank
         parts = (some(0.3, 3, taken), some(0.3, taken), some(0.1, 3, taken))
-        changes = runtime.ExpressionChanges(rest, directions, reach, *parts, basis_columns=columns)
+        layers = [(0.3 * random.standard_normal(shape)).astype(np.float32) for shape in ((32, features), (4, 32))]
+        zeros = tuple(np.zeros(len(layer), np.float32) for layer in layers)
+        blended = (some(0.3, features), some(0.3, rank, features), some(1, 0), tuple(layers), zeros)
+        network = FeatureChanges(*blended) if features else None
+        changes = runtime.ExpressionChanges(rest, directions, reach, *parts, basis_columns=columns, features=network)
         eye = np.eye(inputs, dtype=np.float32)
         filmed = runtime.Filmed(rest, rest + 1, eye, reach, np.zeros((2, 2), np.float32))
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)

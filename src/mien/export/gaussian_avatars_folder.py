@@ -70,7 +70,8 @@ def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams
     if baked.changes is not None:
         raise UserError(
             f"{folder}: GaussianAvatars' folder cannot hold Gaussians that change with the expression "
-            "(--method.expression-rank); export a .mien instead, or train a run with rank 0"
+            "beside the mesh; export a .mien instead, or train a run with `--method.appearance static "
+            "--method.expression-rank 0`"
         )
     with _replaced_together(folder) as aside:
         write_flame_params(aside / PARAMETERS, avatar.face_model, face)
