@@ -62,7 +62,7 @@ def _imports(place: str) -> Iterator[None]:
     """Import the class at a place "MODULE:CLASS". What fails in another package is not reported as a bug in mien."""
     try:
         yield
-    except Exception as error:  # whatever the code of another package raises
+    except (Exception, SystemExit) as error:  # whatever the code of another package raises
         if place.startswith("mien."):
             raise
         remedy = "update or uninstall the package of this method"
