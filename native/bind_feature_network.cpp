@@ -141,11 +141,10 @@ void feature_network_backward(const Group<NetworkArrays>& group, const Bases& ba
   const KeptArrays kept(keep, network);
   const GradientArrays out(gradients, own, items.size());
   const nb::gil_scoped_release release;
-  mien::feature_network_backward(network, {items.data(), static_cast<int64_t>(items.size())},
-                                 {kept.features.data(), kept.hidden.data()},
-                                 {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(),
-                                  out.bias1.data(), out.weight2.data(), out.bias2.data(),
-                                  out.inputs.shape(0) == 0 ? nullptr : out.inputs.data()});
+  mien::feature_network_backward(
+      network, {items.data(), static_cast<int64_t>(items.size())}, {kept.features.data(), kept.hidden.data()},
+      {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(), out.bias1.data(),
+       out.weight2.data(), out.bias2.data(), out.inputs.shape(0) == 0 ? nullptr : out.inputs.data()});
 }
 
 void factored_update(const Out<-1, -1, -1>& values, const In<-1, -1>& rows, const In<-1>& columns,
