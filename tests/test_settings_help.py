@@ -101,7 +101,8 @@ def test_presets_are_differences_to_the_defaults(name: str) -> None:
     method = METHODS[name]
     assert {"draft", "standard"} <= set(method.presets) <= set(PRESETS), f"PRESETS of {name}"
     assert method.presets["standard"] == {}, f"standard of {name} is not its defaults"
-    assert set(method.presets["draft"].get("method", {})) <= {"photometric"}, f"draft of {name}: more than its losses"
+    cheaper = {"photometric", "appearance"}
+    assert set(method.presets["draft"].get("method", {})) <= cheaper, f"draft of {name}: more than losses and features"
     assert "settings" not in method.presets["draft"]
     for preset, changes in method.presets.items():
         assert type(PRESETS[preset].config(name)) is method.config
