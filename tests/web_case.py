@@ -116,10 +116,11 @@ def drawn_head(
         rest, reach = np.zeros(inputs, np.float32), np.ones(1, np.float32)
         taken = columns or rank
         parts = (some(0.3, 3, taken), some(0.3, taken), some(0.1, 3, taken))
-        layers = [(0.3 * random.standard_normal(shape)).astype(np.float32) for shape in ((32, features), (4, 32))]
-        zeros = tuple(np.zeros(len(layer), np.float32) for layer in layers)
-        blended = (some(0.3, features), some(0.3, rank, features), some(1, 0), tuple(layers), zeros)
-        network = FeatureChanges(*blended) if features else None
+        network = None
+        if features:
+            layers = [(0.3 * random.standard_normal(shape)).astype(np.float32) for shape in ((32, features), (4, 32))]
+            zeros = tuple(np.zeros(len(layer), np.float32) for layer in layers)
+            network = FeatureChanges(some(0.3, features), some(0.3, rank, features), some(1, 0), tuple(layers), zeros)
         changes = runtime.ExpressionChanges(rest, directions, reach, *parts, basis_columns=columns, features=network)
         eye = np.eye(inputs, dtype=np.float32)
         filmed = runtime.Filmed(rest, rest + 1, eye, reach, np.zeros((2, 2), np.float32))
