@@ -139,9 +139,8 @@ def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
 def test_a_whole_head_is_trained_on_a_device(scene: Scene, device: str) -> None:
     """By default, with sides that are filled and features. Steps reach a correction of the hair and a prune."""
     like = like_on("cuda") if device == "cuda" else torch.zeros((), dtype=torch.float64)
-    config = replace(GaussianAvatarsConfig(), appearance="features")
     settings = TrainSettings(steps=16, split="none", unseen="filled", mesh="fitted", record_every=1)
-    state = train_some(scene, like, config, settings)
+    state = train_some(scene, like, GaussianAvatarsConfig(), settings)
     store = state.avatar.gaussian_store()
     assert all(store[name].device.type == like.device.type for name in store.names())
     assert all(torch.isfinite(store[name]).all() for name in store.trained)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 
-FEATURES = ("feature_color", "feature_opacity")
+_FEATURES = ("feature_color", "feature_opacity")
 """Names of the changes by features."""
 BASES = ("color_basis", "opacity_basis", "offset_basis")
 """Names of the bases of linear changes, which are also those of the changes."""
@@ -21,7 +21,7 @@ def change_penalties(config: GaussianAvatarsConfig, changes: Mapping[str, Tensor
         config: The settings, which have the weights.
         changes: The changes of one or more timesteps by name; others are ignored.
     """
-    kinds = (("expression", BASES, config.expression_weight), ("appearance", FEATURES, config.appearance_weight))
+    kinds = (("expression", BASES, config.expression_weight), ("appearance", _FEATURES, config.appearance_weight))
     losses = {}
     for loss, names, weight in kinds:
         squares = [changes[name].square().mean() for name in names if name in changes]

@@ -141,9 +141,10 @@ def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideV
 
 
 def _held_back(avatar: Avatar, posed: Posed) -> Float[Tensor, ""] | float:
-    """What holds changes with the expression back where nothing was filmed, because the mesh is a better guess there.
+    """Return the cost of changes that the mesh does not make, in an expression that nobody filmed.
 
-    Filmed expressions come together: without this, raising one of them alone turns others' shadows on.
+    The mesh is a better guess there. Filmed expressions come together, so without this cost, raising one of them alone
+    also brings the shadows of the others.
     """
     surface = avatar.surface()
     penalty = None if surface is None else surface.change_penalty(posed.aux)
