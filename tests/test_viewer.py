@@ -284,11 +284,17 @@ def test_words_tell_which_side_was_filmed(session: Session) -> None:
 # Files.
 
 
-def test_a_screenshot_has_the_pixels_of_the_window(session: Session) -> None:
-    view = front_view(session.avatar, 96, 640)
-    picture = cv2.imdecode(np.frombuffer(screenshot(session, view), np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
-    assert picture.shape == (640, 96, 3)
+@pytest.mark.parametrize(
+    ("window", "picture"),
+    [((96, 1200), (96, 1200)), ((96, 540), (192, 1080)), ((540, 96), (2048, 364)), ((0, 0), (16, 16))],
+)
+def test_a_screenshot_has_the_shape_of_the_window_and_at_least_its_pixels(
+    session: Session, window: tuple[int, int], picture: tuple[int, int]
+) -> None:
+    saved = screenshot(session, replace(front_view(session.avatar, 96, 640), width=window[0], height=window[1]))
+    decoded = cv2.imdecode(np.frombuffer(saved, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    assert decoded.shape == (picture[1], picture[0], 3)
 
 
 def test_videos_hold_the_motion_or_a_turn(session: Session, tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 // Opens a viewer's address in headless Chromium, does steps, and prints all requests and errors of the page as json, and the
-// height of the canvas at each saving.
+// width divided by the height of the canvas at each saving.
 // tests/test_viewer_page.py calls it:
 //   node view.mjs CHROMIUM ADDRESS < {"width", "height", "steps": [..]}
 // A step is one of: {"see": text}, {"wait": milliseconds}, {"click": text of a button}, {"drag": [x, y]},
@@ -14,7 +14,7 @@ const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swifts
 const browser = await chromium.launch({ executablePath, args });
 try {
   const context = await browser.newContext({ viewport: { width, height }, acceptDownloads: true });
-  const requests = [], errors = [], heights = [];
+  const requests = [], errors = [], shapes = [];
   const tab = await context.newPage();
   tab.on("request", (request) => requests.push(request.url()));
   tab.on("pageerror", (error) => errors.push(`${error}`));
@@ -35,7 +35,7 @@ try {
       return tab.mouse.up();
     }
     if (step.save) {
-      heights.push(await tab.locator("canvas").first().evaluate((canvas) => canvas.clientHeight));
+      shapes.push(await tab.locator("canvas").first().evaluate((canvas) => canvas.clientWidth / canvas.clientHeight));
       const coming = tab.waitForEvent("download");
       await tab.getByText(step.save[0], { exact: true }).first().click();
       return (await coming).saveAs(step.save[1]);
@@ -43,7 +43,7 @@ try {
     throw new Error(`no such step: ${JSON.stringify(step)}`);
   };
   for (const step of steps) await act(step);
-  console.log(JSON.stringify({ requests, errors, heights }));
+  console.log(JSON.stringify({ requests, errors, shapes }));
 } finally {
   await browser.close();
 }

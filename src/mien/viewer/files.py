@@ -20,13 +20,23 @@ TURNTABLE_FRAMES, TURNTABLE_FPS = 100, 25.0
 """Number of frames and frames a second of a turntable, which is the video of a session without a motion."""
 
 
+SCREENSHOT_HEIGHT = 1080
+"""Smallest height of a screenshot in pixels."""
+
+
 class Stopped(Exception):  # noqa: N818
     """The recording was stopped."""
 
 
 def screenshot(session: Session, view: View) -> bytes:
-    """A view as the content of a .png, with as many pixels as the browser's canvas has."""
-    return encode_picture(session.picture(view, height=MAX_SIDE))
+    """A view as the content of a .png, in the shape of the browser's canvas, with at least as many pixels.
+
+    The height is at least `SCREENSHOT_HEIGHT`, because a browser that draws slowly makes its canvas smaller than its
+    window.
+    """
+    scale = max(1.0, SCREENSHOT_HEIGHT / max(1, view.height))
+    larger = replace(view, width=round(scale * view.width), height=round(scale * view.height))
+    return encode_picture(session.picture(larger, height=MAX_SIDE))
 
 
 def video(
