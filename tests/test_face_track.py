@@ -109,6 +109,23 @@ def test_a_held_out_sequence_gets_the_mean_correction_of_the_pose() -> None:
     assert torch.equal(tuned.expression, face.expression), "expressions have no part that all timesteps share"
 
 
+@pytest.mark.parametrize("still", ["head_translation", "head_rotation"])
+def test_a_field_that_is_not_tuned_keeps_no_correction_from_the_others(still: str) -> None:
+    """With a rate of 0, as MonoGaussianAvatar's paper has for translations, a field takes no part in the tuning."""
+    face, moving = _still_face(3), "head_rotation" if still == "head_translation" else "head_translation"
+    tuning = FaceTuning(enabled=True, keep_mean_pose=False, keep_turns=False)
+    tuning = replace(tuning, **{moving: Rate(0.01), still: Rate(0.0)})
+    track = FaceTrack(face, tuning, (2, 1))
+    _push(track, 0, 1.0, (2,), moving)
+    tuned = track.params()
+    torch.testing.assert_close(getattr(tuned, moving)[2], torch.tensor([0.0, 0.0, -0.01]))
+    assert torch.equal(getattr(tuned, still), getattr(face, still))
+    steady = FaceTrack(face, replace(tuning, keep_mean_pose=True), (2, 1))
+    _push(steady, 0, 1.0, (2,), moving)
+    steady.steady_pose()
+    torch.testing.assert_close(getattr(steady.params(), moving), getattr(face, moving), atol=1e-8, rtol=0)
+
+
 def test_the_mean_correction_is_given_in_the_head_frame() -> None:
     tracked = replace(_still_face(4), head_rotation=torch.randn(4, 3, generator=torch.Generator().manual_seed(0)))
     turn, shift = matrix_from_axis_angle(torch.tensor([0.02, -0.01, 0.03])), torch.tensor([0.001, 0.002, -0.003])
@@ -208,10 +225,12 @@ def _still_face(timesteps: int) -> FaceParams:
     )
 
 
-def _push(track: FaceTrack, index: int, gradient: float, axes: tuple[int, ...] = (0, 1, 2)) -> None:
-    """One step of Adam for a timestep whose head's translation has this gradient; the rest of it has none."""
+def _push(
+    track: FaceTrack, index: int, gradient: float, axes: tuple[int, ...] = (0, 1, 2), field: str = "head_translation"
+) -> None:
+    """One step of Adam for a timestep, one field of which has this gradient; its other gradients are 0."""
     one = track.face(index)
     for name in ("expression", "joints", "head_rotation", "head_translation"):
         getattr(one, name).grad = torch.zeros_like(getattr(one, name))
-    one.head_translation.grad = torch.zeros(1, 3).index_fill(1, torch.tensor(axes), gradient)
+    getattr(one, field).grad = torch.zeros(1, 3).index_fill(1, torch.tensor(axes), gradient)
     Adam().step(track.parameter_groups(index), Progress(0, 10))

@@ -147,9 +147,11 @@ class FaceTrack:
         return replace(self._start, **fields)
 
     def _seen(self) -> Bool[Tensor, " t"]:
-        """Which timesteps training has used and changed."""
-        moments = self._moments.get("head_translation")
-        return torch.zeros(len(self._start), dtype=torch.bool) if moments is None else moments.step > 0
+        """Which timesteps training has used and changed. A field whose rate is 0 counts no steps, so any field counts."""
+        seen = torch.zeros(len(self._start), dtype=torch.bool)
+        for moments in self._moments.values():
+            seen |= moments.step > 0
+        return seen
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that a checkpoint has to save. They share memory with the track."""
