@@ -146,6 +146,60 @@ def test_docs_have_values_that_differ_from_the_default() -> None:
         assert table[name].split(" | ") == [f" {getattr(default, name)}", f"{value} "], name
 
 
+# -- HeadGaS -----------------------------------------------------------------------------------------------------------
+
+
+def values_of(method: str) -> dict[str, str]:
+    """The column "here" of a method's first table in docs/paper_preset.md, by the names in its first column."""
+    (own,) = [text for text in re.split(r"^## ", PAGE.read_text(), flags=re.MULTILINE) if text.startswith(method)]
+    table = own[own.index("| setting |") :].split("\n\n")[0].splitlines()[2:]
+    rows = [line.removeprefix("| ").split(" | ") for line in table]
+    return {cells[0].replace("`", ""): cells[2] for cells in rows}
+
+
+def steps_of(steps: int, *times: float) -> list[int]:
+    return [round(time * steps) for time in times]
+
+
+def test_docs_have_all_values_of_headgas() -> None:
+    paper: Any = PRESETS["paper"].config("headgas")
+    steps = PRESETS["paper"].settings_of("headgas").steps
+    density, perceptual = paper.density, paper.photometric.perceptual
+    start, stop, size_start, first = steps_of(steps, density.start, density.stop, density.size_start, perceptual.start)
+    every = (stop - start) // (density.rounds - 1)
+    assert (start, stop, every) == (500, 15_000, 100)
+    assert steps_of(steps, paper.sh_warmup) == [4 * 1_000], "one more degree every 1,000 steps"
+    assert (paper.means_rate, paper.means_times_extent) == (Rate(1.6e-4, 1.6e-6), True)
+    assert (paper.log_scales_rate, paper.quats_rate) == (Rate(5e-3), Rate(1e-3))
+    assert (density.grow_gradient, density.split_size, density.size_unit) == (2e-4, 0.01, "extent")
+    assert (perceptual.region, perceptual.every) == ("person", 1)
+    expected = {
+        "steps": f"{steps:,}",
+        "points": f"{paper.points:,}",
+        "features, hidden": f"{paper.features}, {paper.hidden}",
+        "directions": f"{paper.directions}: as many as the face has inputs",
+        "inputs": "expression coefficients and free joints",
+        "sh_degree": f"{paper.sh_degree}",
+        "sh_warmup": "the same",
+        "sh_higher_share": f"1/{round(1 / paper.sh_higher_share)}",
+        "means_rate, means_times_extent": "the same",
+        "log_scales_rate, quats_rate": "the same",
+        "features_rate, network_rate": "2.5e-3, 2e-3 to 2e-4",
+        "encoding_bands, encoding_length": f"{paper.encoding_bands}, {paper.encoding_length} m",
+        "density.start, stop, rounds": "the same",
+        "density.grow_gradient, split_size, size_unit": "the same",
+        "density.prune_size, size_start": f"{density.prune_size} E, from step {size_start}".replace("0.1", ".1"),
+        "density.opacity_resets": "none" if not density.opacity_resets else "some",
+        "judged_expressions": f"{paper.judged_expressions}",
+        "density.max_gaussians": f"{density.max_gaussians:,}",
+        "face_tuning": "on" if paper.face_tuning.enabled else "off",
+        "photometric.perceptual": f"{perceptual.weight} on the box of the scoring mask, from step {first:,}, "
+        "three blocks of a VGG16",
+    }
+    assert (paper.features_rate, paper.network_rate, perceptual.blocks) == (Rate(2.5e-3), Rate(2e-3, 2e-4), 3)
+    assert values_of("HeadGaS") == expected
+
+
 # -- MonoGaussianAvatar ------------------------------------------------------------------------------------------------
 
 
@@ -178,6 +232,44 @@ def test_docs_have_values_of_mono_gaussian_avatar() -> None:
     table = mono_table()
     for name, words in {"max_points": "100,000", "epochs": "120", "attribute_width": "256, 7"}.items():
         assert words in table[name].split("|")[1], name
+
+
+def test_docs_have_all_values_of_mono_gaussian_avatar() -> None:
+    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
+    steps, tuning, photometric = (
+        PRESETS["paper"].settings_of("mono_gaussian_avatar").steps,
+        paper.face_tuning,
+        paper.photometric,
+    )
+    halvings = [round(paper.epochs * time) for time in paper.rate_halvings]
+    assert (paper.own_rate.start, paper.pretraining, paper.face_points) == (0, 0, paper.max_points)
+    assert (photometric.perceptual.crop, photometric.perceptual.blocks) == (224, 3)
+    expected = {
+        "steps": f"{steps:,}",
+        "frames_per_step, points_per_step": f"{paper.frames_per_step}, {paper.points_per_step:,}",
+        "start, points, sphere_radius": f"{paper.start}, {paper.points}, {paper.sphere_radius}",
+        "pretraining": "0",
+        "own_rate": "0",
+        "max_points": f"{paper.max_points:,}",
+        "first_epoch, epochs": f"{paper.first_epoch}, {paper.epochs}",
+        "schedule": paper.schedule,
+        "attribute_width, attribute_layers": f"{paper.attribute_width}, {paper.attribute_layers}",
+        "encoding_bands": f"{paper.encoding_bands}",
+        "sphere_start": "yes" if paper.sphere_start else "no",
+        "deformation_width": f"{paper.deformation_width}",
+        "change_width": f"{paper.change_width}",
+        "scale_gain": f"{paper.scale_gain}",
+        "means_rate": f"{paper.means_rate.start:.1e}".replace("e-0", "e-"),
+        "network_rate": f"{paper.network_rate.start:.0e}".replace("e-0", "e-"),
+        "rate_halvings": f"epochs {halvings[0]} and {halvings[1]}",
+        "face_weight": "the same" if paper.face_weight == 10 else "another",
+        "face_points": "all points",
+        "photometric": "the same",
+        "photometric.perceptual": f"{photometric.perceptual.weight:g}, three blocks on crops of 224 pixels"[1:],
+        "face_tuning.expression, joints, head_rotation": "5e-4 from epoch 10",
+        "face_tuning.head_translation": f"{tuning.head_translation.start:g}",
+    }
+    assert values_of("MonoGaussianAvatar") == expected
 
 
 def test_docs_have_the_counts_and_radii_of_both_schedules() -> None:

@@ -13,11 +13,12 @@ from mien.errors import UserError
 from mien.face import FaceModel
 from mien.perceptual import load_training_features, weights
 from mien.perceptual.weights import weights_path
+from mien.pictures import Box
 from mien.render.rendering import Rendering
 from mien.training import Sequence, TrainSettings, read_curves, train
 from mien.training.footage.frames import crop_random
 from mien.training.footage.sequence import Target, Targets
-from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss
+from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss, person_box
 from toy_scene import toy_sequence
 from training_progress import silence, stopped_at
 
@@ -113,6 +114,29 @@ def test_weight_of_a_pixel_is_that_of_the_whole_picture() -> None:
     crop, goal = torch.full((32, 32, 3), 0.5), torch.full((32, 32, 3), 90 / 255)
     assert losses[0] == pytest.approx(2.0 / 4 * float(load_training_features()(crop, goal)), rel=1e-5)
     assert losses[1] == pytest.approx(losses[0] / 2, rel=1e-5)
+
+
+def test_the_whole_person_counts_fully() -> None:
+    """The box of the person is compared, and its share of the picture does not matter."""
+    losses = []
+    for width in (64, 128):
+        image = torch.full((64, width, 3), 0.5)
+        rendering = Rendering(image, torch.ones(64, width), torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
+        target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
+        settings = PerceptualLoss(weight=2.0, region="person", crop=16)
+        goal = perceptual_goal(target, settings, crop_random(TrainSettings(), 0))
+        assert target.picture[goal.crop].shape == (50, 50, 3)
+        losses.append(float(perceptual_loss(rendering, goal, settings)))
+    whole = load_training_features()(torch.full((50, 50, 3), 0.5), torch.full((50, 50, 3), 90 / 255))
+    assert losses == pytest.approx([2.0 * float(whole)] * 2, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("box", "used"),
+    [((10, 5, 50, 40), (10, 5, 50, 40)), ((0, 0, 0, 0), (0, 0, 16, 16)), ((78, 59, 2, 1), (64, 44, 16, 16))],
+)
+def test_the_persons_box_is_never_too_small(box: Box, used: Box) -> None:
+    assert person_box(replace(some_target(()), box=box)) == used
 
 
 def test_steps_that_have_the_loss() -> None:

@@ -24,15 +24,14 @@ class Differences(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class PerceptualLoss:
-    """A loss of trained features (the first blocks of a VGG16) on small crops, which keeps details sharp.
+    """A loss of trained features (the first blocks of a VGG16), which keeps details sharp.
 
-    Each crop is drawn at random: around the eyes, around the mouth, or anywhere in the scoring mask's box. A crop is
-    compared by other features than those of the scored metric (ST-LPIPS).
+    It compares pictures by other features than those of the scored metric (ST-LPIPS).
     """
 
     weight: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Weight of the distance of features, for a crop as large as the picture. A smaller crop counts by its share of
-    the pixels, so that the weight of one pixel does not depend on the crop. 0 switches the loss off."""
+    """Weight of the distance of features. A crop counts by its share of the picture's pixels, so that the weight of one
+    pixel does not depend on the crop. The whole person (`region`) counts fully. 0 switches the loss off."""
     start: Annotated[float, FRACTION] = 0.3
     """Time of the first step with this loss, as a fraction of the run."""
     every: Annotated[int, Range(1, 1_000)] = 8
@@ -41,6 +40,9 @@ class PerceptualLoss:
     """Side of the crops, in pixels of the training pictures. The cost grows with its square."""
     blocks: Annotated[int, Range(1, 3)] = 2
     """Number of blocks of the network, from fine to coarse features. Each block more doubles the cost, or more."""
+    region: Literal["parts", "person"] = "parts"
+    """Pixels that a step compares: a crop drawn at random around the eyes, around the mouth, or anywhere in the scoring
+    mask's box (parts), or all of that box (person), which takes many times as long."""
 
     def due(self, step: int, steps: int) -> bool:
         """Whether a step of a run of `steps` has this loss."""

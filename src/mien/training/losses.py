@@ -19,6 +19,9 @@ from mien.render.rendering import Rendering
 from mien.training.footage import Target
 from mien.training.photometric import photometric_loss
 
+_LEAST_SIDE = 16
+"""Smallest side of what trained features are taken of, in pixels: that of the smallest picture."""
+
 
 def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -> dict[str, Float[Tensor, ""]]:
     """The weighted losses of one picture, by name. Differentiable in the rendering."""
@@ -62,8 +65,9 @@ class PerceptualGoal:
 
 @torch.no_grad()
 def perceptual_goal(target: Target, settings: PerceptualLoss, random: torch.Generator) -> PerceptualGoal:
-    """The features of a crop of the target, drawn at random. They do not depend on the avatar."""
-    left, top, width, height = drawn_crop(target, settings.crop, random)
+    """The features of the target's box, or of a crop drawn at random. They do not depend on the avatar."""
+    whole = settings.region == "person"
+    left, top, width, height = person_box(target) if whole else drawn_crop(target, settings.crop, random)
     crop = (slice(top, top + height), slice(left, left + width))
     picture = target.picture[crop].to(target.background) / 255
     return PerceptualGoal(crop, _features(picture, settings).features(picture))
@@ -72,12 +76,20 @@ def perceptual_goal(target: Target, settings: PerceptualLoss, random: torch.Gene
 def perceptual_loss(rendering: Rendering, goal: PerceptualGoal, settings: PerceptualLoss) -> Float[Tensor, ""]:
     """The weighted distance of trained features on the goal's crop. Differentiable in the rendering."""
     image = rendering.image[goal.crop]
-    share = image.numel() / rendering.image.numel()
+    share = 1.0 if settings.region == "person" else image.numel() / rendering.image.numel()
     return settings.weight * share * _features(image, settings).distance(image, goal.features)
 
 
 def _features(image: Tensor, settings: PerceptualLoss) -> TrainingFeatures:
     return load_training_features(str(image.device), image.dtype, settings.blocks)
+
+
+def person_box(target: Target) -> Box:
+    """The box of what is not background. It has at least 16 pixels a side, as far as the picture does."""
+    full_height, full_width = target.picture.shape[:2]
+    left, top, width, height = target.box
+    width, height = min(max(width, _LEAST_SIDE), full_width), min(max(height, _LEAST_SIDE), full_height)
+    return min(left, full_width - width), min(top, full_height - height), width, height
 
 
 def drawn_crop(target: Target, side: int, random: torch.Generator) -> Box:

@@ -69,12 +69,21 @@ class HeadGasConfig(MethodConfig):
     reset, so `size_start` sets when large Gaussians are removed."""
 
 
-_STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS = 50_000, 100, 500, 15_000, 1_000
+_STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS, _PERCEPTUAL = 50_000, 100, 500, 15_000, 1_000, 10_000
 """The paper's run, in steps. The schedule of density control and of degrees is that of 3D Gaussian Splatting."""
 
 PRESETS: dict[str, Differences] = {
     "paper": {
         "method": {
+            "photometric": {
+                "perceptual": {
+                    "weight": 0.1,
+                    "start": _PERCEPTUAL / _STEPS,
+                    "every": 1,
+                    "region": "person",
+                    "blocks": 3,
+                },
+            },
             "face_tuning": {"enabled": False, "within_bounds": False},
             "directions": 0,
             "sh_degree": 3,
