@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import train_toy
+from mien.avatar import Avatar, load_avatar
 from mien.cli import main
 from mien.lab.analysis import ANALYSES
+from mien.lab.analysis.mono_gaussian_avatar import convergence as parts_of_convergence
 from mien.lab.analysis.mono_gaussian_avatar import times
 from mien.lab.analysis.mono_gaussian_avatar.subsets import Measured, frontal_quarter, masks, measure, mixed_half, ranges
 from mien.training import TrainSettings
@@ -76,6 +79,25 @@ def test_short_trainings_write_their_pictures(workspace: Path, capsys: pytest.Ca
     # All frames at full size is the same training in both parts.
     assert subsets[0]["head_psnr"] == sides[0]["head_psnr"]
     assert analyze(workspace, *asked) == parts
+
+
+@pytest.mark.slow
+def test_convergence_trains_as_the_run_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With steps before the first picture, as the presets `draft` and `standard` have them."""
+    monkeypatch.setattr(train_toy, "CONFIG", plain_mono_gaussian_avatar(points=60, max_points=120, pretraining=7))
+    write_toy_workspace(tmp_path / "W")
+    seen: list[dict[str, torch.Tensor]] = []
+
+    def drawn(avatar: Avatar, *_: Any) -> torch.Tensor:
+        seen.append({name: tensor.clone() for name, tensor in avatar.state_dict().items()})
+        return torch.full((32, 32, 3), 0.5)
+
+    monkeypatch.setattr(parts_of_convergence, "_drawn", drawn)
+    analyze(tmp_path / "W", "--parts", "convergence", "--steps", str(train_toy.SETTINGS.steps))
+    trained = load_avatar(tmp_path / "W" / "runs" / "toy").state_dict()
+    assert trained.keys() == seen[-1].keys()
+    for name, tensor in trained.items():
+        assert torch.equal(tensor, seen[-1][name]), name
 
 
 def measured(angles: np.ndarray, expressions: np.ndarray) -> Measured:

@@ -18,7 +18,6 @@ from mien.avatar import (
     FaceTuning,
     MethodConfig,
     Posed,
-    Pretraining,
     Progress,
     load_avatar,
     measure_filmed,
@@ -35,7 +34,7 @@ from mien.perceptual import load_training_features
 from mien.progress import Advance, progress_bar
 from mien.render.rendering import Rendering
 from mien.render.validation import CannotDrawError
-from mien.stops import Put, stops_put_off
+from mien.stops import stops_put_off
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.ahead import targets_ahead
@@ -148,9 +147,7 @@ def _train_to_the_end(
         targets_ahead(data.order, data.targets, settings) as ahead,
     ):
         data = replace(data, ahead=ahead)
-        pretraining = state.avatar.extras.pretraining
-        if state.step == 0 and pretraining is not None:
-            _pretrain(pretraining, state, settings, progress, stop)
+        pretrain(state, settings, progress, stop.follow)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
                 before = state.step
@@ -168,10 +165,16 @@ def _train_to_the_end(
         _check_finite(run_dir, state)
 
 
-def _pretrain(
-    pretraining: Pretraining, state: TrainingState, settings: TrainSettings, progress: ProgressBar, stop: Put
+def pretrain(
+    state: TrainingState, settings: TrainSettings, progress: ProgressBar, between: Callable[[], None] = lambda: None
 ) -> None:
-    """Run the steps before the first picture. A run that stops here starts again, as nothing was trained."""
+    """Run the steps that a method takes before the first picture, if it has any and no step was taken yet.
+
+    A run that stops here starts again, as nothing was trained. `between` is called after each step and may raise.
+    """
+    pretraining = state.avatar.extras.pretraining
+    if state.step > 0 or pretraining is None:
+        return
     with (
         torch.random.fork_rng(devices=[]),
         progress("pre-training on the face's motion", pretraining.count, 0) as advance,
@@ -179,7 +182,7 @@ def _pretrain(
         torch.manual_seed(settings.seed)
         for _ in pretraining.run(state.track.params()):
             advance()
-            stop.follow()
+            between()
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:

@@ -27,7 +27,7 @@ from mien.training.footage import (
     spread_frames,
     training_frames,
 )
-from mien.training.trainer import TrainingData, start, step
+from mien.training.trainer import TrainingData, pretrain, start, step
 
 TIMES = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 """Times of the snapshots, as fractions of the training."""
@@ -97,8 +97,10 @@ def _snapshots(
     )
     data = TrainingData(order, targets, camera_extent(sequences, trained))
     found = []
+    state = start(sequences, model, config, settings)
+    with one_torch_thread():
+        pretrain(state, settings, progress_bar)
     with one_torch_thread(), progress_bar("convergence", settings.steps) as advance:
-        state = start(sequences, model, config, settings)
         while state.step < settings.steps:
             before = state.step
             step(state, data, settings)
