@@ -35,6 +35,7 @@ class FaceTrack:
         lengths: Number of timesteps of each sequence. Default: one sequence.
         bounds: Range of each expression coefficient, for settings that keep to it. Default: no bounds.
         away: `turns_from_mean` of `face`. By default it is computed, which waits for a GPU that holds `face`.
+        trained: Indices of the timesteps that training uses. Default: all.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class FaceTrack:
         lengths: Items[int] = (),
         bounds: Float[Tensor, "e 2"] | None = None,
         away: Float[Tensor, "t 3"] | None = None,
+        trained: Items[int] | None = None,
     ):
         self._start = face.detach()
         self._bounds = None
@@ -54,7 +56,8 @@ class FaceTrack:
         assert sum(self._lengths) == len(face), "timesteps of the sequences"
         self._tuning = tuning
         self._fields = {name: getattr(self._start, name).clone() for name in _FIELDS}
-        self._away = turns_from_mean(self._start) if away is None else away
+        self._trained = list(range(len(face)) if trained is None else trained)
+        self._away = turns_from_mean(self._start, self._trained) if away is None else away
         self._sequence = torch.arange(len(self._lengths)).repeat_interleave(torch.tensor(self._lengths))
         self._rows: dict[int, _Row] = {}
         names = _FIELDS if tuning.enabled else ()
@@ -70,6 +73,10 @@ class FaceTrack:
     def face(self, index: int) -> FaceParams:
         """One timestep. With tuning, its tensors are leaves that share memory with the track."""
         return self._row(index).face
+
+    def trained_face(self) -> FaceParams:
+        """The timesteps that training uses, as they were tracked."""
+        return self._start[self._trained]
 
     def parameter_groups(self, index: int) -> list[ParameterGroup]:
         """The parameter groups of one timestep. Their tensors are those of `face(index)`."""
@@ -184,11 +191,17 @@ def mean_pose_correction(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[
     return matrix_from_axis_angle(mean[:3]), mean[3:]
 
 
-def turns_from_mean(tracked: FaceParams) -> Float[Tensor, "t 3"]:
-    """Return the rotation vectors of head poses from their mean, in radians, in float64 on the CPU."""
+def turns_from_mean(tracked: FaceParams, trained: Items[int] | None = None) -> Float[Tensor, "t 3"]:
+    """Return the rotation vectors of head poses from their mean, in radians, in float64 on the CPU.
+
+    Args:
+        tracked: The poses.
+        trained: Indices of those that the mean is taken over. Default: all.
+    """
     rotations = tracked.T_world_head[:, :3, :3].double().cpu()
+    own = rotations if trained is None else rotations[list(trained)]
     # The rotation that is nearest to the mean matrix aligns the axes with its columns.
-    mean, _ = align_centered(np.eye(3), rotations.mean(0).T.numpy())
+    mean, _ = align_centered(np.eye(3), own.mean(0).T.numpy())
     return axis_angle_from_matrix(torch.from_numpy(mean).mT @ rotations)
 
 

@@ -180,7 +180,7 @@ def pretrain(
         progress("pre-training on the face's motion", pretraining.count, 0) as advance,
     ):
         torch.manual_seed(settings.seed)
-        for _ in pretraining.run(state.track.params()):
+        for _ in pretraining.run(state.track.trained_face()):
             advance()
             between()
 
@@ -233,16 +233,18 @@ def start(
 ) -> TrainingState:
     """The state before the first step, with the float dtype and device of `like` (default: float32 on the CPU)."""
     faces, frames = [sequence.tracking.face for sequence in sequences], training_frames(sequences, settings)
-    avatar = _first_avatar(method_config, face_model, concatenate(faces), settings)
+    starts = [sum(map(len, faces[:index])) for index in range(len(faces))]
+    used = [starts[frame.sequence] + frame.timestep for frame in frames]
+    # Nothing of a held-out frame may reach the avatar, not even how its face was tracked.
+    shown = sorted(set(used))
+    avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
     fitted = fitted_faces(face_model, sequences, frames, settings, bound=avatar.surface() is not None)
     if fitted is not None:
         faces = fitted
-        avatar = _first_avatar(method_config, face_model, concatenate(faces), settings)
+        avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
     face = concatenate(faces)
-    starts = [sum(map(len, faces[:index])) for index in range(len(faces))]
-    trained = face[[starts[frame.sequence] + frame.timestep for frame in frames]]
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
-    avatar.filmed = measure_filmed(trained, avatar.subject, eyes)
+    avatar.filmed = measure_filmed(face[used], avatar.subject, eyes)
     surface = avatar.surface()
     if surface is not None and surface.wants_first_colors:
         surface.set_first_colors(vertex_colors(face_model, sequences, faces, frames))
@@ -250,7 +252,7 @@ def start(
         avatar, face_model, sequences, faces, frames, settings, torch.zeros(()) if like is None else like
     )
     make_parts = prepare_parts(given)
-    away = turns_from_mean(face)
+    away = turns_from_mean(face, shown)
     if like is not None:
         move_avatar(avatar, like)
         face = face.to(like)
@@ -260,7 +262,7 @@ def start(
     strategy = density_strategy(density, avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     tuning = tuning_for(method_config.face_tuning, sequences)
-    track = FaceTrack(face, tuning, lengths, face_model.expression_bounds, away)
+    track = FaceTrack(face, tuning, lengths, face_model.expression_bounds, away, shown)
     return TrainingState(avatar, Adam(), strategy, track, {}, parts, covered=given.known_coverage)
 
 
