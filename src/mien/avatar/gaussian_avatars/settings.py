@@ -131,7 +131,10 @@ class GaussianAvatarsConfig(MethodConfig):
 
 
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
-"""The paper's schedule, in steps: the run, between rounds of density control, to the first round, between resets."""
+"""The paper's schedule, in steps: the run, between rounds of density control, to the first reset, between resets.
+
+The published code runs a round every `_ROUND` steps after step `_FIRST`, and none at that step.
+"""
 _SH_DEGREE, _DEGREE_STEPS = 3, 1_000
 _VISIT = 30
 """How much further the paper's optimiser moves a frame between two visits than its learning rate says.
@@ -165,9 +168,9 @@ _PAPER: dict[str, Any] = _PUBLISHED | {
         "head_translation": {"start": _VISIT * 1e-6},
     },
     "density": {
-        "start": _FIRST / _STEPS,
+        "start": (_FIRST + _ROUND) / _STEPS,
         "stop": (_STEPS - _ROUND) / _STEPS,
-        "rounds": (_STEPS - _ROUND - _FIRST) // _ROUND + 1,
+        "rounds": (_STEPS - _FIRST) // _ROUND - 1,
         "size_unit": "extent",
         "split_size": 0.01,
         "prune_radius": 20.0,

@@ -70,7 +70,10 @@ class HeadGasConfig(MethodConfig):
 
 
 _STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS, _PERCEPTUAL = 50_000, 100, 500, 15_000, 1_000, 10_000
-"""The paper's run, in steps. The schedule of density control and of degrees is that of 3D Gaussian Splatting."""
+"""The paper's run, in steps. The schedule of density control and of degrees is that of 3D Gaussian Splatting.
+
+Its code runs a round every `_ROUND` steps between steps `_FIRST` and `_LAST`, and none at these.
+"""
 
 PRESETS: dict[str, Differences] = {
     "paper": {
@@ -91,9 +94,9 @@ PRESETS: dict[str, Differences] = {
             "means_rate": {"start": 1.6e-4, "end": 1.6e-6},
             "means_times_extent": True,
             "density": {
-                "start": _FIRST / _STEPS,
-                "stop": _LAST / _STEPS,
-                "rounds": (_LAST - _FIRST) // _ROUND + 1,
+                "start": (_FIRST + _ROUND) / _STEPS,
+                "stop": (_LAST - _ROUND) / _STEPS,
+                "rounds": (_LAST - _FIRST) // _ROUND - 1,
                 "size_unit": "extent",
                 "split_size": 0.01,
                 "prune_size": 0.1,
