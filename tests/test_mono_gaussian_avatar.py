@@ -1,6 +1,7 @@
 """MonoGaussianAvatar follows its formulas."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -169,9 +170,17 @@ def test_vertices_with_their_own_directions_cost_nothing() -> None:
     assert max(loss.item() for loss in losses.values()) < 1e-9
 
 
-def test_losses_near_the_face_model_are_those_of_the_paper() -> None:
-    face_model = with_pose_correctives()
-    avatar = new_avatar(replace(SMALL, face_points=12), face_model)
+@pytest.mark.parametrize("source", ["code", "supplement"])
+def test_losses_near_the_face_model_are_those_of_the_paper(source: str) -> None:
+    face_model, by_code = with_pose_correctives(), source == "code"
+    supplement: dict[str, Any] = {
+        "face_expression_weight": 1e3,
+        "face_expression_by_variance": False,
+        "face_correctives_weight": 1e3,
+    }
+    paper = PRESETS["paper"].config("mono_gaussian_avatar")
+    assert supplement == {name: getattr(paper, name) for name in supplement}
+    avatar = new_avatar(replace(SMALL, face_points=12, **({} if by_code else supplement)), face_model)
     step = 4
     posed = avatar.pose(toy_face(5)[1], Progress(step, 100))
     losses = avatar.regularizers(posed, pictured(30), Progress(step, 100))
@@ -186,12 +195,14 @@ def test_losses_near_the_face_model_are_those_of_the_paper() -> None:
     assert face_model.pose_basis is not None
     # Lengths are four times life size.
     pose = found.pose - 4 * face_model.pose_basis[:, nearest].permute(1, 2, 0)
-    torch.testing.assert_close(losses["pose_correctives"], 10 * 10 * (10 * pose).square().mean())
+    expected = 10 * 10 * (10 * pose).square().mean() if by_code else 1000 * pose.square().mean()
+    torch.testing.assert_close(losses["pose_correctives"], expected)
     variance = toy_face(5).expression.var(0, correction=0)
     # Coefficients and directions in units where the mean variance of coefficients is 1.
     unit = variance.mean()
     expression = unit.sqrt() * (found.expression - 4 * face_model.expression_basis[:, nearest].permute(1, 2, 0))
-    expected = 10 * 10 * ((10 * expression).square() / (variance / unit * 2)).mean()
+    of_code = 10 * 10 * ((10 * expression).square() / (variance / unit * 2)).mean()
+    expected = of_code if by_code else 1000 * expression.square().mean()
     torch.testing.assert_close(losses["expression_directions"], expected)
     torch.stack(list(losses.values())).sum().backward()
     # The points do not feel these losses.

@@ -218,7 +218,7 @@ def test_mono_gaussian_avatar_has_the_papers_sizes_rates_and_schedules() -> None
     assert (paper.points, paper.max_points, paper.encoding_bands, paper.sphere_start) == (400, 100_000, 6, True)
     # A head model of four times life size: radius .5, scales .025, rate 1e-4.
     assert (4 * paper.sphere_radius, 4 * paper.scale_gain, 4 * paper.means_rate.start) == (0.5, 0.025, 1e-4)
-    assert (paper.network_rate, paper.face_weight) == (Rate(1e-4), 10)
+    assert paper.network_rate == Rate(1e-4)
     assert [round(120 * time) for time in paper.rate_halvings] == [80, 100]
     tuning = paper.face_tuning
     for rate in (tuning.expression, tuning.joints, tuning.head_rotation):
@@ -262,7 +262,10 @@ def test_docs_have_all_values_of_mono_gaussian_avatar() -> None:
         "means_rate": f"{paper.means_rate.start:.1e}".replace("e-0", "e-"),
         "network_rate": f"{paper.network_rate.start:.0e}".replace("e-0", "e-"),
         "rate_halvings": f"epochs {halvings[0]} and {halvings[1]}",
-        "face_weight": "the same" if paper.face_weight == 10 else "another",
+        "face_skinning_weight": f"{paper.face_skinning_weight:g}",
+        "face_expression_weight, face_expression_by_variance": f"{paper.face_expression_weight:,.0f}, "
+        + ("yes" if paper.face_expression_by_variance else "no"),
+        "face_correctives_weight": f"{paper.face_correctives_weight:,.0f}",
         "face_points": "all points",
         "photometric": "the same",
         "photometric.perceptual": f"{photometric.perceptual.weight:g}, three blocks on crops of 224 pixels"[1:],

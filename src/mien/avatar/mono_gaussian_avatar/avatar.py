@@ -116,39 +116,37 @@ class MonoGaussianAvatar(Avatar):
 
         Points are detached: these losses train the networks only. Each step uses the next `face_points` points; on
         average, that is the paper's mean over all points. The squared difference of an expression direction is
-        multiplied by the squared mean variance of all coefficients over the training frames, and divided by the
-        variance of its own coefficient. The term then does not depend on how a face model scales its coefficients (the
-        paper's weights are for FLAME).
+        multiplied by the mean variance of all coefficients over the training frames. The term then does not depend on
+        how a face model scales its coefficients (the paper's weights are for FLAME).
         """
         n = len(self.store)
         turn = progress.step // progress.frames
         chosen = torch.arange(turn * self.config.face_points, (turn + 1) * self.config.face_points)
         means = self.store["means"].detach()
         losses = self._face_losses(means[chosen[:n].to(means.device) % n])
-        weight = self.config.face_weight * self._schedule().face_decay(progress.fraction)
+        weight = self._schedule().face_decay(progress.fraction)
         return {name: weight * loss for name, loss in losses.items()}
 
     def _face_losses(self, means: Float[Tensor, "p 3"]) -> dict[str, Float[Tensor, ""]]:
-        """The same losses for some points, without the weight that they all have."""
+        """The same losses for some points, as they are before their weights halve."""
         model = self.face_model
         found = self.deformation.whole(means / LENGTH_UNIT)
         canonical = means + LENGTH_UNIT * found.offset.detach()
         nearest = nearest_vertices(canonical, self._at_rest().vertices)
         # The bone that stands still belongs to no vertex.
         weights = torch.nn.functional.pad(model.skinning_weights[nearest], (0, 1))
-        losses = {"skinning": 0.1 * _mean_square(found.weights - weights)}
+        losses = {"skinning": self.config.face_skinning_weight * _mean_square(found.weights - weights)}
         difference = found.expression - model.expression_basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
         variance = self.get_buffer("expression_variance")
         unit = variance.mean().clamp_min(1e-8)
-        # Coefficients that never moved would otherwise have an infinite weight.
-        relative = (variance / unit).clamp_min(0.01)
-        losses["expression_directions"] = 10 * _mean_square(
-            10 * difference * (unit / (relative * len(relative))).sqrt()
-        )
+        if self.config.face_expression_by_variance:
+            # Coefficients that never moved would otherwise have an infinite weight.
+            unit = unit / ((variance / unit).clamp_min(0.01) * len(variance))
+        losses["expression_directions"] = self.config.face_expression_weight * _mean_square(difference * unit.sqrt())
         if found.pose.shape[-1] > 0:
             basis = model.pose_basis
             correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
-            losses["pose_correctives"] = 10 * _mean_square(10 * (found.pose - correctives))
+            losses["pose_correctives"] = self.config.face_correctives_weight * _mean_square(found.pose - correctives)
         return losses
 
     def _pretrain(self, face: FaceParams) -> Iterator[None]:

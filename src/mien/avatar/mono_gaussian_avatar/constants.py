@@ -20,7 +20,7 @@ class MonoGaussianAvatarConstants:
     """Frames of such a step. Not varied."""
     pretraining_rate: float = 3e-3
     """Learning rate of its first step. It falls to a tenth. Not varied."""
-    pretraining_weight: float = 10.0
+    pretraining_weight: float = 100.0
     """Weight of the distance between points and their places on the moved mesh, beside the losses that keep the
     networks near the face model. Not varied."""
 

@@ -82,8 +82,16 @@ class MonoGaussianAvatarConfig(MethodConfig):
     rate_halvings: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = ()
     """Times at which the rates of points and networks are halved, as fractions of the run (paper: epochs 80 and
     100)."""
-    face_weight: Annotated[float, NOT_NEGATIVE] = 10.0
-    """Weight of the losses that keep the networks near the face model. It halves at epochs 20, 30, 50 and 70."""
+    face_skinning_weight: Annotated[float, NOT_NEGATIVE] = 1.0
+    """Weight of the mean squared distance of a point's skinning weights from those of the nearest vertex. This weight
+    and the two below keep the networks near the face model. All three halve at epochs 20, 30, 50 and 70."""
+    face_expression_weight: Annotated[float, NOT_NEGATIVE] = 1e4
+    """Weight of the same distance of expression directions, in units where the coefficients' mean variance is 1."""
+    face_expression_by_variance: bool = True
+    """Whether the term of a coefficient is also divided by its variance, relative to the mean of all, and by the number
+    of coefficients, as in the published code; the supplement has neither."""
+    face_correctives_weight: Annotated[float, NOT_NEGATIVE] = 1e4
+    """Weight of the same distance of pose correctives."""
     face_points: Annotated[int, GAUSSIAN_COUNT] = 256
     """Number of points that these losses use in each step, in turn."""
 
@@ -117,6 +125,9 @@ _PAPER: dict[str, Any] = {
     "network_rate": {"start": 1e-4, "end": None},
     "own_rate": {"start": 0.0, "end": None},
     "rate_halvings": [80 / _PAPER_EPOCHS, 100 / _PAPER_EPOCHS],
+    "face_expression_weight": 1e3,
+    "face_expression_by_variance": False,
+    "face_correctives_weight": 1e3,
     "face_points": 100_000,
 }
 """The paper's settings (docs/paper_preset.md)."""
