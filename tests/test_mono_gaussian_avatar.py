@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, Rate
+from mien.avatar.mono_gaussian_avatar import avatar as avatar_module
 from mien.avatar.mono_gaussian_avatar.avatar import (
     canonical_face,
     nearest_vertices,
@@ -370,3 +371,15 @@ def test_nearest_vertices() -> None:
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     points = torch.tensor([[0.6, 0.1, 0], [0.1, 0.1, 5], [0.4, 0.55, 0]])
     assert nearest_vertices(points, vertices).tolist() == [1, 0, 2]
+
+
+def test_nearest_vertices_of_many_points_take_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = torch.Generator().manual_seed(0)
+    points, vertices = torch.randn(1000, 3, generator=random), torch.randn(50, 3, generator=random)
+    monkeypatch.setattr(avatar_module, "_POINTS_AT_ONCE", 64)
+    sizes: list[int] = []
+    addmm = torch.addmm
+    monkeypatch.setattr(torch, "addmm", lambda *args, **more: sizes.append(len(args[1])) or addmm(*args, **more))
+    found = nearest_vertices(points, vertices)
+    assert torch.equal(found, (points[:, None] - vertices).norm(dim=-1).argmin(1))
+    assert max(sizes) == 64
