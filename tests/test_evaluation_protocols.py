@@ -216,7 +216,12 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(
     comparison = compare_runs({"short": root / "runs" / "short", "other": other, "never": tmp_path / "never"})
     assert len(comparison.tables) == 2
     warnings = "\n".join(comparison.warnings)
-    assert "not scored on the same frames, pictures, soft edges and masks: short | other" in warnings
+    if other_in == "mask":
+        assert "because they were scored on other frames, pictures or masks: short | other" in warnings
+    else:
+        assert "because they were scored on other soft edges: short (cleaned) | other (filmed); score them" in warnings
+        assert [table.edges for table in comparison.tables] == ["cleaned", "filmed"]
+        assert "blocks, soft edges as filmed)" in comparison_text(comparison)
     assert "never: was not evaluated" in warnings
     with pytest.raises(UserError, match="no evaluated run"):
         compare_runs({"never": tmp_path / "never"})

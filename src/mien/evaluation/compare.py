@@ -45,6 +45,8 @@ class Table:
     frames: int
     scored_on: Mapping[str, Any]
     """Hashes of pictures and masks by sequence."""
+    edges: str
+    """Colours of the truth at soft edges: cleaned or filmed."""
     rows: tuple[Row, ...]
 
     def best(self, part: str | None, metric: str, higher: bool) -> float | None:
@@ -74,6 +76,7 @@ class Comparison:
                     "split": table.split,
                     "frames": table.frames,
                     "scored_on": dict(table.scored_on),
+                    "edges": table.edges,
                     "rows": [_row_content(row) for row in table.rows],
                 }
                 for table in self.tables
@@ -120,14 +123,27 @@ def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:
             groups.setdefault(_ground(entry), []).append(run)
         tables += [_table(protocol, group) for group in groups.values()]
         if len(groups) > 1:
-            sets = " | ".join(", ".join(run.label for run in group) for group in groups.values())
-            warnings.append(
-                f"{protocol}: these runs have separate tables, because they were not scored on the same frames, "
-                f"pictures, soft edges and masks: {sets}"
-            )
+            warnings.append(_apart(protocol, list(groups.values())))
     for table in tables:
         warnings += _differences(table)
     return tables, warnings
+
+
+def _apart(protocol: str, groups: Sequence[Sequence[ScoredRun]]) -> str:
+    """A warning that runs have separate tables, what tells them apart, and how to score them alike."""
+    entries = [group[0].metrics["protocols"][protocol] for group in groups]
+    names = [", ".join(run.label for run in group) for group in groups]
+    causes, remedy = [], ""
+    if len({_ground({**entry, "edges": ""}) for entry in entries}) > 1:
+        causes.append("other frames, pictures or masks")
+    if len({entry["edges"] for entry in entries}) > 1:
+        causes.append("other soft edges")
+        names = [f"{name} ({entry['edges']})" for name, entry in zip(names, entries, strict=True)]
+        remedy = "; score them alike with `mien evaluate DIR --run NAME --edges cleaned`"
+    return (
+        f"{protocol}: these runs have separate tables, because they were scored on {' and '.join(causes)}: "
+        f"{' | '.join(names)}{remedy}"
+    )
 
 
 def _ground(entry: Mapping[str, Any]) -> str:
@@ -169,7 +185,7 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
     first = runs[0].metrics["protocols"][protocol]
     for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
-    return Table(protocol, first["split"], first["frames"], first["scored_on"], tuple(rows))
+    return Table(protocol, first["split"], first["frames"], first["scored_on"], first["edges"], tuple(rows))
 
 
 def _baseline_rows(key: str, name: str, runs: Sequence[ScoredRun], protocol: str) -> list[Row]:

@@ -20,8 +20,8 @@ GLOSSARY = {
     "Target": (
         "The person inside a frozen mask (the matte, cut at the neck), over white. The mask does not change "
         "when the sequence is tracked again, so that runs can be compared. Where the matte is soft, the colours are "
-        "those of the person, estimated from what is solid nearby; `mien evaluate --edges filmed` keeps the filmed "
-        "ones, which hold some of the background."
+        "those of the person, estimated from what is solid nearby. With `mien evaluate --edges filmed`, which tables "
+        "then name, they are the filmed ones, which hold some of the background."
     ),
     "Whole frame, head crop": (
         "A white background raises the PSNR of the whole frame by several dB, so compare clips by their head crops. "
