@@ -98,6 +98,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
     [
         ("create", ("--out DIR", "see mien create --help")),
         ("render here --out a.mp4 --siez 3", ("--siez", "--size INT", "see mien render --help")),
+        ("train here --method.appearance nonsense", ("nonsense", "features", "see mien train --help-all")),
         ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
         ("create a.mp4 --out here --preset fast", ("'fast'", "draft")),
         ("export here --out", ("--out",)),

@@ -123,6 +123,9 @@ def test_wrong_sequences_and_unfinished_runs(workspace: tuple[Path, Path], tmp_p
         evaluate(tmp_path, [folder])
     with pytest.raises(UserError, match="missing"):
         read_metrics(tmp_path)
+    shutil.copy(run_dir / "config.json", tmp_path)
+    with pytest.raises(UserError, match="was not finished; run the same `mien train` or `mien create` again"):
+        evaluate(tmp_path, [folder])
 
 
 def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path], tmp_path: Path) -> None:

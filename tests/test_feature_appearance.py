@@ -203,3 +203,10 @@ def test_features_that_do_not_fit_are_refused(what: str) -> None:
     fault = baked_fault(replace(baked, changes=replace(baked.changes, features=wrong)))
     assert fault is not None
     assert part in fault
+
+
+def test_there_are_as_many_activations_as_ranks() -> None:
+    config = replace(GaussianAvatarsConfig(), appearance_directions=3, expression_rank=4)
+    with pytest.raises(UserError, match=r"--method.appearance-directions 3: .* --method.expression-rank 4"):
+        config.check()
+    replace(config, appearance_directions=4).check()

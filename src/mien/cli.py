@@ -189,7 +189,10 @@ def _run(name: str, rest: list[str]) -> int:
             if more:
                 show(more)
             raise
-        raise UserError(f"{_in_one_line(complaints.getvalue())}; see mien {name} --help") from None
+        complaint = _in_one_line(complaints.getvalue())
+        # The short help leaves out the options of groups, whose names have a dot.
+        every = "-all" if re.search(r"--[a-z-]+\.[a-z]", complaint) else ""
+        raise UserError(f"{complaint}; see mien {name} --help{every}") from None
     sys.stderr.write(printable(complaints.getvalue(), lines=True))
     asked_threads()
     command.check()

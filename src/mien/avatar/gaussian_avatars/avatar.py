@@ -99,7 +99,7 @@ class GaussianAvatars(Avatar):
     @property
     def _activation_count(self) -> int:
         config = self.config
-        return max(config.expression_rank, config.appearance_directions if config.appearance == "features" else 0)
+        return config.appearance_directions if config.appearance == "features" else config.expression_rank
 
     @property
     def _opacity_changes(self) -> bool:

@@ -13,7 +13,7 @@ from mien.avatar.settings import (
     Photometric,
 )
 from mien.config import overlay
-from mien.ranges import FRACTION, NOT_NEGATIVE, Range
+from mien.ranges import FRACTION, NOT_NEGATIVE, NotBelow, Range
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class GaussianAvatarsConfig(MethodConfig):
     appearance: Literal["static", "features"] = "features"
     """Whether a Gaussian's colour and opacity stay as they are, as in the paper, or also change with features that the
     activations of the face blend and one small network reads, as in HeadGaS."""
-    appearance_directions: Annotated[int, Range(1, 64)] = 12
-    """Number of activations of the face that blend the features, with `appearance` features. It is at least
-    `expression_rank`."""
+    appearance_directions: Annotated[int, Range(1, 64), NotBelow("expression_rank")] = 12
+    """Number of activations of the face that blend the features, with `appearance` features. The first ones are those
+    of `expression_rank`, so there are at least as many."""
     appearance_features: Annotated[int, Range(1, 256)] = 16
     """Number of features of each Gaussian, with `appearance` features."""
     appearance_hidden: Annotated[int, Range(1, 1024)] = 32
