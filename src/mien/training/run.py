@@ -232,8 +232,8 @@ def read_training_summary(run_dir: Path) -> dict[str, Any]:
     """
     if (run_dir / "config.json").is_file() and not is_finished(run_dir):
         raise UserError(
-            f"{run_dir}: its training was not finished; run the same `mien train` or `mien create` again, which goes on "
-            "from its last checkpoint"
+            f"{run_dir}: its training was not finished; run the same `mien train` or `mien create` again, which goes "
+            "on from its last checkpoint"
         )
     content = read_json(run_dir / "training.json", _SUMMARY, _VERSION, "`mien train`", _AGAIN)
     with expect_whole(run_dir / "training.json", _AGAIN):
