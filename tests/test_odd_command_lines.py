@@ -103,7 +103,7 @@ ODD = [
     ),
     ("export W --out a.mien --set drop=1", "leave --set and --series out"),
     ("export W --out a.mien --every 3", "--every 3"),
-    ("export W --out a.ply --series none", "none: no such file or folder"),
+    ("export W --out a.ply --series none", "--series none: no such sequence, file or folder; "),
     ("evaluate", "nothing to evaluate"),
     ("evaluate W W", "2 workspaces"),
     ("evaluate W --perceptual-frames -1", "--perceptual-frames -1"),

@@ -109,7 +109,12 @@ class Command:
         if self.neutral is not None and self.series is None:
             raise UserError(f"--neutral {self.neutral}: is for motions; give it together with --series")
         check_neutral(self.neutral)
-        if self.series is not None and self.series not in workspace.sequence_names():
+        if self.series is not None and self.series not in (names := workspace.sequence_names()):
+            if not Path(self.series).exists():
+                raise UserError(
+                    f"--series {self.series}: no such sequence, file or folder; {self.workspace} has the sequences "
+                    f"{', '.join(names) or '(none)'}; or give a workspace, a video, a recording or a sound file"
+                )
             check_driver(Path(self.series), None)
         check_writable(self._first_path(kind), folder=kind.holds == "folder")
 

@@ -151,8 +151,9 @@ def _tables(protocols: Mapping[str, Any]) -> list[DataTable]:
             f"{_TITLES.get(name, name)} · {entry['frames']} held-out frames ({entry['split']}) · face parameters "
             f"{entry['face_params'].replace('_', ' ')} · PSNR on training frames: "
             f"{entry['training_frames']['psnr']:.2f} dB, head crop {entry['training_frames']['head']['psnr']:.2f} dB"
-            f" · ST-LPIPS on {entry['perceptual_frames']} evenly spread frames"
         )
+        if entry["perceptual_frames"]:
+            caption += f" · ST-LPIPS on {entry['perceptual_frames']} evenly spread frames"
         if entry["edges"] == "filmed":
             caption += " · soft edges as they were filmed"
         if "covered_frames" in entry:

@@ -103,3 +103,8 @@ class Format:
     def reads_avatars(self) -> bool:
         """Whether files of the format are read as whole avatars."""
         return self.read is not None and self.holds == "avatar"
+
+
+def pose_words(path: Path, content: Content) -> str:
+    """Return what a file holds that has Gaussians in one pose and nothing to move them by."""
+    return f"{content.count:,} Gaussians in one pose, {path.stat().st_size / 1e6:.1f} MB"

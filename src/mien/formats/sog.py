@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from mien import export
-from mien.formats.format import Content, Format, Options
+from mien.formats.format import Content, Format, Options, pose_words
 
 
 def _write(path: Path, content: Content, options: Options) -> str:
     export.write_sog(path, content.pose())
-    return f"{content.count:,} Gaussians"
+    return pose_words(path, content)
 
 
 SOG = Format("sog", "pose", _write, (".sog",), lambda path: export.read_sog(path))

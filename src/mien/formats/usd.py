@@ -4,14 +4,14 @@ from pathlib import Path
 
 from mien import export
 from mien.export.usd_package import USD_ENDINGS, check_usd
-from mien.formats.format import Content, Format, Options
+from mien.formats.format import Content, Format, Options, pose_words
 
 
 def _write(path: Path, content: Content, options: Options) -> str:
     moving = content.poses()
     if moving is None:
         export.write_usd(path, [content.pose()])
-        return f"{content.count:,} Gaussians"
+        return pose_words(path, content)
     count = export.write_usd(path, *moving)
     return f"{count} time samples, {path.stat().st_size / 1e6:.1f} MB"
 

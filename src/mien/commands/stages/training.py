@@ -69,7 +69,8 @@ def run_training_stage(
             closing.callback(live.close)
         train(loaded, face_model, method, settings, run_dir, watch=live)
     summary = read_training_summary(run_dir)
-    say(f"{run}: {summary['gaussians']:,} Gaussians after {summary['steps']:,} steps in {summary['seconds']:.0f} s")
+    steps = "1 step" if summary["steps"] == 1 else f"{summary['steps']:,} steps"
+    say(f"{run}: {summary['gaussians']:,} Gaussians after {steps} in {summary['seconds']:.0f} s")
 
 
 def _tell_covered(sequences: list[Sequence], settings: TrainSettings) -> None:
