@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, MethodConfig, make_portable
+from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, GaussianAvatars, MethodConfig, make_portable
 from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render import rasterize
@@ -64,8 +64,14 @@ def grown_avatar(model: FaceModel, face: FaceParams, config: MethodConfig, count
     store.assign("log_scales", 0.4 * noise(9, count, 3) - 0.7)
     store.assign("opacity_logits", 2 * noise(10, count) + 1)
     store.assign("sh_constant", noise(11, count, 1, 3))
-    for name in {"color_basis", "opacity_basis", "offset_basis"} & set(store.names()):
+    for name in sorted({"color_basis", "opacity_basis", "offset_basis"} & set(store.names())):
         store.assign(name, 0.1 * noise(12, *store[name].shape))
+    for name in sorted({"feature_bases", "neutral_features"} & set(store.names())):
+        store.assign(name, noise(13, *store[name].shape))
+        assert isinstance(avatar, GaussianAvatars)
+        assert avatar.appearance is not None
+        for seed, weight in enumerate(avatar.appearance.parameters()):
+            weight.copy_(0.3 * noise(14 + seed, *weight.shape))
     return avatar
 
 
@@ -88,8 +94,20 @@ def rendered_without_torch(avatar: Avatar, face: FaceParams, camera: Camera, fol
 @pytest.mark.exact
 @pytest.mark.parametrize(
     "colors",
-    [{}, {"sh_degree": 2}, {"sh_degree": 1, "sh_frame": "head"}, {"sh_degree": 1, "expression_rank": 7}],
-    ids=["constant colours", "colours in world space", "colours in the head frame", "changes with the expression"],
+    [
+        {},
+        {"sh_degree": 2},
+        {"sh_degree": 1, "sh_frame": "head"},
+        {"sh_degree": 1, "expression_rank": 7},
+        {"expression_rank": 4, "appearance": "features"},
+    ],
+    ids=[
+        "constant colours",
+        "colours in world space",
+        "colours in the head frame",
+        "changes with the expression",
+        "features",
+    ],
 )
 @torch.no_grad()
 def test_every_pixel_equals_that_of_training(colors: dict[str, Any], tmp_path: Path) -> None:

@@ -79,10 +79,11 @@ class GaussianAvatars(Avatar):
             changes["feature_color"], changes["feature_opacity"] = self.appearance(self.store, activations)
         if "offset_basis" in changes:
             local["means"] = local["means"] + changes["offset_basis"]
-        for name in (name for name in ("opacity_basis", "feature_opacity") if name in changes):
-            local["opacity_logits"] = local["opacity_logits"] + changes[name]
-        for name in (name for name in ("color_basis", "feature_color") if name in changes):
-            sh = torch.cat([sh[:, :1] + changes[name][:, None], sh[:, 1:]], dim=1)
+        # Changes are added up before they join a value, as `mien.runtime` does, which gives the same bytes.
+        if opacity := [changes[name] for name in ("opacity_basis", "feature_opacity") if name in changes]:
+            local["opacity_logits"] = local["opacity_logits"] + sum(opacity[1:], opacity[0])
+        if color := [changes[name] for name in ("color_basis", "feature_color") if name in changes]:
+            sh = torch.cat([sh[:, :1] + sum(color[1:], color[0])[:, None], sh[:, 1:]], dim=1)
         return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
 
     def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
