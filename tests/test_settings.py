@@ -156,7 +156,8 @@ def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None
     ("line", "words"),
     [
         ("--method.sh-degre 2", "gaussian_avatars has no such setting; did you mean --method.sh-degree? there are: "),
-        ("--method.features 2", "--method.features: gaussian_avatars has no such setting; there are: --method.photo"),
+        ("--method.nonsense 2", "--method.nonsense: gaussian_avatars has no such setting; there are: --method.photo"),
+        ("--method.features 2", "did you mean --method.appearance-features? there are: "),
         ("--method.max-gaussians 2", "did you mean --method.density.max-gaussians?"),
         ("--method.density.split 2", "did you mean --method.density.split-size? there are: --method.density.start"),
         ("--method.density 2", "--method.density: is a group of settings of gaussian_avatars; there are: --method.de"),

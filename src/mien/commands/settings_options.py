@@ -150,11 +150,15 @@ def check_names(arguments: Sequence[str], prefix: str, listed: Sequence[Leaf], o
 
 
 def _near(option: str, known: Sequence[str]) -> list[str]:
-    """The option with the most similar last part, if there is one: a name may be right and its group forgotten."""
+    """The option with the most similar last part, if there is one: a name may be right and its group forgotten.
+
+    If there is none, it is the first one whose last part has the given one as one of its words.
+    """
     names = [*known, *{name.rpartition(".")[0] for name in known}]
     lasts = {name: name.rpartition(".")[2] for name in names}
     near = difflib.get_close_matches(option.rpartition(".")[2], set(lasts.values()), 3)
-    return difflib.get_close_matches(option, sorted(name for name in names if lasts[name] in near), 1, 0.5)
+    found = difflib.get_close_matches(option, sorted(name for name in names if lasts[name] in near), 1, 0.5)
+    return found or [name for name in known if option.rpartition(".")[2] in lasts[name].split("-")][:1]
 
 
 def _replaced(settings: Any, values: Mapping[str, Any]) -> Any:
