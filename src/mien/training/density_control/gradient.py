@@ -34,7 +34,6 @@ from mien import _native
 from mien.arrays import is_native, unpacked
 from mien.avatar import GaussianStore, GradientDensity, Posed, Progress
 from mien.render.rendering import Rendering
-from mien.training.constants import TRAINING
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
 
 
@@ -77,10 +76,8 @@ class GradientStrategy(DensityStrategy):
             store.assign(name, lowered)
         return changed
 
-    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
-        """Remove redundant Gaussians, but not soon after a reset of opacities. The statistics start again."""
-        if fraction < 1 and any(0 <= fraction - time < TRAINING.unjudged_after_reset for time in self._resets):
-            return
+    def thin(self, store: GaussianStore, redundant: Redundant) -> None:
+        """Remove redundant Gaussians. The statistics start again."""
         store.select(~redundant())
         self._restart(len(store))
 

@@ -61,7 +61,7 @@ class RefillStrategy(DensityStrategy):
         self._highest_opacities = torch.zeros(len(store), device=self._highest_opacities.device)
         return True
 
-    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
+    def thin(self, store: GaussianStore, redundant: Redundant) -> None:
         """Do nothing, because the rounds remove what no view has shown."""
 
     def state(self) -> dict[str, Tensor]:

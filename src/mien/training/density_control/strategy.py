@@ -31,12 +31,11 @@ class DensityStrategy(ABC):
         """
 
     @abstractmethod
-    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
-        """Remove redundant Gaussians between two rounds, if the strategy removes any and it is time for that.
+    def thin(self, store: GaussianStore, redundant: Redundant) -> None:
+        """Remove redundant Gaussians between two rounds, if the strategy removes any.
 
         Args:
             store: The store.
-            fraction: How far the run is, 0..1.
             redundant: Is called only if its result is used.
         """
 
@@ -59,7 +58,7 @@ class FixedStrategy(DensityStrategy):
         """Return False, because the store never changes."""
         return False
 
-    def thin(self, store: GaussianStore, fraction: float, redundant: Redundant) -> None:
+    def thin(self, store: GaussianStore, redundant: Redundant) -> None:
         """Do nothing."""
 
     def state(self) -> dict[str, Tensor]:

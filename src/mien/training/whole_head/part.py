@@ -100,7 +100,7 @@ class WholeHead:
             ]
             return prune_hidden(step.avatar, self.unseen, views, close=not last)
 
-        step.density.thin(step.avatar.gaussian_store(), step.fraction_done, redundant)
+        step.density.thin(step.avatar.gaussian_store(), redundant)
 
     def _load_state(self, state: dict[str, Tensor]) -> None:
         if self.hair is not None:
