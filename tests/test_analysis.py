@@ -287,7 +287,7 @@ def test_the_command_names_every_analysis_and_part(capsys: pytest.CaptureFixture
 BAD = [
     ("analyze gaussian-avatars gone", "gone: no such folder"),
     ("analyze gaussian-avatars W --run none", "no run 'none'; there are: begun, other, toy"),
-    ("analyze gaussian-avatars W --run begun", "training.json: missing; run `mien train` again"),
+    ("analyze gaussian-avatars W --run begun", "begun: its training was not finished; run the same `mien train`"),
     ("analyze gaussian-avatars W --run other", "other: is a run of headgas, not of gaussian_avatars"),
     ("analyze gaussian-avatars W --run toy --parts speed hair", "--parts hair: no such part; there are: growth, speed"),
     ("analyze gaussian-avatars W --run toy --steps 0", "--steps 0: give a number from 1 to 1000000"),
