@@ -11,7 +11,7 @@ from mien.avatar import HeadGas, HeadGasConfig, Progress
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.avatar import input_directions, neighbor_distances, sample_surface, spread_out
-from mien.avatar.settings import Photometric
+from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.runtime import pose
 from mien.training import PRESETS
@@ -173,9 +173,10 @@ def test_the_papers_schedule() -> None:
     steps = PRESETS["paper"].settings_of("headgas").steps
     density = config.density
     rounds = sorted(_round_steps(density.start, density.stop, density.rounds, steps))
-    assert (steps, rounds) == (50_000, list(range(500, 15_001, 100)))
+    assert (steps, rounds) == (50_000, list(range(600, 15_000, 100)))
     assert (config.points, config.features, config.hidden, config.sh_degree, config.directions) == (2500, 32, 64, 3, 0)
-    assert config.photometric == Photometric(0.8, 0.2)
+    perceptual = PerceptualLoss(weight=0.1, start=0.2, every=1, blocks=3, region="person")
+    assert config.photometric == Photometric(0.8, 0.2, perceptual=perceptual)
 
 
 def test_points_are_on_the_mesh_evenly_by_area() -> None:
