@@ -273,7 +273,7 @@ def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
         outcomes = both.run(create, ["evaluate", str(studio.root), "--run", name], waits=waits[trained])
         if all(outcome.code == 0 for outcome in outcomes):
             waits[trained] = waits_to_meet(waits[trained], outcomes)
-        if "missing; run `mien train` again" in outcomes[1].told:  # it came first, and there was nothing to evaluate
+        if "its training was not finished" in outcomes[1].told:  # it came first, and there was nothing to evaluate
             assert outcomes[0].code == 0
         else:
             told += assert_apart(outcomes, name)
