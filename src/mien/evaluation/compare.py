@@ -49,6 +49,11 @@ class Table:
     """Colours of the truth at soft edges: cleaned or filmed."""
     rows: tuple[Row, ...]
 
+    @property
+    def ground(self) -> str:
+        """What the frames are scored on, for headings: the split, and whether soft edges are as they were filmed."""
+        return self.split + (", soft edges as filmed" if self.edges == "filmed" else "")
+
     def best(self, part: str | None, metric: str, higher: bool) -> float | None:
         """The best figure of a column among the runs, rounded as printed, or None if fewer than two runs have one."""
         digits = next(digits for name, _, digits, _ in COLUMNS if name == metric)

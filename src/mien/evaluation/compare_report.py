@@ -71,9 +71,8 @@ def comparison_html(comparison: Comparison, frames: Sequence[Sequence[_DrawnFram
 
 def _heading(table: Table) -> str:
     names = ", ".join(dict.fromkeys(table.rows[0].entry["per_frame"]["sequence"]))
-    filmed = ", soft edges as filmed" if table.edges == "filmed" else ""
     protocol = table.protocol.replace("_", " ").capitalize()
-    return f"{protocol}: {table.frames} held-out frames of {names} ({table.split}{filmed})"
+    return f"{protocol}: {table.frames} held-out frames of {names} ({table.ground})"
 
 
 def _data_table(table: Table) -> DataTable:

@@ -55,8 +55,7 @@ def comparison_text(comparison: Comparison, bold: bool = False) -> str:
 def _table_text(table: Table, bold: bool) -> str:
     """A heading and an aligned table: first the whole frame, then the head crop."""
     sequences = ", ".join(sorted(set(table.rows[0].entry["per_frame"]["sequence"])))
-    filmed = ", soft edges as filmed" if table.edges == "filmed" else ""
-    title = printable(f"{table.protocol}: {table.frames} held-out frames of {sequences} ({table.split}{filmed})")
+    title = printable(f"{table.protocol}: {table.frames} held-out frames of {sequences} ({table.ground})")
     extra = ("Gaussians", "training", "ms/frame")
     heads = [
         "",

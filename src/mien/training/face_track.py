@@ -154,7 +154,7 @@ class FaceTrack:
         return replace(self._start, **fields)
 
     def _seen(self) -> Bool[Tensor, " t"]:
-        """Which timesteps training has used and changed. Any field tells: those with a rate of 0 count no steps."""
+        """Return which timesteps training has changed. Every field counts, as one with a rate of 0 has no steps."""
         seen = torch.zeros(len(self._start), dtype=torch.bool)
         for moments in self._moments.values():
             seen |= moments.step > 0
