@@ -21,6 +21,7 @@ from mien.avatar.density import GradientDensity
 from mien.errors import UserError
 from mien.export import MeshModel, read_glb, read_ply, write_glb, write_page, write_ply
 from mien.face import FaceModel
+from mien.face.head_parts import head_parts
 from mien.render import rasterize
 from mien.runtime.baked import Filmed
 from mien.training import Sequence, filmed_words, read_coverage, train
@@ -28,6 +29,7 @@ from mien.training.density_control import density_strategy
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
 from mien.training.footage.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
 from mien.training.footage.frames import Frame, training_frames
+from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
 from sh_colors import rgb_from_sh
@@ -148,6 +150,24 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     assert moved is not None
     assert moved[filled_in][:, 1].any()
     assert not moved[filled_in][:, [0, 2]].any()
+
+
+def test_what_is_beside_shown_triangles_is_trained(
+    toy: tuple[FaceModel, Sequence], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hair above a band beside what pictures show is on their outline, so pictures train it. Fills begin behind it."""
+    model, avatar = toy[0], bare_avatar(toy)
+    middles, found = model.head_vertices(avatar.subject)[0][model.faces].mean(1), covered(toy)
+    apart = torch.cdist(middles, middles[found.seen > WHOLE_HEAD.unseen_confidence]).amin(1)
+    filled = {}
+    for band in (0.0, 0.03):
+        monkeypatch.setattr("mien.training.whole_head.unseen.WHOLE_HEAD", replace(WHOLE_HEAD, outline_band=band))
+        prior = known(toy, avatar).prior
+        assert prior.filled_in is not None
+        filled[band] = prior.filled_in & ~head_parts(model).interior
+    assert filled[0.03].equal(filled[0.0] & (apart > 0.03))
+    assert filled[0.03].any()
+    assert (filled[0.0] & ~filled[0.03]).any()
 
 
 def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> None:

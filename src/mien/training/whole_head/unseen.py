@@ -2,7 +2,8 @@
 
 What no picture shows must not help to explain pictures. Gaussians on such triangles are made up: opaque and flat, at
 the height of hair, in completed colours. Training changes only their height along the normal, where pictures clearly
-contradict it, as where they stand out beyond the outline.
+contradict it, as where they stand out beyond the outline. Triangles in a band beside those that are seen are trained,
+because the hair above them is on the outline.
 """
 
 from collections.abc import Sequence as Items
@@ -129,6 +130,8 @@ def unseen_of(
     if avatar.surface() is None:
         return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
     filled_in = (shown < WHOLE_HEAD.unseen_confidence) & (found.above > 0.5)
+    outside = (found.above > 0.5) & ~parts.interior
+    filled_in &= ~(outside & beside_shown(model, neutral, outside & ~filled_in))
     filled_in |= hidden_inside(model, parts.interior, sequences, faces, frames)
     widening = wider_where_faces_move(model, neutral, parts.interior)
     behind_head = back_hair(model, neutral, hair, hanging)
@@ -139,6 +142,23 @@ def unseen_of(
     return Unseen(
         found, SurfacePrior(hair, hanging, colors, doubt, filled_in, filled_in | parts.interior, strands, widening)
     )
+
+
+def beside_shown(
+    face_model: FaceModel, vertices: Float[Tensor, "v 3"], shown: Bool[Tensor, " f"]
+) -> Bool[Tensor, " f"]:
+    """Which triangles are so near to those that pictures show that hair above them is on the outline of some picture.
+
+    Args:
+        face_model: The face model.
+        vertices: The person's neutral head in the head frame, in metres.
+        shown: Triangles of the outside that pictures show.
+    """
+    if not bool(shown.any()):
+        return torch.zeros_like(shown)
+    middles = vertices[face_model.faces.long()].mean(1)
+    apart = torch.cdist(middles, middles[shown], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    return apart < WHOLE_HEAD.outline_band
 
 
 def _hair_colors(
