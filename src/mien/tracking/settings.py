@@ -1,4 +1,4 @@
-"""Settings of tracking: the fit to landmarks, the fit to pixels, and the paper's descent."""
+"""Settings of tracking: the fit to landmarks, the fit to pixels, the paper's descent, and the scoring mask."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -200,3 +200,14 @@ class TrackingSettings:
         paper = self.paper if self.schedule == "paper" else PaperSettings()
         by_pixels = self.schedule == "fast" or (self.schedule == "paper" and paper.start == "fast")
         return replace(self, paper=paper, photometric=self.photometric if by_pixels else PhotometricSettings())
+
+
+@dataclass(frozen=True)
+class ScoringSettings:
+    """Settings of the scoring mask: what is trained on and scored."""
+
+    cut: Literal["plane", "line"] = "plane"
+    """Lower end of the head in the masks. plane: a plane across the lower neck, which all cameras see alike; the
+    projected head stays whole. line: as in the supplement of GaussianAvatars, a straight line in each picture along the
+    base of the neck, below which everything goes; for figures beside those of that protocol. Masks are written once,
+    so a sequence keeps its cut."""
