@@ -41,6 +41,9 @@ _TRACKING_RECIPE = 12
 """Version of the tracking. It is raised whenever the same captures would be tracked differently, so that old trackings
 no longer count as current."""
 
+_DESCENT_RECIPE = "descent 2"
+"""The same for what only the schedule `paper` does."""
+
 DEFAULT_SCORING = ScoringSettings()
 
 Overlay = Literal["auto", "all", "none"]
@@ -167,6 +170,7 @@ def _tracking_fingerprint(
     captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
     content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]
     content += [sorted(set(hold_out))] if hold_out else []
+    content += [_DESCENT_RECIPE] if settings.schedule == "paper" else []
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
