@@ -102,9 +102,8 @@ class Extras:
     """Returns the number of training frames that the next optimiser step uses."""
     pretraining: Pretraining | None = None
     """Training before the first picture. None if the avatar needs none."""
-    closing: int = 1
-    """Side of the square of pixels by which finished pictures are eroded and then dilated (`mien.render.close_holes`).
-    1 changes nothing."""
+    closing: int = 0
+    """Pixels by which finished pictures are eroded and then dilated (`mien.render.close_holes`)."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
 

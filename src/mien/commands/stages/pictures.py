@@ -24,14 +24,14 @@ def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
 
 
 @torch.no_grad()
-def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing: int = 1) -> UInt8[np.ndarray, "h w _"]:
+def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing: int = 0) -> UInt8[np.ndarray, "h w _"]:
     """The picture as RGB over the background, or as RGBA with straight colours.
 
     Args:
         options: What pictures look like.
         gaussians: What is drawn.
         camera: The camera.
-        closing: Side of the square by which holes are closed (`close_holes`). Transparent pictures keep them.
+        closing: Pixels by which holes are closed (`close_holes`). Transparent pictures keep them.
     """
     background = torch.tensor(options.color()).to(gaussians.means)
     with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
