@@ -163,8 +163,7 @@ class PointAvatar(Avatar):
             opacity_logits=as_array(own.new_full((n,), math.log(_OPACITY / (1 - _OPACITY)))),
             sh=as_array(sh_from_rgb(self._colors(self.subject))[:, None]),
         )
-        still = {"still_weights": motion.still_weights, "still_pose": motion.still_pose}
-        return BlendSkinned(motion.rig, attributes, **still)
+        return BlendSkinned(motion.rig, attributes, still_weights=motion.still_weights, still_pose=motion.still_pose)
 
     @property
     def _motion(self) -> PointMotion:
