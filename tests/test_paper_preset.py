@@ -120,6 +120,7 @@ def names_in(changes: dict[str, Any], place: str = "") -> list[str]:
         ("gaussian_avatars", "GaussianAvatars"),
         ("headgas", "HeadGaS"),
         ("mono_gaussian_avatar", "MonoGaussianAvatar"),
+        ("point_avatar", "PointAvatar"),
     ],
 )
 def test_docs_name_every_setting_that_differs_from_the_default(method: str, section: str) -> None:
@@ -208,7 +209,7 @@ def test_docs_have_all_values_of_headgas() -> None:
 
 def mono_table() -> dict[str, str]:
     page = PAGE.read_text()
-    own = page[page.index("## MonoGaussianAvatar") :]
+    own = page.split("\n## MonoGaussianAvatar\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| (`[a-z_., `]+) \|(.*)\|$", own, flags=re.MULTILINE)
     return {name: words for names, words in rows for name in re.findall(r"`([a-z_.]+)`", names)}
 
