@@ -6,7 +6,15 @@ Tests of a formula or a mechanism use them, so that a change of a default does n
 from dataclasses import replace
 from typing import Any
 
-from mien.avatar import METHODS, FaceTuning, GaussianAvatarsConfig, MethodConfig, MonoGaussianAvatarConfig, Rate
+from mien.avatar import (
+    METHODS,
+    FaceTuning,
+    GaussianAvatarsConfig,
+    MethodConfig,
+    MonoGaussianAvatarConfig,
+    PointAvatarConfig,
+    Rate,
+)
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.training import TrainSettings
 
@@ -19,7 +27,11 @@ def plain_run(**changes: Any) -> TrainSettings:
 
 def plain_config(method: str, **changes: Any) -> MethodConfig:
     """Plain settings of a method. Those of a method without any here are its defaults."""
-    plain = {"gaussian_avatars": plain_gaussian_avatars, "mono_gaussian_avatar": plain_mono_gaussian_avatar}
+    plain = {
+        "gaussian_avatars": plain_gaussian_avatars,
+        "mono_gaussian_avatar": plain_mono_gaussian_avatar,
+        "point_avatar": plain_point_avatar,
+    }
     return replace(plain.get(method, METHODS[method].config)(), **changes)
 
 
@@ -44,5 +56,13 @@ def plain_mono_gaussian_avatar(**changes: Any) -> MonoGaussianAvatarConfig:
         epochs=100,
         network_rate=Rate(1e-3, 1e-4),
         own_rate=Rate(0.0),
+    )
+    return replace(plain, **changes)
+
+
+def plain_point_avatar(**changes: Any) -> PointAvatarConfig:
+    """Some hundred points that start on a sphere, as in the paper."""
+    plain = PointAvatarConfig(
+        start="sphere", pretraining=0, points=200, max_points=1_000, epochs=20, growth_epochs=4, frames_per_step=1
     )
     return replace(plain, **changes)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from mien.adam import FactoredMoments, Moments
 from mien.avatar import HeadGas, HeadGasConfig, Progress
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
@@ -15,6 +16,7 @@ from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.runtime import pose
 from mien.training import PRESETS
+from mien.training.adam import Adam
 from mien.training.density_control.gradient import _round_steps
 from toy_scene import runtime_face, toy_face, toy_face_model
 
@@ -81,6 +83,41 @@ def test_color_and_opacity_are_the_networks_of_features_and_place() -> None:
     values = torch.where(values < 0, 0.01 * values, values) @ last.weight.T + last.bias
     torch.testing.assert_close(gaussians.sh[0], values[:, :12].reshape(40, 4, 3))
     torch.testing.assert_close(gaussians.opacities[0], values[:, 12].sigmoid())
+
+
+def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None:
+    """The preset has the formulas' gradients: dense ones of all bases, and the encoding's of the centres."""
+    paper: Any = PRESETS["paper"].config("headgas")
+    assert (paper.encoding_gradient, paper.factored_bases, paper.network_epsilon) == (True, False, 1e-8)
+    face, by_encoding, by_bases = toy_face(5)[2], {}, {}
+    for encoding_gradient, factored_bases in ((False, True), (True, True), (False, False), (True, False)):
+        avatar = new_avatar(replace(SMALL, encoding_gradient=encoding_gradient, factored_bases=factored_bases))
+        fill(avatar.store["bases"])
+        fill(avatar.store["neutral_features"], 2)
+        gaussians = avatar.pose(face).gaussians
+        (gaussians.opacities.sum() + gaussians.sh.square().sum()).backward()
+        by_encoding[encoding_gradient, factored_bases] = avatar.store["means"].grad
+        (group,) = [group for group in avatar.parameter_groups() if group.name == "bases"]
+        before = avatar.store["bases"].detach().clone()
+        if not factored_bases:
+            by_bases[encoding_gradient] = avatar.store["bases"].grad
+        Adam().step([group], Progress(0, 100))
+        moved = (avatar.store["bases"].detach() - before).abs()
+        assert moved.max() > 0
+        kind = FactoredMoments if factored_bases else Moments
+        assert isinstance(avatar.store.moments["bases"], kind)
+    assert by_encoding[False, True] is None
+    assert by_encoding[False, False] is None
+    moving = by_encoding[True, True]
+    assert moving is not None
+    assert moving.abs().min() > 0
+    torch.testing.assert_close(by_encoding[True, False], moving)
+    torch.testing.assert_close(by_bases[True], by_bases[False])
+
+
+def test_networks_have_the_epsilon_of_the_settings() -> None:
+    groups = {group.name: group for group in new_avatar(replace(SMALL, network_epsilon=1e-8)).parameter_groups()}
+    assert (groups["network"].epsilon, groups["means"].epsilon) == (1e-8, 1e-15)
 
 
 def test_nothing_moves_in_the_head_frame() -> None:

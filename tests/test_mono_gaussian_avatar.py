@@ -8,13 +8,10 @@ import torch
 from torch import Tensor
 
 from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, Rate
-from mien.avatar.mono_gaussian_avatar import avatar as avatar_module
-from mien.avatar.mono_gaussian_avatar.avatar import (
-    canonical_face,
-    nearest_vertices,
-)
+from mien.avatar.mono_gaussian_avatar import motion
 from mien.avatar.mono_gaussian_avatar.constants import MONO
-from mien.avatar.mono_gaussian_avatar.networks import Deformation
+from mien.avatar.mono_gaussian_avatar.motion import canonical_face, nearest_vertices
+from mien.avatar.mono_gaussian_avatar.networks import Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.surface_places import at_places, random_places
@@ -125,11 +122,11 @@ def points_in_world(avatar: MonoGaussianAvatar, face: FaceParams) -> Tensor:
     return means @ pose[:3, :3].T + pose[:3, 3]
 
 
-class Perfect(torch.nn.Module):
+class Perfect(DeformationNet):
     """Deformation network that knows the face model's vertices."""
 
     def __init__(self, face_model: FaceModel) -> None:
-        super().__init__()
+        torch.nn.Module.__init__(self)
         self.model = face_model
 
     def whole(self, points: Tensor) -> Deformation:
@@ -269,6 +266,28 @@ def test_schedules_are_those_of_paper_and_code() -> None:
     assert decays == [1, 0.5, 0.25, 0.125, 0.0625, 0.0625]
 
 
+def test_the_round_into_epoch_101_is_the_first_with_the_late_length_in_paper() -> None:
+    """A round runs after the last step of an epoch. The defaults begin one round later, as they were measured."""
+    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
+    assert (paper.late_epoch, SMALL.late_epoch) == (101, 102)
+    for late_epoch in (101, 102):
+        schedule = Schedule("code", 130, 400, late_epoch=late_epoch)
+        lengths = {epoch: 4 * schedule.sampling_length((epoch - 0.01) / 130) for epoch in range(99, 105)}
+        assert [epoch for epoch, length in lengths.items() if length == 0.004] == list(range(late_epoch, 105))
+    avatar = new_avatar(replace(SMALL, late_epoch=40))
+    parents, noise = torch.tensor([3]), torch.tensor([[0.5, 0.0, 0.0]])
+    children = avatar.density().refill(avatar.store, parents, noise, 39.5 / 100)["means"]
+    torch.testing.assert_close(children - avatar.store["means"][parents], torch.tensor([[0.0005, 0, 0]]))
+
+
+def test_paper_has_adams_own_epsilon_and_the_published_skinning_branch() -> None:
+    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
+    assert (paper.adam_epsilon, paper.skinning_norm) == (1e-8, True)
+    groups = new_avatar(replace(SMALL, adam_epsilon=1e-8)).parameter_groups()
+    assert {group.epsilon for group in groups} == {1e-8}
+    assert {group.epsilon for group in new_avatar().parameter_groups()} == {1e-15}
+
+
 def test_the_end_of_a_run_changes_nothing() -> None:
     schedule = Schedule("code", 100, 400)
     assert schedule.rendering_radius(1.0) == schedule.rendering_radius(0.999)
@@ -376,7 +395,7 @@ def test_nearest_vertices() -> None:
 def test_nearest_vertices_of_many_points_take_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     random = torch.Generator().manual_seed(0)
     points, vertices = torch.randn(1000, 3, generator=random), torch.randn(50, 3, generator=random)
-    monkeypatch.setattr(avatar_module, "_POINTS_AT_ONCE", 64)
+    monkeypatch.setattr(motion, "_POINTS_AT_ONCE", 64)
     sizes: list[int] = []
     addmm = torch.addmm
     monkeypatch.setattr(torch, "addmm", lambda *args, **more: sizes.append(len(args[1])) or addmm(*args, **more))

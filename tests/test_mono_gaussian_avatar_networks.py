@@ -84,6 +84,24 @@ def test_summed_directions_are_exactly_the_sums_of_directions() -> None:
     torch.testing.assert_close(weights, (20 * network.skinning(softplus(network.hidden(values)))).softmax(-1))
 
 
+def test_the_published_skinning_branch_has_weight_norm_and_the_start_of_the_trunk() -> None:
+    torch.manual_seed(0)
+    plain, published = DeformationNet(400, 4, 9, 5), DeformationNet(400, 4, 9, 5, skinning_norm=True)
+    assert isinstance(published.hidden, torch.nn.Linear)
+    assert float(published.hidden.weight.detach().std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)
+    assert published.hidden.bias.abs().max() == 0
+    assert {name for name, _ in published.named_parameters() if name.startswith("hidden.")} == {
+        "hidden.bias",
+        "hidden.parametrizations.weight.original0",
+        "hidden.parametrizations.weight.original1",
+    }
+    assert {name for name, _ in plain.named_parameters() if name.startswith("hidden.")} == {
+        "hidden.weight",
+        "hidden.bias",
+    }
+    torch.testing.assert_close(published.whole(torch.randn(7, 3)).weights, torch.full((7, 5), 0.2))
+
+
 def test_deformation_starts_as_nothing_with_even_weights() -> None:
     found = DeformationNet(16, 4, 9, 5).whole(torch.randn(7, 3))
     assert found.offset.abs().max() == found.expression.abs().max() == found.pose.abs().max() == 0

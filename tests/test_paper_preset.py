@@ -120,6 +120,7 @@ def names_in(changes: dict[str, Any], place: str = "") -> list[str]:
         ("gaussian_avatars", "GaussianAvatars"),
         ("headgas", "HeadGaS"),
         ("mono_gaussian_avatar", "MonoGaussianAvatar"),
+        ("point_avatar", "PointAvatar"),
     ],
 )
 def test_docs_name_every_setting_that_differs_from_the_default(method: str, section: str) -> None:
@@ -185,6 +186,9 @@ def test_docs_have_all_values_of_headgas() -> None:
         "means_rate, means_times_extent": "the same",
         "log_scales_rate, quats_rate": "the same",
         "features_rate, network_rate": "2.5e-3, 2e-3 to 2e-4",
+        "factored_bases": "yes" if paper.factored_bases else "no",
+        "encoding_gradient": "yes" if paper.encoding_gradient else "no",
+        "network_epsilon": f"{paper.network_epsilon:.0e}".replace("e-0", "e-"),
         "encoding_bands, encoding_length": f"{paper.encoding_bands}, {paper.encoding_length} m",
         "density.start, stop, rounds": f"from step {start} to {stop:,}, every {every} steps",
         "density.grow_gradient, split_size, size_unit": "the same",
@@ -205,7 +209,7 @@ def test_docs_have_all_values_of_headgas() -> None:
 
 def mono_table() -> dict[str, str]:
     page = PAGE.read_text()
-    own = page[page.index("## MonoGaussianAvatar") :]
+    own = page.split("\n## MonoGaussianAvatar\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| (`[a-z_., `]+) \|(.*)\|$", own, flags=re.MULTILINE)
     return {name: words for names, words in rows for name in re.findall(r"`([a-z_.]+)`", names)}
 
@@ -253,14 +257,17 @@ def test_docs_have_all_values_of_mono_gaussian_avatar() -> None:
         "max_points": f"{paper.max_points:,}",
         "first_epoch, epochs": f"{paper.first_epoch}, {paper.epochs}",
         "schedule": paper.schedule,
+        "late_epoch": f"{paper.late_epoch}",
         "attribute_width, attribute_layers": f"{paper.attribute_width}, {paper.attribute_layers}",
         "encoding_bands": f"{paper.encoding_bands}",
         "sphere_start": "yes" if paper.sphere_start else "no",
         "deformation_width": f"{paper.deformation_width}",
+        "skinning_norm": "yes" if paper.skinning_norm else "no",
         "change_width": f"{paper.change_width}",
         "scale_gain": f"{paper.scale_gain}",
         "means_rate": f"{paper.means_rate.start:.1e}".replace("e-0", "e-"),
         "network_rate": f"{paper.network_rate.start:.0e}".replace("e-0", "e-"),
+        "adam_epsilon": f"{paper.adam_epsilon:.0e}".replace("e-0", "e-"),
         "rate_halvings": f"epochs {halvings[0]} and {halvings[1]}",
         "face_skinning_weight": f"{paper.face_skinning_weight:g}",
         "face_expression_weight, face_expression_by_variance": f"{paper.face_expression_weight:,.0f}, "

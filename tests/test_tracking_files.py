@@ -10,11 +10,13 @@ import torch
 
 from damage import edit_json
 from mien.errors import UserError
-from mien.storage import read_tensors, write_tensors
+from mien.storage import read_json, read_tensors, write_tensors
 from mien.tracking import (
     Appearance,
     Scoring,
+    ScoringSettings,
     Tracking,
+    check_scoring_cut,
     read_scoring,
     read_scoring_hash,
     read_tracking,
@@ -152,6 +154,24 @@ def test_scoring_round_trip_and_frozen(tmp_path):
     write_scoring(folder, _scoring(value=100), "a1")
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     assert list(tmp_path.iterdir()) == [folder], "no scratch folder stays behind"
+
+
+def test_masks_keep_their_cut(tmp_path):
+    """scoring.json names the cut, and another one is refused with the remedy, because masks are written once."""
+    folder = tmp_path / "scoring"
+    check_scoring_cut(folder, ScoringSettings("line"), "a1")
+    write_scoring(folder, replace(_scoring(), cut="line"), "a1")
+    assert read_json(folder / "scoring.json", "mien.scoring", 1, "")["cut"] == "line"
+    assert read_scoring(folder).cut == "line"
+    check_scoring_cut(folder, ScoringSettings("line"), "a1")
+    check_scoring_cut(folder, ScoringSettings("plane"), "b2")  # masks of other pictures are made again
+    with pytest.raises(UserError, match=r"--scoring.cut plane: .*give --scoring.cut line, or delete that folder"):
+        check_scoring_cut(folder, ScoringSettings("plane"), "a1")
+    edit_json(folder / "scoring.json", lambda content: content.update(cut="circle"))
+    with pytest.raises(UserError, match=r"cut 'circle' is neither plane nor line; delete the folder"):
+        read_scoring(folder)
+    edit_json(folder / "scoring.json", lambda content: content.pop("cut"))
+    assert read_scoring(folder).cut == "plane", "masks from before there was a choice"
 
 
 def test_half_written_scoring_is_replaced(tmp_path):

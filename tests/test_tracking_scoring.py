@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mien.camera import look_at
-from mien.tracking import Tracking, make_scoring, write_overlay
+from mien.tracking import ScoringSettings, Tracking, make_scoring, write_overlay
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.neck_line import bottom_vertices, fit_neck_lines
 from mien.tracking.report.overlay import OverlayPainter
@@ -186,6 +186,24 @@ def test_make_scoring():
     assert (left, top) == (0, 0)
     assert width == SIZE
     assert abs(top + height - row) < 15
+
+
+def test_the_cut_line_keeps_what_is_above_the_line_of_each_picture_and_nothing_else():
+    """`line` is the supplement's mask: a straight line in the picture, and no exception for what is below it."""
+    model, face = _upright(2, roll=0.5)
+    tracking = _tracking(model, face)
+    capture = capture_of(torch.full((2, 478, 2), 100.0))
+    scoring = make_scoring(capture, tracking, model, settings=ScoringSettings("line"))
+    a, b, d = tracking.neck_lines[1, 0].double().numpy()
+    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+    above = a * columns + b * rows + d
+    assert abs(a) > 0.2, "the head is tilted, and so is the line"
+    assert scoring.cut == "line"
+    assert (scoring.masks[1, 0][above > 0.5] == 255).all()
+    assert (scoring.masks[1, 0][above < -0.5] == 0).all()
+    by_plane = make_scoring(capture, tracking, model)
+    assert by_plane.cut == "plane"
+    assert (by_plane.masks[1, 0] > scoring.masks[1, 0]).any() or (by_plane.masks[1, 0] < scoring.masks[1, 0]).any()
 
 
 def test_overlay(tmp_path):

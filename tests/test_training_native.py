@@ -87,3 +87,12 @@ def test_the_same_bits_for_any_number_of_threads() -> None:
     _native.set_thread_count(before)
     for other in results[1:]:
         assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
+
+
+def test_another_epsilon_is_that_of_the_formula() -> None:
+    """The core has one epsilon. An update with another is made in PyTorch, and is as small as the formula says."""
+    for epsilon, moved in ((1e-15, 0.1), (1e-8, 0.1 / 11), (1e-9, 0.05)):
+        values = torch.zeros(3)
+        gradient = torch.full((3,), 1e-9)
+        update_all([Update(values, gradient, Moments.zeros(values), 0.1, epsilon)])
+        torch.testing.assert_close(values, torch.full((3,), -moved), rtol=1e-4, atol=0)

@@ -9,6 +9,9 @@ from torch import Tensor
 
 BETA1, BETA2 = 0.9, 0.999
 """Decay of both running means per update (Kingma and Ba 2015)."""
+EPSILON = 1e-15
+"""Number added to the root of the second moment, as in 3D Gaussian Splatting, unless a group of parameters says
+otherwise. Kingma and Ba propose 1e-8, which networks are mostly trained with."""
 
 
 @dataclass(eq=False)

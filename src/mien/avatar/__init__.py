@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
     from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
     from mien.avatar.ops.activation import sigmoid
+    from mien.avatar.point_avatar.avatar import PointAvatar
+    from mien.avatar.point_avatar.settings import PointAvatarConfig
     from mien.avatar.schedules import TRAINED, Progress, Rate
     from mien.avatar.settings import (
         DensityRules,
@@ -78,6 +80,8 @@ __all__ = [
     "ParameterGroup",
     "PerceptualLoss",
     "Photometric",
+    "PointAvatar",
+    "PointAvatarConfig",
     "Posed",
     "SurfacePrior",
     "Progress",

@@ -12,7 +12,7 @@ from typing import final
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mien.adam import FactoredGradient, FactoredMoments, Moments
+from mien.adam import EPSILON, FactoredGradient, FactoredMoments, Moments
 from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.constants import AVATAR
 from mien.avatar.density import DensityControl
@@ -54,6 +54,8 @@ class ParameterGroup:
     """Gradients, by the names of `tensors`, that `Tensor.grad` does not hold."""
     halvings: tuple[float, ...] = ()
     """Times at which the rate is halved, as fractions of the run."""
+    epsilon: float = EPSILON
+    """Adam's epsilon. It does not reach gradients that are `factored`."""
 
     def rate_at(self, progress: Progress) -> float:
         """The learning rate at a step."""
@@ -100,6 +102,8 @@ class Extras:
     """Returns the number of training frames that the next optimiser step uses."""
     pretraining: Pretraining | None = None
     """Training before the first picture. None if the avatar needs none."""
+    closing: int = 0
+    """Pixels by which finished pictures are eroded and then dilated (`mien.render.close_holes`)."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
 

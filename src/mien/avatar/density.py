@@ -13,6 +13,8 @@ from torch import Tensor
 
 from mien.avatar.settings import GradientSettings, RefillSettings
 from mien.avatar.store import GaussianStore
+from mien.gaussians import Gaussians
+from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_quaternion
 
 
@@ -67,6 +69,11 @@ class GradientDensity:
         )
 
 
+def drawn_opacities(gaussians: Gaussians, rendering: Rendering) -> Float[Tensor, " n"]:
+    """The hook of methods whose Gaussians are visible by their opacity."""
+    return gaussians.opacities.detach().reshape(-1)
+
+
 @dataclass(frozen=True)
 class RefillDensity:
     """Each round deletes Gaussians that were never visible, then adds children of random survivors up to a target."""
@@ -79,6 +86,9 @@ class RefillDensity:
     """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by."""
     may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = allow_all_prunes
     """(store, prunes requested) -> prunes allowed."""
+    observed: Callable[[Gaussians, Rendering], Float[Tensor, " n"]] = drawn_opacities
+    """(Gaussians of a step, their picture after the backward pass) -> how visible each Gaussian is, 0..1. The highest
+    value since the last round stands for the opacity."""
 
     def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "RefillDensity":
         """The same control, which resets no opacity and has no limit."""

@@ -79,6 +79,9 @@ METHODS = {
         "mien.avatar.mono_gaussian_avatar.avatar:MonoGaussianAvatar",
         "mien.avatar.mono_gaussian_avatar.settings:MonoGaussianAvatarConfig",
     ),
+    "point_avatar": Method(
+        "mien.avatar.point_avatar.avatar:PointAvatar", "mien.avatar.point_avatar.settings:PointAvatarConfig"
+    ),
 }
 """Mien's own methods by name. A method whose settings import torch comes last: looking for the method of a config goes
 through the settings in this order."""

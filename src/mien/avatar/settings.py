@@ -11,6 +11,8 @@ from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, 
 
 GAUSSIAN_COUNT = Range(1, 10_000_000)
 """Range of a number of Gaussians. Tens of millions would not fit into memory."""
+EPSILON_RANGE = Range(1e-30, 1)
+"""Range of Adam's epsilon."""
 
 
 class Differences(TypedDict, total=False):

@@ -13,7 +13,7 @@ from mien.capture import CaptureSettings
 from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.overall import Overall
-from mien.tracking import TrackingSettings
+from mien.tracking import ScoringSettings, TrackingSettings
 from mien.training import NAMED_SPLIT, TrainSettings
 from mien.workspace import Workspace, check_new_workspace
 
@@ -49,6 +49,7 @@ class Command:
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    scoring: ScoringSettings = field(default_factory=ScoringSettings)
 
     def check(self) -> None:
         """Check options, names and paths without heavy libraries."""
@@ -78,6 +79,7 @@ class Command:
         from mien.commands.stages.capturing import check_camera_ids
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
+        from mien.commands.stages.tracking import check_masks
         from mien.progress import say, whole_command
         from mien.training import check_run, check_untouched
 
@@ -90,6 +92,7 @@ class Command:
         check_untouched(workspace.run_dir(run))
         self.options.say_what_is_ignored()
         face_model_of(self.face_model)
+        check_masks(workspace, workspace.sequence_names(), self.scoring)
         if self.calibration is None:
             names = sequence_names(self.videos, self.name)
             for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
@@ -136,6 +139,7 @@ class Command:
             overlay=self.overlay,
             preview=self.preview,
             hold_out=settings.held_out_sequences if self.track_apart else (),
+            scoring=self.scoring,
         )
         together = [name for name in captured if name in trackings]
         run_training_stage(workspace, together, run, method, settings, self.view)

@@ -139,7 +139,7 @@ class Command:
 
         def picture(index: int) -> "numpy.ndarray":
             posed = still or avatar.pose(face[index]).gaussians.detach().timestep(0)
-            return draw(self.picture, posed, cameras[index])
+            return draw(self.picture, posed, cameras[index], avatar.extras.closing)
 
         pictures = (picture(index) for index in range(len(cameras)))
         shown = pictures if output.kind == "still" else track_progress(pictures, "Rendering", len(cameras))
@@ -183,7 +183,8 @@ class Command:
         move_avatar(avatar, like)
 
         def picture(face: "mien.face.FaceParams", camera: "mien.camera.Camera") -> "numpy.ndarray":
-            return draw(self.picture, avatar.pose(face.to(like)).gaussians.detach().timestep(0), camera)
+            posed = avatar.pose(face.to(like)).gaussians.detach().timestep(0)
+            return draw(self.picture, posed, camera, avatar.extras.closing)
 
         write_pictures(output, [draw_sheet(tiles, picture)], self.fps)
         say(f"{self.out}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")

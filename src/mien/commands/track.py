@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mien.tracking import TrackingSettings
+from mien.tracking import ScoringSettings, TrackingSettings
 from mien.workspace import open_workspace
 
 
@@ -33,6 +33,7 @@ class Command:
     overlay: Literal["auto", "all", "none"] = "auto"
     """Frames in overlay.mp4: all, every n-th if a clip has over 3,000 (auto), or none."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
+    scoring: ScoringSettings = field(default_factory=ScoringSettings)
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -53,4 +54,5 @@ class Command:
             self.overlay,
             self.preview,
             self.hold_out,
+            self.scoring,
         )

@@ -13,7 +13,7 @@ from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.face import FaceParams, part_boxes
 from mien.pictures import Box
-from mien.render import rasterize
+from mien.render import close_holes, rasterize
 from mien.render.validation import drawable
 from mien.tracking import Scoring
 from mien.training.footage import Frame, Sequence, composite, foreground_colors
@@ -115,4 +115,5 @@ def avatar_image(experiment: Experiment, frame: Frame, face: FaceParams | None =
     gaussians = experiment.avatar.pose(experiment.face(frame) if face is None else face).gaussians.timestep(0)
     white = torch.ones(3).to(gaussians.means)
     with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
-        return rasterize(gaussians, experiment.camera(frame), white).image.clamp(0, 1).cpu()
+        image = rasterize(gaussians, experiment.camera(frame), white).image.clamp(0, 1)
+    return close_holes(image, experiment.avatar.extras.closing).cpu()

@@ -34,7 +34,10 @@ AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted",
 _MAX_TRAINING_FRAMES = 200
 _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
 """Figures that every frame has."""
-_MASK = "frozen scoring mask: matte cut at the neck, over white"
+_MASKS = {
+    "plane": "frozen scoring mask: matte cut at the neck, over white",
+    "line": "frozen scoring mask: matte above the neck line of each picture, over white",
+}
 _CROP = "frozen head box of each frame"
 _PART_CROPS = f"boxes of the tracked mesh; enlarged to {PART_SIDE} pixels for ST-LPIPS if a side is shorter"
 
@@ -176,7 +179,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
         "perceptual_frames": sum("perceptual" in row for row in own_rows),
         "split": experiment.split,
-        "mask": _MASK,
+        "mask": "; ".join(sorted({_MASKS[experiment.scorings[frame.sequence].cut] for frame in evaluation.frames})),
         "edges": experiment.edges,
         "crop": _CROP,
         "part_crops": _PART_CROPS,

@@ -1,6 +1,7 @@
 """Pictures of Gaussians and of meshes, with gradients, and camera paths."""
 
 from mien.render.camera_paths import orbit, sway, turntable
+from mien.render.closing import close_holes
 from mien.render.mesh import (
     Headlight,
     MeshFragments,
@@ -21,6 +22,7 @@ __all__ = [
     "Headlight",
     "MeshFragments",
     "Texture",
+    "close_holes",
     "interpolate",
     "orbit",
     "rasterize",

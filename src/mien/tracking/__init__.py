@@ -18,8 +18,20 @@ if TYPE_CHECKING:
         write_residual_report,
     )
     from mien.tracking.scoring import Scoring, head_crop, head_cutter, make_scoring
-    from mien.tracking.scoring_files import read_scoring, read_scoring_hash, scoring_exists, write_scoring
-    from mien.tracking.settings import PaperSettings, PhotometricSettings, SmoothnessSettings, TrackingSettings
+    from mien.tracking.scoring_files import (
+        check_scoring_cut,
+        read_scoring,
+        read_scoring_hash,
+        scoring_exists,
+        write_scoring,
+    )
+    from mien.tracking.settings import (
+        PaperSettings,
+        PhotometricSettings,
+        ScoringSettings,
+        SmoothnessSettings,
+        TrackingSettings,
+    )
     from mien.tracking.tracking import Appearance, Tracking
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
@@ -31,9 +43,11 @@ __all__ = [
     "PaperSettings",
     "PhotometricSettings",
     "Scoring",
+    "ScoringSettings",
     "SmoothnessSettings",
     "Tracking",
     "TrackingSettings",
+    "check_scoring_cut",
     "check_tracking_of",
     "fit_neck_cut",
     "fit_neck_lines",

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.constants import TRACKING
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
+from mien.tracking.settings import ScoringSettings
 from mien.tracking.tracking import Tracking
 
 
@@ -27,24 +29,49 @@ class Scoring:
     """Opacity of the head (255 is head): the matte, cut at the neck. It is a memory map if there are many."""
     crops: Int[np.ndarray, "t c 4"]
     """Left, top, width and height of the head crop in pixels: the box of the mask."""
+    cut: Literal["plane", "line"] = "plane"
+    """Lower end of the head (`ScoringSettings.cut`)."""
 
 
-def make_scoring(capture: Capture, tracking: Tracking, face_model: FaceModel, scratch: Path | None = None) -> Scoring:
+DEFAULTS = ScoringSettings()
+
+
+def make_scoring(
+    capture: Capture,
+    tracking: Tracking,
+    face_model: FaceModel,
+    scratch: Path | None = None,
+    settings: ScoringSettings = DEFAULTS,
+) -> Scoring:
     """Make masks and head crops of every frame. Masks too large for the memory are in an unnamed file in `scratch`.
 
-    A pixel keeps its matte if it is above the neck cut and not far beside the neck, or inside the projected head,
-    because a lowered chin is below the cut. Parts that are then not connected to the head are removed.
+    With the cut `plane`, a pixel keeps its matte if it is above the neck cut and not far beside the neck, or inside the
+    projected head, because a lowered chin is below the cut. Parts that are then not connected to the head are removed.
+    With the cut `line`, a pixel keeps its matte if it is above the neck line, and nothing else counts.
     """
     masks = PictureStack(capture.mattes.shape, scratch)
     crops = np.zeros((*capture.mattes.shape[:2], 4), np.int64)
     neck = NeckParts.of(face_model)
     for timestep in track_progress(range(capture.timesteps), "Scoring masks", capture.timesteps):
-        cut = head_cutter(face_model, neck, tracking.face[timestep])
+        cut = head_cutter(face_model, neck, tracking.face[timestep]) if settings.cut == "plane" else None
         for index, camera in enumerate(tracking.cameras):
-            mask = cut(np.asarray(capture.mattes[timestep, index]), camera)
+            matte = np.asarray(capture.mattes[timestep, index])
+            line = tracking.neck_lines[timestep, index]
+            mask = cut_at_line(matte, line.double().numpy()) if cut is None else cut(matte, camera)
             masks.write(timestep, index, mask)
             crops[timestep, index] = head_crop(mask)
-    return Scoring(masks.array(), crops)
+    return Scoring(masks.array(), crops, settings.cut)
+
+
+def cut_at_line(matte: UInt8[np.ndarray, "h w"], line: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "h w"]:
+    """The matte above a neck line (a, b, d) of `Tracking.neck_lines`, with a soft border one pixel wide.
+
+    This is the mask of GaussianAvatars (arXiv:2312.02069), supplement B.
+    """
+    height, width = matte.shape
+    x, y = np.arange(width)[None] + 0.5, np.arange(height)[:, None] + 0.5
+    keep = np.clip(line[0] * x + line[1] * y + line[2] + 0.5, 0, 1)
+    return np.round(matte * keep).astype(np.uint8)
 
 
 def head_cutter(

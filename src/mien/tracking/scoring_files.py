@@ -2,7 +2,9 @@
 
 import hashlib
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from mien.locks import read_beside_writers
 from mien.picture_files import PictureStack, decode_png, encode_picture
 from mien.storage import expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
 from mien.tracking.scoring import Scoring
+from mien.tracking.settings import ScoringSettings
 
 _FORMAT, _VERSION = "mien.scoring", 1
 _STAGE = "`mien track`"
@@ -49,6 +52,23 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str) -> None:
     except BaseException:
         remove_tree(temporary)
         raise
+
+
+def check_scoring_cut(path: Path, settings: ScoringSettings, capture_hash: str) -> None:
+    """Check that the masks in the folder `path`, if there are any of this capture, have the cut of the settings.
+
+    Raises:
+        UserError: They have another cut. Masks are written once, because scores of other masks do not compare.
+    """
+    if not scoring_exists(path, capture_hash):
+        return
+    cut = _cut_of(path, read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE))
+    if cut != settings.cut:
+        raise UserError(
+            f"--scoring.cut {settings.cut}: the masks in {path} were made with the cut {cut}, and masks are written "
+            f"once, so that runs compare; give --scoring.cut {cut}, or delete that folder (scores from before and "
+            "after cannot be compared)"
+        )
 
 
 def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
@@ -100,7 +120,7 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     digest.update(crops.astype(np.int32).tobytes())
     if digest.hexdigest() != content.get("sha256"):
         raise UserError(f"{path}: masks or crops have changed since they were written; {_REMEDY}")
-    return Scoring(masks.array(), crops.astype(np.int64))
+    return Scoring(masks.array(), crops.astype(np.int64), _cut_of(path, content))
 
 
 def read_scoring_hash(path: Path) -> str:
@@ -125,6 +145,7 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str) -> None:
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
     about = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width, "capture_hash": capture_hash}
+    about |= {"cut": scoring.cut}
     digest.update(crops.tobytes())
     write_json(
         folder / "scoring.json",
@@ -132,6 +153,14 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str) -> None:
         _VERSION,
         {**about, "sha256": digest.hexdigest()},
     )
+
+
+def _cut_of(path: Path, content: Mapping[str, Any]) -> Literal["plane", "line"]:
+    """The cut that scoring.json names. Masks that were written before there was a choice have the plane."""
+    cut = content.get("cut", "plane")
+    if cut not in ("plane", "line"):
+        raise UserError(f"{path / 'scoring.json'}: cut {cut!r:.60} is neither plane nor line; {_REMEDY}")
+    return cut
 
 
 def _mask_file(folder: Path, timestep: int, camera: int) -> Path:

@@ -1,4 +1,4 @@
-"""Settings of tracking: the fit to landmarks, the fit to pixels, and the paper's descent."""
+"""Settings of tracking: the fit to landmarks, the fit to pixels, the paper's descent, and the scoring mask."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -103,16 +103,17 @@ class PaperSettings:
     """Tracking by gradient descent as in the supplement of GaussianAvatars (section A), from a better start."""
 
     start: Literal["fast", "landmarks"] = "fast"
-    """Start of the fit. fast: the global epochs start from the result of the schedule `fast`, which is better and
-    quicker. landmarks: as in the supplement, the first frame is fitted to convergence, then each next frame from the
-    one before it, then the epochs run."""
+    """Start of the fit. fast: each frame starts from its result of the schedule `fast`, which is better. landmarks: as
+    in the supplement, the first frame is fitted to convergence, and each next frame starts from the one before it.
+    Either way, the global epochs come last."""
     first_steps: Annotated[int, COUNT_OR_NONE] = 500
-    """Optimiser steps at the first frame, half of them for texture and light alone. Only with start `landmarks`."""
+    """Optimiser steps of a turn at the first frame, half of those of the first turn for texture and light alone. Turns
+    follow until the cost no longer falls by a hundredth. Only with start `landmarks`."""
     steps: Annotated[int, COUNT_OR_NONE] = 50
-    """Optimiser steps for each next frame, which starts from the frame before it. Only with start `landmarks`."""
+    """Optimiser steps for each frame in the pass before the epochs."""
     epochs: Annotated[int, COUNT_OR_NONE] = 30
     """Passes over all frames in random order that refine everything."""
-    texture_size: Annotated[int, _TEXELS] = 512
+    texture_size: Annotated[int, _TEXELS] = 1024
     """Texels along each side of the texture."""
     texture_steps: Annotated[int, COUNT_OR_NONE] = 8
     """Optimiser steps for texels that a frame shows better than earlier frames. Only with start `landmarks`."""
@@ -197,6 +198,18 @@ class TrackingSettings:
 
     def in_effect(self) -> "TrackingSettings":
         """The settings that a tracking depends on: those that its schedule does not use are at their defaults."""
-        paper = self.paper if self.schedule == "paper" else PaperSettings()
+        # With 512, an earlier default, so that trackings of other schedules stay current.
+        paper = self.paper if self.schedule == "paper" else PaperSettings(texture_size=512)
         by_pixels = self.schedule == "fast" or (self.schedule == "paper" and paper.start == "fast")
         return replace(self, paper=paper, photometric=self.photometric if by_pixels else PhotometricSettings())
+
+
+@dataclass(frozen=True)
+class ScoringSettings:
+    """Settings of the scoring mask: what is trained on and scored."""
+
+    cut: Literal["plane", "line"] = "plane"
+    """Lower end of the head in the masks. plane: a plane across the lower neck, which all cameras see alike; the
+    projected head stays whole. line: as in the supplement of GaussianAvatars, a straight line in each picture along the
+    base of the neck, below which everything goes; for figures beside those of that protocol. Masks are written once,
+    so a sequence keeps its cut."""

@@ -9,11 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
-from mien.adam import BETA1, BETA2, FactoredMoments
+from mien.adam import BETA1, BETA2, EPSILON, FactoredMoments
 from mien.arrays import unpacked
 from mien.avatar import Moments, ParameterGroup, Progress
-
-_EPSILON = 1e-15
 
 
 class Update(NamedTuple):
@@ -23,6 +21,8 @@ class Update(NamedTuple):
     gradient: Tensor
     moments: Moments
     rate: float
+    epsilon: float = EPSILON
+    """Added to the root of the second moment."""
 
 
 class FactoredUpdate(NamedTuple):
@@ -65,7 +65,8 @@ class Adam:
                     continue
                 tensor.grad = None
                 if rate > 0:
-                    updates.append(Update(tensor, gradient, self._state(group, name, tensor, Moments), rate))
+                    state = self._state(group, name, tensor, Moments)
+                    updates.append(Update(tensor, gradient, state, rate, group.epsilon))
         update_all(updates)
 
     def state(self) -> dict[str, Moments | FactoredMoments]:
@@ -89,7 +90,7 @@ class Adam:
 
 
 def update_all(updates: Sequence[Update]) -> None:
-    """Apply all updates in place: natively if tensors are float32, contiguous and on a CPU."""
+    """Apply all updates in place: natively if tensors are float32, contiguous and on a CPU, with mien's `EPSILON`."""
     tasks = []
     for update in updates:
         task = _native_task(update)
@@ -104,18 +105,20 @@ def update_all(updates: Sequence[Update]) -> None:
 @torch.no_grad()
 def update_reference(update: Update) -> None:
     """One update in plain PyTorch."""
-    values, gradient, moments, rate = update
+    values, gradient, moments, rate, epsilon = update
     moments.step += 1
     step = float(moments.step)
     moments.first.lerp_(gradient, 1 - BETA1)
     moments.second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-    denominator = moments.second.sqrt().mul_(1 / math.sqrt(1 - BETA2**step)).add_(_EPSILON)
+    denominator = moments.second.sqrt().mul_(1 / math.sqrt(1 - BETA2**step)).add_(epsilon)
     values.addcdiv_(moments.first, denominator, value=-rate / (1 - BETA1**step))
 
 
 def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None:
     """The update in the form that the core takes, or None if it cannot take these tensors."""
-    values, gradient, moments, rate = update
+    values, gradient, moments, rate, epsilon = update
+    if epsilon != EPSILON:  # that of the core
+        return None
     arrays = (values, gradient, moments.first, moments.second, moments.step)
     for tensor in arrays:
         if not (tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous()):
@@ -154,5 +157,5 @@ def factored_update_reference(update: FactoredUpdate) -> None:
     moments.second.copy_(torch.where(touched[:, None], second, moments.second))
     moments.weights.copy_(torch.where(touched, moments.weights * BETA2 + (1 - BETA2), moments.weights))
     weights = torch.where(touched, moments.weights, torch.ones_like(moments.weights))
-    deviations = (moments.second / weights[:, None]).sqrt() + _EPSILON
+    deviations = (moments.second / weights[:, None]).sqrt() + EPSILON
     values.sub_(rate * gradient / deviations[:, None])

@@ -8,6 +8,7 @@ length unit of the encoding; and the opacity to prune by. `headgas_variants` has
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -43,7 +44,13 @@ from mien.avatar.headgas.variants import (
 )
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.expression_changes import expression_inputs, principal_directions
-from mien.avatar.ops.feature_network import Layers, blended_features, feature_network
+from mien.avatar.ops.feature_network import (
+    Layers,
+    blended_features,
+    feature_network,
+    feature_network_reference,
+    network_outputs,
+)
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.avatar.surface_places import sample_surface
@@ -145,8 +152,10 @@ class HeadGas(Avatar):
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
         ]
         if parts.blends:
-            groups.append(factored_group(self.store, "bases", config.features_rate, self._bases_gradient))
-        return [*groups, network_group("network", self.network, config.network_rate)] if parts.layers else groups
+            factored = factored_group(self.store, "bases", config.features_rate, self._bases_gradient)
+            groups.append(factored if config.factored_bases else store_group(self.store, "bases", config.features_rate))
+        network = network_group("network", self.network, config.network_rate)
+        return [*groups, replace(network, epsilon=config.network_epsilon)] if parts.layers else groups
 
     def gaussian_store(self) -> GaussianStore:
         """Every per-Gaussian tensor."""
@@ -229,7 +238,7 @@ class HeadGas(Avatar):
             for e in inputs:
                 weights, rest = averaging_weights(e)
                 neutral = rest * store["neutral_features"]
-                values = shares * blended_features(store["bases"], weights, neutral, self._bases_gradient)
+                values = shares * self._blended(weights, neutral)
                 yield Changes(values[:, :-1], values[:, -1] + start_logit().to(values))
             return
         encoding = self._encoding()
@@ -241,11 +250,26 @@ class HeadGas(Avatar):
             return
         layers = self._layers(progress)
         for e in inputs:
-            found = split_outputs(
-                parts,
-                *feature_network(store["bases"], e, store["neutral_features"], encoding, layers, self._bases_gradient),
-            )
+            found = split_outputs(parts, *self._outputs(e, encoding, layers))
             yield found if isinstance(found, Changes) else self._unpainted(found, progress)
+
+    def _blended(self, weights: Float[Tensor, " k"], neutral: Float[Tensor, "n f"]) -> Float[Tensor, "n f"]:
+        bases = self.store["bases"]
+        if self.config.factored_bases:
+            return blended_features(bases, weights, neutral, self._bases_gradient)
+        return neutral + torch.einsum("nkf,k->nf", bases, weights)
+
+    def _outputs(
+        self, inputs: Float[Tensor, " k"], encoding: Float[Tensor, "n c"], layers: Layers
+    ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
+        """The network's outputs at one timestep, with the gradients that the settings ask for."""
+        bases, neutral = self.store["bases"], self.store["neutral_features"]
+        is_native = self.config.factored_bases and not self.config.encoding_gradient
+        if is_native or not torch.is_grad_enabled():
+            return feature_network(bases, inputs, neutral, encoding.detach(), layers, self._bases_gradient)
+        if self.config.factored_bases:
+            return network_outputs(self._blended(inputs, neutral), encoding, layers)
+        return feature_network_reference(bases, inputs, neutral, encoding, layers)
 
     def _unpainted(self, moved: Float[Tensor, "n 7"], progress: Progress) -> Changes:
         shares = self._color_shares(progress).to(moved)
@@ -274,9 +298,9 @@ class HeadGas(Avatar):
         return shares
 
     def _encoding(self) -> Float[Tensor, "n c"]:
-        # Detached, so that centres move only by their effect on the picture, not through the encoding of their
-        # position.
-        points = self.store["means"].detach() / self.config.encoding_length
+        # Detached by default, so that centres move only by their effect on the picture.
+        means = self.store["means"]
+        points = (means if self.config.encoding_gradient else means.detach()) / self.config.encoding_length
         return positional_encoding(points, self.config.encoding_bands)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import Differences, FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import EPSILON_RANGE, Differences, FaceTuning, GradientSettings, MethodConfig
 from mien.ranges import FRACTION, NOT_NEGATIVE, Range, ToLoad
 
 Variant = Literal["full", "no_mlp", "delta", "change_all", "no_blending"]
@@ -38,6 +38,12 @@ class HeadGasConfig(MethodConfig):
     """Number of octaves of the positional encoding."""
     encoding_length: Annotated[float, Range(1e-4, 1e4)] = 0.05
     """Length of one unit in the positional encoding, in metres."""
+    encoding_gradient: bool = False
+    """Whether centres also move by what the encoding of their position changes in the network, as the paper's formulas
+    say. Otherwise they move only by their effect on the picture, which takes less time."""
+    factored_bases: bool = True
+    """Whether the bases of features are trained without a first moment and with one second moment for all directions,
+    which takes much less memory and time. Otherwise by Adam, as all else."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics for view-dependent colour. Keep 0 with a single camera, because
     view-dependent colours then absorb the head's pose."""
@@ -59,6 +65,9 @@ class HeadGasConfig(MethodConfig):
     """Learning rate of the feature bases and of the neutral features, per step."""
     network_rate: Rate = Rate(2e-3, 2e-4)
     """Learning rate of the network, per step."""
+    network_epsilon: Annotated[float, EPSILON_RANGE] = 1e-15
+    """Adam's epsilon for the network. Networks are mostly trained with 1e-8; with another one than 1e-15, steps take a
+    little longer, because only that one is in the native code."""
     judged_expressions: Annotated[int, Range(0, 10_000)] = 64
     """Number of training expressions, as different as possible, at which each round of density control computes the
     opacities to prune by. With 0, only the opacities in the steps since the last round count."""
@@ -89,6 +98,9 @@ PRESETS: dict[str, Differences] = {
             },
             "face_tuning": {"enabled": False, "within_bounds": False},
             "directions": 0,
+            "encoding_gradient": True,
+            "factored_bases": False,
+            "network_epsilon": 1e-8,
             "sh_degree": 3,
             "sh_warmup": 4 * _DEGREE_STEPS / _STEPS,
             "means_rate": {"start": 1.6e-4, "end": 1.6e-6},

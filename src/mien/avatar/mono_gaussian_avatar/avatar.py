@@ -18,7 +18,6 @@ those that the network gives to its position (`own_rate`).
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -28,7 +27,7 @@ from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, Pretrainin
 from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.density import RefillDensity
-from mien.avatar.mono_gaussian_avatar.constants import MONO
+from mien.avatar.mono_gaussian_avatar.motion import AtRest, FaceWeights, PointMotion, canonical_face
 from mien.avatar.mono_gaussian_avatar.networks import (
     ATTRIBUTE_WIDTHS,
     ATTRIBUTES,
@@ -39,19 +38,14 @@ from mien.avatar.mono_gaussian_avatar.networks import (
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, MonoGaussianAvatarConfig
 from mien.avatar.ops.activation import sigmoid
-from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.settings import RefillSettings
 from mien.avatar.store import GaussianStore
-from mien.avatar.surface_places import at_places, random_places, sample_surface
+from mien.avatar.surface_places import sample_surface
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
-from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
-
-_POINTS_AT_ONCE = 4096
-"""Number of points whose distances to all vertices are in memory at once: 74 MB for a face model of 4,535 vertices."""
 
 
 class MonoGaussianAvatar(Avatar):
@@ -68,13 +62,14 @@ class MonoGaussianAvatar(Avatar):
         e, k = face.expression.shape[1], len(face_model.joint_names)
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
         self.attributes = AttributeNet(*sizes, config.sphere_start).to(like)
-        self.deformation = DeformationNet(config.deformation_width, e, 9 * face.joints.shape[1], k + 1).to(like)
+        outputs = (e, 9 * face.joints.shape[1], k + 1)
+        self.deformation = DeformationNet(config.deformation_width, *outputs, config.skinning_norm).to(like)
         self.change = AttributeChangeNet(config.change_width).to(like)
         expression, joints = canonical_face(face_model, face.expression.detach().mean(0))
         self.register_buffer("canonical_expression", expression)
         self.register_buffer("canonical_joints", joints)
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
-        self._baked, self._rest = Kept[BlendSkinned](), Kept[_AtRest]()
+        self._baked, self._rest = Kept[BlendSkinned](), Kept[AtRest]()
         if config.start == "sphere":
             # Uniform in a cube, then projected onto the sphere, as in the published code.
             cube = 2 * torch.rand(config.points, 3).to(like) - 1
@@ -94,7 +89,7 @@ class MonoGaussianAvatar(Avatar):
         if not self.training and progress is TRAINED and can_pose_baked(self.store["means"], face):
             baked = self._baked.of((*self.parameters(), *self.buffers()), self.bake)
             return Posed(pose_baked(baked, face), {})
-        means, displacement = self._deformed(face)
+        means, displacement = self._motion.deformed(self.store["means"], face)
         # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
         raw = split_attributes(self._attributes_at_rest() + change)
@@ -111,8 +106,7 @@ class MonoGaussianAvatar(Avatar):
 
     def canonical_face(self) -> FaceParams:
         """The canonical expression and joints, at the subject's usual head pose."""
-        expression, joints = self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints")
-        return replace(self.subject, expression=expression[None], joints=joints[None])
+        return self._motion.canonical_face()
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Distance of skinning weights and blend directions from those of the nearest canonical vertex.
@@ -126,51 +120,22 @@ class MonoGaussianAvatar(Avatar):
         turn = progress.step // progress.frames
         chosen = torch.arange(turn * self.config.face_points, (turn + 1) * self.config.face_points)
         means = self.store["means"].detach()
-        losses = self._face_losses(means[chosen[:n].to(means.device) % n])
+        losses = self._motion.face_losses(means[chosen[:n].to(means.device) % n], self._face_weights())
         weight = self._schedule().face_decay(progress.fraction)
         return {name: weight * loss for name, loss in losses.items()}
 
-    def _face_losses(self, means: Float[Tensor, "p 3"]) -> dict[str, Float[Tensor, ""]]:
-        """The same losses for some points, as they are before their weights halve."""
-        model = self.face_model
-        found = self.deformation.whole(means / LENGTH_UNIT)
-        canonical = means + LENGTH_UNIT * found.offset.detach()
-        nearest = nearest_vertices(canonical, self._at_rest().vertices)
-        # The bone that stands still belongs to no vertex.
-        weights = torch.nn.functional.pad(model.skinning_weights[nearest], (0, 1))
-        losses = {"skinning": self.config.face_skinning_weight * _mean_square(found.weights - weights)}
-        difference = found.expression - model.expression_basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
-        variance = self.get_buffer("expression_variance")
-        unit = variance.mean().clamp_min(1e-8)
-        if self.config.face_expression_by_variance:
-            # Coefficients that never moved would otherwise have an infinite weight.
-            unit = unit / ((variance / unit).clamp_min(0.01) * len(variance))
-        losses["expression_directions"] = self.config.face_expression_weight * _mean_square(difference * unit.sqrt())
-        if found.pose.shape[-1] > 0:
-            basis = model.pose_basis
-            correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
-            losses["pose_correctives"] = self.config.face_correctives_weight * _mean_square(found.pose - correctives)
-        return losses
+    def _face_weights(self) -> FaceWeights:
+        config = self.config
+        by_variance = config.face_expression_by_variance
+        weights = (config.face_skinning_weight, config.face_expression_weight, config.face_correctives_weight)
+        return FaceWeights(*weights, self.get_buffer("expression_variance"), by_variance)
 
     def _pretrain(self, face: FaceParams) -> Iterator[None]:
         """Teach the deformation network the face model's motion in training frames.
 
         The published network starts without any motion, and needs some hundred thousand steps to find it.
         """
-        optimizer = torch.optim.Adam(self.deformation.parameters(), lr=MONO.pretraining_rate)
-        canonical, faces = self._at_rest().vertices, self.face_model.faces
-        for step in range(self.config.pretraining):
-            optimizer.param_groups[0]["lr"] = MONO.pretraining_rate * 0.1 ** (step / self.config.pretraining)
-            frames = face[torch.randint(len(face), (MONO.pretraining_frames,))].detach()
-            corners, weights = random_places(canonical, faces, MONO.pretraining_points)
-            means = at_places(canonical, corners, weights)
-            target = at_places(self.face_model.head_vertices(frames), corners, weights)
-            found, _ = self._deformed_from(means, frames)
-            distance = (found - target).norm(dim=-1).mean() / LENGTH_UNIT
-            optimizer.zero_grad()
-            torch.autograd.backward([MONO.pretraining_weight * distance, *self._face_losses(means).values()])
-            optimizer.step()
-            yield
+        yield from self._motion.learn(face, self.config.pretraining, self._face_weights())
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group for the points, and one per network."""
@@ -180,7 +145,7 @@ class MonoGaussianAvatar(Avatar):
         if "own_attributes" in self.store.names():
             groups.append(store_group(self.store, "own_attributes", self.config.own_rate))
         groups += [network_group(name, network, rate) for name, network in networks.items()]
-        return [replace(group, halvings=halvings) for group in groups]
+        return [replace(group, halvings=halvings, epsilon=self.config.adam_epsilon) for group in groups]
 
     def gaussian_store(self) -> GaussianStore:
         """The store of points. Everything else comes from networks."""
@@ -206,30 +171,16 @@ class MonoGaussianAvatar(Avatar):
     @torch.no_grad()
     def bake(self) -> BlendSkinned:
         """Points with blend directions and skinning weights, raw attributes, and the network that changes them."""
-        means = self.store["means"]
-        found = self.deformation.whole(means / LENGTH_UNIT)
-        expression, pose = LENGTH_UNIT * found.expression, LENGTH_UNIT * found.pose
-        face = self.canonical_face()
-        canonical = means + LENGTH_UNIT * found.offset
-        skinning = blend_transforms(found.weights, self._transforms(face))[0]
-        coefficients = self._coefficients(face, absolute=True)
-        rest = unskin(canonical, skinning) - torch.cat([expression, pose], dim=-1) @ coefficients[0]
+        motion = self._motion.baked(self.store["means"], bake_rig(self.face_model, self.subject))
         raw = split_attributes(self._attributes_at_rest())
         layers = self.change.layers()
-        rig = replace(
-            bake_rig(self.face_model, self.subject),
-            template=as_array(rest),
-            expression_basis=as_array(expression.permute(2, 0, 1)),
-            skinning_weights=as_array(found.weights[:, :-1]),
-            pose_basis=as_array(pose.permute(2, 0, 1)),
-        )
         # The network takes the motion from the canonical position, but the runtime gives the motion from the rest
         # position. They differ by a constant for each point. Both enter linearly, so the constant uses the same columns
         # of weights again.
         first = layers[0].weight / LENGTH_UNIT
         network = AttributeNetwork(
             input="displacement",
-            base=as_array(rest - canonical),
+            base=as_array(motion.to_rest),
             weights=tuple(
                 as_array(part) for part in (torch.cat([first, first], dim=1), *(layer.weight for layer in layers[1:]))
             ),
@@ -244,15 +195,15 @@ class MonoGaussianAvatar(Avatar):
             sh=as_array(raw["sh"][:, None]),
         )
         return BlendSkinned(
-            rig=rig,
+            rig=motion.rig,
             attributes=attributes,
             scale_activation="sigmoid",
             scale_gain=self.config.scale_gain,
             scale_offset=self._schedule().rendering_radius(1.0),
             color_activation="sigmoid",
             network=network,
-            still_weights=as_array(found.weights[:, -1]),
-            still_pose=as_array(face.T_world_head[0]),
+            still_weights=motion.still_weights,
+            still_pose=motion.still_pose,
         )
 
     def _attributes_at_rest(self) -> Float[Tensor, "n 11"]:
@@ -262,100 +213,18 @@ class MonoGaussianAvatar(Avatar):
 
     def _schedule(self) -> Schedule:
         config = self.config
-        return Schedule(config.schedule, config.epochs, config.points, config.first_epoch)
+        return Schedule(config.schedule, config.epochs, config.points, config.first_epoch, config.late_epoch)
 
-    def _transforms(self, face: FaceParams) -> Float[Tensor, "b k 3 4"]:
-        """The joints' transforms in the head frame, then that of the bone which stands still in the world."""
-        still = _inverse(face.T_world_head) @ self.canonical_face().T_world_head
-        return torch.cat([self.face_model.joint_transforms(face), still[:, None]], dim=1)[:, :, :3]
-
-    def _at_rest(self) -> "_AtRest":
-        """What depends on the canonical face alone."""
-
-        @torch.no_grad()
-        def make() -> _AtRest:
-            face = self.canonical_face()
-            vertices, transforms = self.face_model.head_vertices(face)[0], self._transforms(face)[0]
-            return _AtRest(vertices, transforms, self._coefficients(face, absolute=True))
-
+    @property
+    def _motion(self) -> PointMotion:
         own = (self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints"))
-        return self._rest.of((*own, *self.subject.tensors().values()), make)
+        return PointMotion(self.face_model, self.subject, self.deformation, *own, self._rest)
 
-    def _coefficients(self, face: FaceParams, absolute: bool = False) -> Float[Tensor, "b c"]:
-        """Weights of the blend directions: less those of the canonical face, or as they are (`absolute`)."""
-        own = torch.cat([face.expression, _pose_features(face)], dim=1)
-        if absolute:
-            return own
-        return own - self._at_rest().coefficients
-
-    def _deformed(self, face: FaceParams) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
-        """Points in the head frame, and their motion from the canonical positions, both in metres."""
-        return self._deformed_from(self.store["means"], face)
-
-    def _deformed_from(
-        self, means: Float[Tensor, "n 3"], face: FaceParams
-    ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
-        offset, moved, weights = self.deformation(means / LENGTH_UNIT, self._coefficients(face))
-        canonical = means + LENGTH_UNIT * offset
-        at_rest = self._at_rest().transforms
-        posed = skin_points(canonical, LENGTH_UNIT * moved, weights, at_rest, self._transforms(face))
-        return posed, posed - canonical
-
-
-class _AtRest(NamedTuple):
-    """The canonical face."""
-
-    vertices: Float[Tensor, "v 3"]
-    transforms: Float[Tensor, "k 3 4"]
-    coefficients: Float[Tensor, "1 c"]
-
-
-def canonical_face(
-    model: FaceModel, expression: Float[Tensor, " e"]
-) -> tuple[Float[Tensor, " e"], Float[Tensor, "j 3"]]:
-    """An expression and joints at which the jaw is open by `MONO.canonical_jaw`.
-
-    A free jaw turns by this angle. A jaw that follows the expression gets it from the coefficient that opens it most.
-    Other joints are at rest. A model without a joint `jaw` keeps its jaw.
-    """
-    joints = expression.new_zeros(len(model.free_joint_names), 3)
-    if "jaw" in model.free_joint_names:
-        joints[model.free_joint_names.index("jaw"), 0] = MONO.canonical_jaw
-    elif "jaw" in model.joint_names:
-        opening = model.joint_rotation_basis[:, model.joint_names.index("jaw"), 0].to(expression)
-        best = opening.argmax()
-        if opening[best] > 0:
-            expression = expression.clone()
-            expression[best] += (MONO.canonical_jaw - expression @ opening) / opening[best]
-    return expression, joints
-
-
-def _pose_features(face: FaceParams) -> Float[Tensor, "b p"]:
-    """R - I of the free joints, row by row."""
-    return (matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)).flatten(1)
-
-
-def _inverse(pose: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
-    """The inverses of rigid transforms."""
-    turned = pose[:, :3, :3].transpose(1, 2)
-    return rigid_transform(turned, -(turned @ pose[:, :3, 3:])[..., 0])
+    def _at_rest(self) -> AtRest:
+        """What depends on the canonical face alone."""
+        return self._motion.at_rest()
 
 
 def split_attributes(raw: Float[Tensor, "*b 11"]) -> dict[str, Tensor]:
     """The columns of the attribute networks by name."""
     return dict(zip(ATTRIBUTES, raw.split(ATTRIBUTE_WIDTHS, dim=-1), strict=True))
-
-
-@torch.no_grad()
-def nearest_vertices(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "v 3"]) -> Int[Tensor, " n"]:
-    """The index of the vertex nearest to each point.
-
-    Points are looked at in parts: all 100,000 of the paper at once would need 1.8 GB for their distances.
-    """
-    # |p - v|^2 less |p|^2, which is the same for all vertices, and half of that.
-    own, across = vertices.square().sum(-1) / 2, vertices.T
-    return torch.cat([torch.addmm(own, part, across, alpha=-1).argmin(-1) for part in points.split(_POINTS_AT_ONCE)])
-
-
-def _mean_square(values: Tensor) -> Float[Tensor, ""]:
-    return values.square().mean()

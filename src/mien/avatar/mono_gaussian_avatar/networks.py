@@ -95,14 +95,24 @@ class Deformation(NamedTuple):
 
 
 class DeformationNet(nn.Module):
-    """Offset, blend directions and skinning weights of a point, given its position. At first zero, zero, equal."""
+    """Offset, blend directions and skinning weights of a point, given its position. At first zero, zero, equal.
 
-    def __init__(self, width: int, expressions: int, pose_features: int, bones: int):
+    Args:
+        width: Width of all layers.
+        expressions: Number of expression coefficients.
+        pose_features: Number of features of the joints' rotations.
+        bones: Number of skinning weights.
+        skinning_norm: Whether the hidden layer of the skinning weights starts as the trunk's and has weight
+            normalisation, as published. Otherwise it is a plain layer.
+    """
+
+    def __init__(self, width: int, expressions: int, pose_features: int, bones: int, skinning_norm: bool = False):
         super().__init__()
         self.expressions, self.pose_features = expressions, pose_features
         self.trunk = nn.ModuleList(weight_norm(_linear(size, width)) for size in (3, width, width, width))
         self.directions = nn.Linear(width, 3 * (1 + expressions + pose_features))
-        self.hidden, self.skinning = nn.Linear(width, width), nn.Linear(width, bones)
+        self.hidden = weight_norm(_linear(width, width)) if skinning_norm else nn.Linear(width, width)
+        self.skinning = nn.Linear(width, bones)
         for last in (self.directions, self.skinning):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
@@ -142,7 +152,7 @@ class DeformationNet(nn.Module):
     def _layers(self, weight: Float[Tensor, "o w"], bias: Float[Tensor, " o"]) -> list[Layer]:
         """Trunk, hidden layer of the skinning weights, and their logits beside `weight` and `bias` of the trunk."""
         trunk = [Layer(_as_linear(layer).weight, _as_linear(layer).bias, "softplus") for layer in self.trunk]
-        hidden = Layer(self.hidden.weight, self.hidden.bias, "softplus")
+        hidden = Layer(_as_linear(self.hidden).weight, _as_linear(self.hidden).bias, "softplus")
         of_hidden = torch.cat([weight.new_zeros(weight.shape), self.skinning.weight])
         of_trunk = torch.cat([weight, weight.new_zeros(self.skinning.weight.shape)])
         last = Layer(torch.cat([of_hidden, of_trunk], dim=1), torch.cat([bias, self.skinning.bias]), extra=len(trunk))

@@ -36,6 +36,8 @@ class Schedule:
     epochs: int
     first_count: int
     first_epoch: int = 0
+    late_epoch: int = 102
+    """The epoch with whose start children are first put at `MONO.late_length`."""
 
     def rounds(self) -> tuple[float, ...]:
         """Times at which an epoch ends, but for the last one."""
@@ -52,8 +54,13 @@ class Schedule:
         return LENGTH_UNIT * MONO.first_radius * factor * MONO.radius_factor ** max(0, (late - 60) // 5)
 
     def sampling_length(self, fraction: float) -> float:
-        """Radius of the sphere (`paper`) or side of the cube (`code`) of children around their parent, in metres."""
-        return LENGTH_UNIT * MONO.late_length if self._epoch(fraction) > 100 else self.rendering_radius(fraction)
+        """Radius of the sphere (`paper`) or side of the cube (`code`) of children around their parent, in metres.
+
+        The time is that of the last step before a round, and therefore in the epoch that ends.
+        """
+        if self._epoch(fraction) + 1 >= self.late_epoch:
+            return LENGTH_UNIT * MONO.late_length
+        return self.rendering_radius(fraction)
 
     def points_at(self, fraction: float) -> int:
         """The number of points after a round."""

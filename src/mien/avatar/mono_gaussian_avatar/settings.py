@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
-from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
+from mien.avatar.settings import EPSILON_RANGE, GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
 from mien.ranges import NOT_NEGATIVE, Above, Range, ToLoad
 
 LENGTH_UNIT = 0.25
@@ -55,6 +55,9 @@ class MonoGaussianAvatarConfig(MethodConfig):
     schedule: Literal["paper", "code"] = "code"
     """Whose numbers of points and radii: those of the paper, whose children are on a sphere around their parents, or
     those of the published code, whose children are in a cube."""
+    late_epoch: Annotated[int, Range(1, 100_000)] = 102
+    """The paper's epoch with whose start new points are first put 0.001 m from their parents, whatever the radius
+    (published code: 101)."""
     attribute_width: Annotated[int, _WIDTH] = 64
     """Width of the attribute network."""
     attribute_layers: Annotated[int, Range(1, 32)] = 3
@@ -67,6 +70,9 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Whether the attribute network's trunk starts as about the signed distance to a sphere, as in the paper."""
     deformation_width: Annotated[int, _WIDTH] = 64
     """Width of the deformation network."""
+    skinning_norm: bool = False
+    """Whether the hidden layer of the skinning weights has weight normalisation and starts as the layers before it, as
+    published."""
     change_width: Annotated[int, _WIDTH] = 32
     """Width of the network that changes attributes with motion."""
     scale_gain: Annotated[float, Range(0, 1000)] = 0.00625
@@ -79,6 +85,9 @@ class MonoGaussianAvatarConfig(MethodConfig):
     own_rate: Rate = Rate(5e-2, 2e-3)
     """Learning rate of each point's own attributes, per step. They are added to the raw attributes that the network
     predicts for its position, which are smooth. With 0, points have none."""
+    adam_epsilon: Annotated[float, EPSILON_RANGE] = 1e-15
+    """Adam's epsilon for points and networks. With another one than 1e-15, steps take longer, because only that one is
+    in the native code (published code: 1e-8)."""
     rate_halvings: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = ()
     """Times at which the rates of points and networks are halved, as fractions of the run (paper: epochs 80 and
     100)."""
@@ -115,15 +124,18 @@ _PAPER: dict[str, Any] = {
     "first_epoch": 0,
     "epochs": _PAPER_EPOCHS,
     "schedule": "paper",
+    "late_epoch": 101,
     "attribute_width": 256,
     "attribute_layers": 7,
     "encoding_bands": 6,
     "sphere_start": True,
     "deformation_width": 128,
+    "skinning_norm": True,
     "change_width": 64,
     "means_rate": {"start": 1e-4 * LENGTH_UNIT, "end": None},
     "network_rate": {"start": 1e-4, "end": None},
     "own_rate": {"start": 0.0, "end": None},
+    "adam_epsilon": 1e-8,
     "rate_halvings": [80 / _PAPER_EPOCHS, 100 / _PAPER_EPOCHS],
     "face_expression_weight": 1e3,
     "face_expression_by_variance": False,

@@ -37,7 +37,7 @@ class Layers(NamedTuple):
 def _plain_network(
     bases: Tensor, inputs: Tensor, neutral: Tensor, own: Tensor, layers: Layers, gradient: FactoredGradient
 ) -> tuple[Tensor, Tensor]:
-    return _network(blended_features(bases, inputs, neutral, gradient), own, layers)
+    return network_outputs(blended_features(bases, inputs, neutral, gradient), own, layers)
 
 
 @native(_plain_network)
@@ -80,10 +80,13 @@ def feature_network_reference(
     layers: Layers,
 ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
     """`feature_network` in plain PyTorch, whose bases have a common gradient."""
-    return _network(neutral + torch.einsum("nkf,k->nf", bases, inputs), own, layers)
+    return network_outputs(neutral + torch.einsum("nkf,k->nf", bases, inputs), own, layers)
 
 
-def _network(features: Tensor, own: Tensor, layers: Layers) -> tuple[Tensor, Tensor]:
+def network_outputs(
+    features: Float[Tensor, "n f"], own: Float[Tensor, "n x"], layers: Layers
+) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
+    """The network in plain PyTorch, differentiable in everything: all outputs but the last, and the last."""
     hidden = torch.cat([features, own], dim=-1) @ layers.weight1.T + layers.bias1
     outputs = torch.nn.functional.leaky_relu(hidden, SLOPE) @ layers.weight2.T + layers.bias2
     return outputs[:, :-1], outputs[:, -1]

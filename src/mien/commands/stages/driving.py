@@ -126,7 +126,8 @@ def run_driving_stage(
     beside = None if options.alone or output.transparent else driver.pictures
 
     def frame(timestep: int) -> np.ndarray:
-        shown = draw(picture, avatar.pose(driven[timestep]).gaussians.detach().timestep(0), camera)
+        posed = avatar.pose(driven[timestep]).gaussians.detach().timestep(0)
+        shown = draw(picture, posed, camera, avatar.extras.closing)
         if beside is None:
             return shown
         theirs = beside(timestep)

@@ -13,7 +13,7 @@ from mien.commands.picture import PictureOptions
 from mien.export.pictures import to_rgb, to_rgba
 from mien.gaussians import Gaussians
 from mien.progress import say
-from mien.render import rasterize
+from mien.render import close_holes, rasterize
 from mien.render.validation import drawable
 from mien.training import read_run_config
 
@@ -24,13 +24,21 @@ def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
 
 
 @torch.no_grad()
-def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera) -> UInt8[np.ndarray, "h w _"]:
-    """The picture as RGB over the background, or as RGBA with straight colours."""
+def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing: int = 0) -> UInt8[np.ndarray, "h w _"]:
+    """The picture as RGB over the background, or as RGBA with straight colours.
+
+    Args:
+        options: What pictures look like.
+        gaussians: What is drawn.
+        camera: The camera.
+        closing: Pixels by which holes are closed (`close_holes`). Transparent pictures keep them.
+    """
     background = torch.tensor(options.color()).to(gaussians.means)
     with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
         rendering = rasterize(gaussians, camera, background)
-    image, alpha = (tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha))
-    return to_rgba(image, alpha) if options.background == "transparent" else to_rgb(image)
+    if options.background == "transparent":
+        return to_rgba(*(tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha)))
+    return to_rgb(close_holes(rendering.image.float(), closing).cpu().numpy())
 
 
 def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> None:

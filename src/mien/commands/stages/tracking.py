@@ -18,8 +18,10 @@ from mien.inside import remove_tree
 from mien.locks import hold
 from mien.progress import say
 from mien.tracking import (
+    ScoringSettings,
     Tracking,
     TrackingSettings,
+    check_scoring_cut,
     check_tracking_of,
     has_enough_faces,
     make_scoring,
@@ -39,6 +41,10 @@ _TRACKING_RECIPE = 12
 """Version of the tracking. It is raised whenever the same captures would be tracked differently, so that old trackings
 no longer count as current."""
 
+_DESCENT_RECIPE = "descent 2"
+"""The same for what only the schedule `paper` does."""
+
+DEFAULT_SCORING = ScoringSettings()
 
 Overlay = Literal["auto", "all", "none"]
 """Frames that overlay.mp4 shows."""
@@ -52,6 +58,7 @@ def run_tracking_stage(
     overlay: Overlay = "auto",
     preview: bool = False,
     hold_out: Collection[str] = (),
+    scoring: ScoringSettings = DEFAULT_SCORING,
 ) -> dict[str, Tracking]:
     """Track all sequences of a workspace together, with one identity; return the trackings by name.
 
@@ -62,12 +69,14 @@ def run_tracking_stage(
 
     Raises:
         BeingWrittenError: another process is writing one of the sequences.
+        UserError: Among others, a sequence has masks with another cut than that of `scoring`.
     """
     face_model = face_model_of(face_model_choice)
     names = workspace.sequence_names()
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
     check_apart(names, hold_out)
+    check_masks(workspace, names, scoring)
     finished = None if again else _finished_trackings(workspace, names, face_model, settings, overlay, hold_out)
     if finished is not None:
         say(f"{', '.join(finished)}: the tracking is current, nothing to do")
@@ -79,7 +88,7 @@ def run_tracking_stage(
             trackings = _track(workspace, names, face_model, settings, fingerprint, preview, hold_out)
         else:
             say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
-        _write_what_follows(workspace, trackings, face_model, overlay)
+        _write_what_follows(workspace, trackings, face_model, overlay, scoring)
     return trackings
 
 
@@ -94,6 +103,17 @@ def check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
         raise UserError(f"--hold-out {unknown[0]}: no such sequence; there are: {', '.join(names)}")
     if set(names) <= set(hold_out):
         raise UserError(f"--hold-out {' '.join(hold_out)}: leaves no sequence that could show the person's shape")
+
+
+def check_masks(workspace: Workspace, names: Collection[str], scoring: ScoringSettings) -> None:
+    """Check that existing scoring masks have the cut of the settings (`check_scoring_cut`)."""
+    for name in names:
+        folder = workspace.sequence_dir(name)
+        try:
+            capture_hash = read_capture_hash(folder / "capture")
+        except UserError:  # reported when it is read as a whole
+            continue
+        check_scoring_cut(folder / "scoring", scoring, capture_hash)
 
 
 def _finished_trackings(
@@ -120,7 +140,11 @@ def _finished_trackings(
 
 
 def _write_what_follows(
-    workspace: Workspace, trackings: Mapping[str, Tracking], face_model: FaceModel, overlay: Overlay
+    workspace: Workspace,
+    trackings: Mapping[str, Tracking],
+    face_model: FaceModel,
+    overlay: Overlay,
+    scoring: ScoringSettings,
 ) -> None:
     """Write scoring masks, reports and overlays that are missing or outdated."""
     for name, tracking in trackings.items():
@@ -131,8 +155,8 @@ def _write_what_follows(
                 say(f"{name}: the pictures changed, so the scoring mask is made again")
             capture = read_capture(folder / "capture")
             check_tracking_of(capture, tracking, folder / "tracking")
-            scoring = make_scoring(capture, tracking, face_model, scratch=folder)
-            write_scoring(folder / "scoring", scoring, capture_hash)
+            made = make_scoring(capture, tracking, face_model, scratch=folder, settings=scoring)
+            write_scoring(folder / "scoring", made, capture_hash)
         _show_tracking(folder, tracking, face_model, overlay)
 
 
@@ -146,6 +170,7 @@ def _tracking_fingerprint(
     captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
     content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]
     content += [sorted(set(hold_out))] if hold_out else []
+    content += [_DESCENT_RECIPE] if settings.schedule == "paper" else []
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 

@@ -2,7 +2,8 @@
 
 The loop, with the names of `RefillSettings`:
 
-1. In every step, after the backward pass, `observe` notes the highest opacity that each Gaussian has had.
+1. In every step, after the backward pass, `observe` notes the highest opacity that each Gaussian has had. The method
+   can say otherwise how visible a Gaussian is (`observed`).
 2. After the steps at `times`, `adapt` runs a round:
    - Prune: a Gaussian goes if its opacity stayed below `prune_opacity` in all views since the last round. The method
      can judge by another opacity (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always stays.
@@ -31,9 +32,8 @@ class RefillStrategy(DensityStrategy):
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
         """Update each Gaussian's highest opacity."""
-        torch.maximum(
-            self._highest_opacities, posed.gaussians.opacities.detach().reshape(-1), out=self._highest_opacities
-        )
+        visible = self._density.observed(posed.gaussians, rendering)
+        torch.maximum(self._highest_opacities, visible, out=self._highest_opacities)
 
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Prune and refill at the times of the rounds."""

@@ -1,0 +1,1 @@
+"""PointAvatar: isotropic points with colours by normals (Zheng et al., CVPR 2023)."""

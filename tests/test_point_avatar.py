@@ -1,0 +1,170 @@
+"""PointAvatar follows its formulas: the schedule, light by normals, prunes of hidden points, and closed holes."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mien.avatar import PointAvatar, PointAvatarConfig, Progress
+from mien.avatar.encoding import positional_encoding
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.avatar.point_avatar.avatar import _was_drawn
+from mien.avatar.point_avatar.networks import SurfaceNet, _slopes_of_encoding
+from mien.errors import UserError
+from mien.face import FaceParams, head_poses
+from mien.gaussians import Gaussians
+from mien.render import close_holes, rasterize
+from mien.training import PRESETS
+from plain_settings import plain_point_avatar
+from sh_colors import rgb_from_sh
+from toy_scene import toy_camera, toy_face, toy_face_model
+
+SMALL = plain_point_avatar(points=30, max_points=100, face_points=30)
+
+
+def new_avatar(config: PointAvatarConfig = SMALL, disturbed: bool = True) -> PointAvatar:
+    torch.manual_seed(0)
+    avatar = PointAvatar(config, toy_face_model(), toy_face(5))
+    if disturbed:
+        with torch.no_grad():
+            for parameter in avatar.parameters():
+                parameter.add_(0.05 * torch.randn(parameter.shape))
+    return avatar
+
+
+def colors(avatar: PointAvatar, face: FaceParams) -> Tensor:
+    return rgb_from_sh(avatar.pose(face).gaussians.sh)[..., 0, :]
+
+
+def test_all_points_are_round_opaque_and_of_one_size() -> None:
+    gaussians = new_avatar().pose(toy_face(5)[0], Progress(0, 100)).gaussians
+    radius = 0.0375 * 0.75 ** np.log2(30 / 100)
+    torch.testing.assert_close(gaussians.scales, torch.full((30, 3), radius / 2))
+    assert gaussians.opacities.unique().tolist() == [pytest.approx(0.99)]
+
+
+def test_points_double_and_shrink_together() -> None:
+    avatar = new_avatar()
+    counts = [avatar._count((epoch + 0.5) / 20) for epoch in (0, 3, 4, 7, 8, 19)]
+    assert counts == [30, 30, 60, 60, 100, 100]
+    assert avatar.radius(0.25) == pytest.approx(0.75 * avatar.radius(0.1))
+    settings = avatar.density().settings
+    targets = dict(zip(settings.times, settings.targets, strict=True))
+    assert len(targets) == 19
+    # The round that ends epoch 3 already fills up to the number of epoch 4.
+    assert (targets[3 / 20], targets[4 / 20], targets[19 / 20]) == (30, 60, 100)
+
+
+def test_the_papers_points_begin_on_a_sphere_and_end_as_a_hundred_thousand() -> None:
+    paper: Any = PRESETS["paper"].config("point_avatar")
+    assert (paper.start, paper.points, paper.max_points, paper.normals) == ("sphere", 400, 100_000, "deformed")
+    # In the paper's lengths, of a head of four times life size: 400 points of radius 0.15 * 0.75^2.
+    avatar = new_avatar(replace(SMALL, points=400, max_points=100_000), disturbed=False)
+    assert 4 * avatar.radius(0.0) == pytest.approx(0.15 * 0.75**2)
+    torch.testing.assert_close(avatar.store["means"].norm(dim=-1), torch.full((400,), 0.125))
+
+
+def test_children_are_within_the_radius_around_their_parents() -> None:
+    avatar = new_avatar()
+    parents, noise = torch.tensor([3, 7]), torch.tensor([[0.5, -0.5, 0.0], [0.1, 0.2, 0.3]])
+    children = avatar.density().refill(avatar.store, parents, noise, 0.0)["means"]
+    torch.testing.assert_close(children - avatar.store["means"][parents], noise * avatar.radius(0.0))
+
+
+def test_slopes_are_the_gradients_of_the_distance() -> None:
+    torch.manual_seed(0)
+    network = SurfaceNet(16, 3, 2).double()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    points = torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
+    found = network(points)
+    (expected,) = torch.autograd.grad(found.distance.sum(), points)
+    torch.testing.assert_close(found.slope, expected)
+    encoding = positional_encoding(points, 2)
+    for column in range(encoding.shape[1]):
+        (expected,) = torch.autograd.grad(encoding[:, column].sum(), points, retain_graph=True)
+        torch.testing.assert_close(_slopes_of_encoding(points, 2)[:, column].detach(), expected)
+
+
+def test_the_surface_starts_as_about_a_sphere() -> None:
+    torch.manual_seed(0)
+    network = SurfaceNet(256, 7, 6)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    inner, outer = (network(radius * directions) for radius in (0.3, 0.8))
+    assert (outer.distance - inner.distance).detach().mean() > 0.2
+    assert (torch.nn.functional.normalize(outer.slope, dim=-1) * directions).sum(-1).detach().mean() > 0.8
+
+
+def test_a_color_is_albedo_times_light_on_the_normal() -> None:
+    avatar, face = new_avatar(), toy_face(5)[2]
+    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
+    normals = torch.nn.functional.normalize(surface.slope, dim=-1)
+    torch.testing.assert_close(colors(avatar, face), surface.albedo.sigmoid() * avatar.shading(normals))
+    assert new_avatar(disturbed=False).shading(normals).unique().tolist() == [1.0]
+
+
+def test_light_follows_deformed_normals_as_the_head_turns() -> None:
+    avatar, face = new_avatar(replace(SMALL, normals="deformed")), toy_face(5)[2]
+    turned = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.0, 0.0]))
+    assert (colors(avatar, face) - colors(avatar, turned)).abs().max() > 1e-3
+    still = new_avatar()
+    torch.testing.assert_close(colors(still, face), colors(still, turned))
+    # Points on rigid bones have normals that turn with them.
+    with torch.no_grad():
+        avatar.deformation.skinning.weight.zero_()
+        avatar.deformation.skinning.bias.zero_()
+        avatar.deformation.skinning.bias[0] = 10.0
+    points = avatar.store["means"].detach() / LENGTH_UNIT
+    normals = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
+    rest = avatar._motion.transforms(avatar._motion.canonical_face())[0, 0, :, :3]
+    now = avatar._motion.transforms(turned)[0, 0, :, :3]
+    expected = normals @ (head_poses(turned)[0, :3, :3] @ now @ rest.T).T
+    torch.testing.assert_close(avatar._deformed_normals(points, normals, turned)[0], expected, atol=1e-5, rtol=0)
+
+
+def test_avatars_with_deformed_normals_say_why_they_cannot_be_exported() -> None:
+    with pytest.raises(UserError, match=r"^the setting normals deformed of point_avatar: .*export a \.ply"):
+        new_avatar(replace(SMALL, normals="deformed")).bake()
+
+
+def test_points_that_others_hide_are_not_drawn() -> None:
+    """A small point behind four large ones takes part in no pixel, but is within the picture."""
+    camera = toy_camera(32)
+    ahead = camera.viewmat[2, :3]
+    near = camera.position + 0.5 * ahead
+    means = torch.stack([near, near, near, near, near + 0.3 * ahead]).requires_grad_()
+    scales = torch.tensor([0.2, 0.2, 0.2, 0.2, 0.01])[:, None].repeat(1, 3)
+    gaussians = Gaussians(
+        means, torch.tensor([1.0, 0, 0, 0]).repeat(5, 1), scales, torch.full((5,), 0.99), torch.zeros(5, 1, 3)
+    )
+    rendering = rasterize(gaussians, camera, torch.ones(3))
+    assert (rendering.radii > 0).all()
+    (rendering.image * torch.linspace(0, 1, 32)[:, None]).sum().backward()
+    seen = _was_drawn(gaussians, rendering)
+    assert seen[0] == 1
+    assert seen[4] == 0
+
+
+def test_losses_hold_points_on_a_surface_whose_slope_is_one() -> None:
+    avatar = new_avatar()
+    posed = avatar.pose(toy_face(5)[1], Progress(4, 100))
+    rendering = rasterize(posed.gaussians.timestep(0), toy_camera(32), torch.ones(3))
+    losses = avatar.regularizers(posed, rendering, Progress(4, 100))
+    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
+    torch.testing.assert_close(losses["distance"], surface.distance.square().mean())
+    torch.testing.assert_close(losses["slope"], 0.1 * (surface.slope.norm(dim=-1) - 1).square().mean())
+    assert set(losses) >= {"skinning", "expression_directions"}
+
+
+def test_closing_fills_bright_specks_and_keeps_the_rest() -> None:
+    picture = torch.ones(20, 20, 3)
+    picture[5:15, 5:15] = 0.25
+    whole = picture.clone()
+    picture[9, 9] = 1.0
+    picture[12:14, 6:8] = 1.0
+    assert torch.equal(close_holes(picture, 1), whole)
+    assert torch.equal(close_holes(picture, 0), picture)
+    assert new_avatar().extras.closing == 1
