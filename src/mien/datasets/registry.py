@@ -7,10 +7,20 @@ from pathlib import Path
 
 from mien.datasets.dataset import Dataset
 from mien.datasets.gaussian_avatars import GAUSSIAN_AVATARS
+from mien.datasets.imavatar import IMAVATAR
+from mien.datasets.insta import INSTA
+from mien.datasets.live_link_face_take import LIVE_LINK_FACE
+from mien.datasets.nerf_blendshape import NERF_BLENDSHAPE
+from mien.datasets.nerface import NERFACE
+from mien.datasets.nersemble import NERSEMBLE
+from mien.datasets.nersemble_benchmark import NERSEMBLE_BENCHMARK
+from mien.datasets.vhap import VHAP
 from mien.errors import UserError
 from mien.plugins import plugin, warn, with_plugins
 
-_OWN = (GAUSSIAN_AVATARS,)
+_OWN = (
+    GAUSSIAN_AVATARS, VHAP, NERSEMBLE, NERSEMBLE_BENCHMARK, INSTA, IMAVATAR, NERFACE, NERF_BLENDSHAPE, LIVE_LINK_FACE,
+)  # fmt: skip
 _GROUP = "mien.datasets"
 """Group of entry points of other packages."""
 

@@ -15,7 +15,7 @@ from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_run_config
-from mien.training.footage import Frame, held_out, sequence_of, training_frames
+from mien.training.footage import Frame, held_out_of, sequence_of, training_frames
 
 
 def load_experiments(run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "cleaned") -> dict[str, Experiment]:
@@ -79,7 +79,7 @@ def held_out_by_protocol(
     unseen_sequences: list[Frame] = []
     unseen_cameras: list[Frame] = []
     for index, sequence in enumerate(sequences):
-        left_out = held_out(sequence.capture.timesteps, settings.split).numpy()
+        left_out = held_out_of(sequence, settings.split).numpy()
         trained_cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
         sharp = sequence.usable() & sequence.sharp()
         seen = np.any(sharp & np.array(trained_cameras), axis=1).tolist()
