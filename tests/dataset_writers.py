@@ -145,7 +145,8 @@ def write_vhap(
         row = {
             "translation": scene.translation[timestep][None], "rotation": scene.pose[timestep, 0][None],
             "neck_pose": scene.pose[timestep, 1][None], "jaw_pose": scene.pose[timestep, 2][None],
-            "eyes_pose": scene.pose[timestep, 3:].reshape(1, 6), "shape": scene.shape, "expr": scene.expr[timestep][None],
+            "eyes_pose": scene.pose[timestep, 3:].reshape(1, 6), "shape": scene.shape,
+            "expr": scene.expr[timestep][None],
         }  # fmt: skip
         file = folder / f"flame_param/{timestep:05d}.npz"
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -169,4 +170,126 @@ def write_vhap(
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
     trained = [frame for frame in frames if frame["timestep_index"] < held and frame["camera_id"] != cameras[-1]]
     (folder / "transforms_train.json").write_text(json.dumps({"frames": trained or frames[: held * len(cameras)]}))
+    return folder
+
+
+def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
+    """Write a person of NeRFace: training pictures in a shuffled order, a mirrored world, fx below 0.
+
+    A ray of the file through the whole pixel (u, v) has the direction R ((u - cx) / fx, -(v - cy) / fy, -1).
+    """
+    order = [2, 0, 3, 1]  # number of each training picture in the clip
+    index = np.full((5, 2), -1.0)
+    index[:, 0] = np.arange(5)
+    for number, timestep in enumerate(order):
+        index[timestep, 1] = number
+    mirror = np.diag([-1.0, 1.0, 1.0])
+    for part, timesteps in (("train", order), ("val", [4]), ("test", [5])):
+        frames = []
+        for number, timestep in enumerate(timesteps):
+            rotation, translation = head_view(timestep)
+            vertices = scene.vertices(timestep, root=False)
+            write_picture(
+                folder / f"{part}/f_{number:04d}.png", draw(scene, vertices, UNEQUAL, rotation, translation)[0]
+            )
+            pose = np.eye(4)
+            pose[:3, :3] = -mirror @ rotation.T
+            pose[:3, 3] = mirror @ (-rotation.T @ translation) * scale
+            frames.append({"file_path": f"./{part}/f_{number:04d}", "transform_matrix": pose.tolist(),
+                           "expression": [timestep, *[0.5] * 75], "bbox": [0, 1, 0, 1]})  # fmt: skip
+        intrinsics = [-UNEQUAL[0, 0], UNEQUAL[1, 1], (UNEQUAL[0, 2] - 0.5) / SIDE, (UNEQUAL[1, 2] - 0.5) / SIDE]
+        content = {"camera_angle_x": -0.8, "frames": frames, "intrinsics": intrinsics}
+        (folder / f"transforms_{part}.json").write_text(json.dumps(content))
+    np.save(folder / "index_map.npy", index)
+    write_picture(folder / "bg/00050.png", np.full((SIDE, SIDE, 3), 255, np.uint8))
+    return folder
+
+
+def write_nerf_blendshape(folder: Path, scene: Scene) -> Path:
+    """Write a person of NeRFBlendShape, from picture 7 on and with a gap."""
+    frames = []
+    for timestep in range(len(scene)):
+        number = 7 + timestep + (timestep > 2)
+        rotation, translation = head_view(timestep)
+        image, matte = draw(scene, scene.vertices(timestep, root=False), UNEQUAL, rotation, translation)
+        write_picture(folder / f"ori_imgs/{number}.jpg", image)
+        classes = np.zeros((SIDE, SIDE, 3), np.uint8)
+        classes[matte > 127] = (0, 0, 255)
+        classes[:4] = (0, 255, 0)
+        write_picture(folder / f"parsing/{number}.png", classes)
+        points = np.stack([np.arange(478) % SIDE, np.full(478, timestep + 0.25)], axis=1)
+        (folder / f"ori_imgs/{number}.lms").write_text("\n".join(f"{x} {y}" for x, y in points))
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = rotation, translation
+        pose = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.insert(0, {"img_id": number, "transform_matrix": pose.tolist(), "exp_ori": [timestep / 10] * 46})
+    content = {"h": SIDE, "w": SIDE, "fx": UNEQUAL[0, 0], "fy": UNEQUAL[1, 1], "cx": UNEQUAL[0, 2] - 0.5,
+               "cy": UNEQUAL[1, 2] - 0.5, "frames": frames}  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+BENCHMARK_SCALE = 1.07
+FRONTAL = "222200037"
+
+
+def benchmark_vertices(scene: Scene, timestep: int, angles: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return the vertices of the benchmark's forward pass: scaled, turned and shifted about the model's origin."""
+    turn = np.eye(3)
+    for axis in range(3):
+        turn = turn @ rotation_of(np.eye(3)[axis] * angles[axis])
+    return BENCHMARK_SCALE * scene.vertices(timestep, root=False) @ turn.T + shift
+
+
+def write_benchmark(folder: Path, scene: Scene, serials: tuple[str, ...] = (FRONTAL,), tracked: bool = True) -> Path:
+    """Write a person of the NeRSemble benchmark, with one test sequence that has a tracking only."""
+    from mien.capture.video import write_video
+
+    place = folder / "sequences" / "EXP-2-eyes"
+    random = np.random.default_rng(8)
+    angles, shifts = random.uniform(-0.3, 0.3, (len(scene), 3)), random.uniform(-0.03, 0.03, (len(scene), 3))
+    poses, intrinsics = {}, {}
+    for index, serial in enumerate(serials):
+        rotation, translation = head_view(2 + index, 1.0)
+        poses[serial] = np.eye(4)
+        poses[serial][:3, :3], poses[serial][:3, 3] = rotation, translation
+        intrinsics[serial] = UNEQUAL.tolist()
+        drawn = [
+            draw(scene, benchmark_vertices(scene, t, angles[t], shifts[t]), UNEQUAL, rotation, translation)
+            for t in range(len(scene))
+        ]
+        write_video(place / f"images/cam_{serial}.mp4", iter([image for image, _ in drawn]), 24.3, crf=1)
+        mattes = [np.repeat(matte[..., None], 3, -1) for _, matte in drawn]
+        write_video(place / f"alpha_maps/cam_{serial}.mp4", iter(mattes), 24.3, crf=1)
+    calibration = {"world_2_cam": {serial: pose.tolist() for serial, pose in poses.items()}, "intrinsics": intrinsics}
+    (folder / "calibration").mkdir()
+    (folder / "calibration/camera_params.json").write_text(json.dumps(calibration))
+    turns = np.stack([np.linalg.multi_dot([rotation_of(np.eye(3)[axis] * angle[axis]) for axis in range(3)])
+                      for angle in angles])  # fmt: skip
+    arrays = {
+        "shape": scene.shape[None], "expression": scene.expr, "rotation": angles, "rotation_matrices": turns,
+        "translation": shifts, "scale": np.array([[BENCHMARK_SCALE]]), "jaw": scene.pose[:, 2],
+        "neck": scene.pose[:, 1],
+        "eyes": scene.pose[:, 3:].reshape(-1, 6), "frames": np.arange(len(scene)),
+    }  # fmt: skip
+    for name in ("EXP-2-eyes", "FREE") if tracked else ():
+        file = folder / f"sequences/{name}/tracking/flame2023_tracking_v2.npz"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(npz({key: array.astype(np.float32) for key, array in arrays.items()}))
+    np.savez(folder / "truth.npz", angles=angles, shifts=shifts)
+    return folder
+
+
+def write_nersemble(folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL)) -> Path:
+    """Write a person of NeRSemble's raw recordings, with empty videos."""
+    poses = {serial: np.eye(4).tolist() for serial in serials}
+    (folder / "calibration").mkdir(parents=True)
+    K = [[8000.0, 0, 1100], [0, 8000, 1604], [0, 0, 1]]
+    content = {"world_2_cam": poses, "intrinsics": K}
+    (folder / "calibration/camera_params.json").write_text(json.dumps(content))
+    for serial in serials:
+        for name in (f"EMO-1-shout+laugh/images/cam_{serial}.mp4", f"BACKGROUND/image_{serial}.jpg"):
+            place = folder / "sequences" / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_bytes(b"0")
     return folder

@@ -57,8 +57,8 @@ class Command:
 
     def run(self) -> None:
         """Read the files and write what they hold."""
-        from mien.commands.stages.importing import run_import_stage
         from mien.commands.stages.findings import findings_lines
+        from mien.commands.stages.importing import run_import_stage
         from mien.progress import say
 
         dataset, told = self._found()

@@ -15,13 +15,12 @@ from mien.storage import replace_folder, write_arrays
 from mien.tracking import make_scoring, write_scoring, write_tracking
 from mien.training import read_sequence, write_own_split
 
-
 FOREIGN = "foreign.safetensors"
 """Arrays of the dataset for which mien has no place."""
 
 
 def write_sequence(folder: Path, sequence: TrackedSequence | FilmedSequence, dataset: Dataset, source: Path) -> None:
-    """Write a sequence as `mien capture` and `mien track` leave one: capture/, and of a tracked one tracking/, scoring/.
+    """Write a sequence as `mien capture` leaves one, and if it is tracked, as `mien track` leaves one.
 
     Beside them are dataset.json, with the split of the authors, and foreign.safetensors, if there is anything for it.
 
@@ -54,9 +53,7 @@ def write_sequence(folder: Path, sequence: TrackedSequence | FilmedSequence, dat
         remove_tree(aside)
 
 
-def _write_into(
-    folder: Path, sequence: TrackedSequence | FilmedSequence, dataset: Dataset, source: Path
-) -> None:
+def _write_into(folder: Path, sequence: TrackedSequence | FilmedSequence, dataset: Dataset, source: Path) -> None:
     capture = sequence.capture
     imported = {"dataset": dataset.name, "from": str(source.absolute())}
     if isinstance(sequence, TrackedSequence):
@@ -69,9 +66,7 @@ def _write_into(
         _write_tracking_into(folder, sequence, imported, capture_hash)
 
 
-def _write_tracking_into(
-    folder: Path, sequence: TrackedSequence, imported: dict[str, str], capture_hash: str
-) -> None:
+def _write_tracking_into(folder: Path, sequence: TrackedSequence, imported: dict[str, str], capture_hash: str) -> None:
     capture, tracking, face_model = sequence.capture, sequence.tracking, sequence.face_model
     content = json.dumps([imported["dataset"], capture_hash, face_model.name, face_model.content_hash])
     fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]

@@ -35,6 +35,7 @@ _MAX_TRAINING_FRAMES = 200
 _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
 """Figures that every frame has."""
 _MASK = "frozen scoring mask: matte cut at the neck, over white"
+_MATTES = "the dataset's mattes, whole, over white"
 _CROP = "frozen head box of each frame"
 _PART_CROPS = f"boxes of the tracked mesh; enlarged to {PART_SIDE} pixels for ST-LPIPS if a side is shorter"
 
@@ -51,6 +52,8 @@ class EvaluationSettings(ScoreSettings):
     """Whether to write every scored picture and its truth as png as well."""
     edges: Edges = "cleaned"
     """Colours of the truth at soft edges of the matte: cleaned of the background, or as filmed."""
+    dataset: str | None = None
+    """Name of the dataset whose protocol counts: its split, and its own mattes. None for mien's scoring masks."""
     fit_faces: bool = False
     """Whether to score the avatar a third time, with expression and pose fitted to each held-out frame's picture."""
     fit_steps: Annotated[int, Range(1, 10_000)] = 20
@@ -176,7 +179,8 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
         "perceptual_frames": sum("perceptual" in row for row in own_rows),
         "split": experiment.split,
-        "mask": _MASK,
+        "mask": _MATTES if experiment.whole_mattes else _MASK,
+        **({} if settings.dataset is None else {"dataset": settings.dataset}),
         "edges": experiment.edges,
         "crop": _CROP,
         "part_crops": _PART_CROPS,

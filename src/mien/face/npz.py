@@ -73,9 +73,7 @@ def _read_array(file: io.BufferedIOBase, limit: int) -> np.ndarray:
     if not all(length >= 0 for length in shape):
         raise ValueError(f"has the shape {shape}")
     if size > limit:
-        raise ValueError(
-            f"has {size:,} bytes; the arrays of a face model have at most {MAX_MODEL_BYTES:,} together"
-        )
+        raise ValueError(f"has {size:,} bytes; the arrays of a face model have at most {MAX_MODEL_BYTES:,} together")
     data = file.read(size)
     # Reading to the end makes zipfile compare the checksum.
     if len(data) != size or file.read(1):

@@ -1,4 +1,4 @@
-"""Sequences of datasets that are videos: they go through `mien capture`, with the dataset's cameras and clean plates."""
+"""Sequences of datasets that are videos go through `mien capture`, with the cameras and plates of the dataset."""
 
 import json
 import tempfile

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from mien.training.footage.own_split import (
         OWN_SPLIT,
         OwnSplit,
+        imported_from,
         ranges_of,
         read_own_split,
         with_own_split,
@@ -90,6 +91,7 @@ __all__ = [
     "held_out",
     "held_out_of",
     "hidden_triangles",
+    "imported_from",
     "inside_triangles",
     "measure_coverage",
     "ranges_of",

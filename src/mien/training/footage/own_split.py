@@ -78,6 +78,19 @@ def read_own_split(folder: Path | None) -> OwnSplit | None:
     return OwnSplit(tuple((start, stop) for start, stop in ranges), tuple(cameras))
 
 
+def imported_from(folder: Path) -> str | None:
+    """Return the name of the dataset that a sequence was imported from, or None if it was not imported.
+
+    Raises:
+        UserError: the file is damaged or of another version.
+    """
+    if not (folder / _FILE).exists():
+        return None
+    imported = read_json(folder / _FILE, FORMAT, VERSION, remedy=_REMEDY).get("imported")
+    name = imported.get("dataset") if isinstance(imported, dict) else None
+    return name if is_one_line(name) else None
+
+
 def with_own_split(
     settings: TrainSettings, splits: Mapping[str, OwnSplit | None], timesteps: Mapping[str, int]
 ) -> TrainSettings:
