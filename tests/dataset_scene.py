@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from flame_like import EXPRESSIONS, IDENTITIES, exact_landmarks, flame_like, posed_as_flame, write_npz
+from flame_like import exact_landmarks, flame_like, posed_as_flame, write_npz
 from mien.camera import Camera
 from mien.face import FaceModel
 from mien.face.flame import flame_face_model, read_flame
@@ -40,7 +40,9 @@ class Scene:
         pose[0] *= root
         pose[1] *= neck
         shift = self.translation[timestep] * root
-        coefficients = np.concatenate([self.shape[:IDENTITIES], self.expr[timestep, :EXPRESSIONS]])
+        identities = int(self.arrays["identities"])
+        expressions = self.arrays["shapedirs"].shape[2] - identities
+        coefficients = np.concatenate([self.shape[:identities], self.expr[timestep, :expressions]])
         return posed_as_flame(self.arrays, pose, coefficients, shift)
 
     def __len__(self) -> int:
@@ -52,11 +54,17 @@ def make_scene(anny: FaceModel, folder: Path, timesteps: int = 6) -> Scene:
     """Return a head that turns about all axes, with a neck, a jaw and eyes that move, and a coloured cheek."""
     arrays = flame_like(anny)
     model = flame_face_model(read_flame(write_npz(folder / "flame.npz", arrays)), "flame")
-    model = replace(model, landmarks=exact_landmarks(anny))
+    return scene_of(arrays, replace(model, landmarks=exact_landmarks(anny)), timesteps)
+
+
+def scene_of(arrays: dict[str, np.ndarray], model: FaceModel, timesteps: int) -> Scene:
+    """Return random poses of a face model, whose arrays are in FLAME's schema."""
     random = np.random.default_rng(3)
     shape, expr = np.zeros(300), np.zeros((timesteps, 100))
-    shape[:IDENTITIES] = 0.5 * random.standard_normal(IDENTITIES)
-    expr[:, :EXPRESSIONS] = 0.5 * random.standard_normal((timesteps, EXPRESSIONS))
+    identities = int(arrays["identities"])
+    expressions = arrays["shapedirs"].shape[2] - identities
+    shape[:identities] = 0.5 * random.standard_normal(identities)
+    expr[:, :expressions] = 0.5 * random.standard_normal((timesteps, expressions))
     pose = np.zeros((timesteps, 5, 3))
     pose[:, 0] = random.uniform(-0.25, 0.25, (timesteps, 3))
     pose[:, 1] = random.uniform(-0.2, 0.2, (timesteps, 3))

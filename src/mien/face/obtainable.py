@@ -20,7 +20,7 @@ OBTAINABLE = (
     ObtainableModel("generic_model", "generic_model.pkl (FLAME 2020)", "MPI's own; not commercial",
                     "flame.is.tue.mpg.de, with an account", "trackings of INSTA, FlashAvatar and IMavatar"),
     ObtainableModel("flame2023", "flame2023.pkl (FLAME 2023)", "MPI's own; not commercial",
-                    "flame.is.tue.mpg.de, with an account", "trackings of VHAP (add it with --teeth), NeRSemble benchmark"),
+                    "flame.is.tue.mpg.de, with an account", "trackings of VHAP (with --teeth) and NeRSemble"),
     ObtainableModel("flame2023_open", "FLAME 2023 Open", "CC-BY-4.0", "flame.is.tue.mpg.de, with an account",
                     "avatars that may carry their face model (add it with --shareable)"),
 )  # fmt: skip

@@ -36,7 +36,7 @@ _STRIPS = (
     (((105, 106, 45), (106, 46, 45)), ((105, 46, 45), (105, 106, 46))),
 )
 """The strips: front, back and bottom of the upper teeth, then front, back and top of the lower. Each has the corners of
-the two triangles of its first square, on the left half and on the right. The corners of the next square are larger by 1."""
+the two triangles of its first square, on the left half and on the right. The next square: plus 1."""
 
 
 def with_teeth(flame: FlameFile, name: str) -> FlameFile:
