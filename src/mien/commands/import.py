@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.commands.help_text import Described
-from mien.commands.stages.names import check_new_run, run_name
+from mien.commands.stages.names import check_new_run, check_new_sequence, run_name
 from mien.datasets import Dataset, find_dataset, known_datasets, recognised
 from mien.errors import UserError
 from mien.workspace import Workspace, check_new_workspace
@@ -65,8 +65,12 @@ class Command:
         if told is not None and dataset.holds == "sequences":
             say(f"{self.path}: {told}")  # before they are read, which takes long
         if dataset.survey is not None:
-            for line in findings_lines(dataset.survey(self.path)):
+            findings = dataset.survey(self.path)
+            for line in findings_lines(findings):
                 say(line)
+            if not self.dry_run:
+                for clip in findings.clips:  # now, because reading takes long
+                    check_new_sequence(Workspace(self.out).sequence_dir(clip.name))
         if not self.dry_run:
             workspace, run = Workspace(self.out), self._run(dataset)
             run_import_stage(dataset, self.path, workspace, run, self.face_model, self.retrack)
