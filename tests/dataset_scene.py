@@ -87,11 +87,11 @@ def head_view(timestep: int, distance: float = 0.9) -> tuple[np.ndarray, np.ndar
 
 def draw(
     scene: Scene, vertices: np.ndarray, K: np.ndarray, rotation: np.ndarray, translation: np.ndarray,
-    size: tuple[int, int] = (SIDE, SIDE),
+    size: tuple[int, int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return picture [h, w, 3] and matte [h, w] of vertices, by an OpenCV camera."""
     placed = torch.from_numpy(vertices @ rotation.T + translation).float()
-    camera = Camera(torch.from_numpy(K).float(), torch.eye(4), *size)
+    camera = Camera(torch.from_numpy(K).float(), torch.eye(4), *(size or (SIDE, SIDE)))
     faces = torch.from_numpy(scene.arrays["f"].astype(np.int64))
     image, alpha = render_mesh(placed, faces, camera, scene.colors, background=(1.0, 1.0, 1.0))
     return (image * 255).round().byte().numpy(), (alpha * 255).round().byte().numpy()
