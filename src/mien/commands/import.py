@@ -45,24 +45,22 @@ class Command:
             raise UserError(f"--retrack: {dataset.name} has no pictures that could be tracked; leave --retrack out")
         if self.retrack and self.face_model is not None:
             raise UserError("--retrack and --face-model: the pictures are tracked with mien's own model; give only one")
-        if self.dry_run and dataset.survey is None:
-            raise UserError(f"--dry-run: {dataset.name} cannot be surveyed without reading it; leave --dry-run out")
         if not self.dry_run:
             check_new_workspace(self.out)
         run = run_name(self._run(dataset))
         if dataset.holds == "avatar":
-            check_new_run(Workspace(self.out).run_dir(run))
+            if not self.dry_run:
+                check_new_run(Workspace(self.out).run_dir(run))
         elif self.name is not None:
             raise UserError(f"--run {self.name}: {dataset.name} holds sequences, which are no run; leave --run out")
 
     def run(self) -> None:
         """Read the files and write what they hold."""
         from mien.commands.stages.findings import findings_lines
-        from mien.commands.stages.importing import run_import_stage
         from mien.progress import say
 
         dataset, told = self._found()
-        if told is not None and dataset.holds == "sequences":
+        if told is not None and (self.dry_run or dataset.holds == "sequences"):
             say(f"{self.path}: {told}")  # before they are read, which takes long
         if dataset.survey is not None:
             findings = dataset.survey(self.path)
@@ -72,6 +70,8 @@ class Command:
                 for clip in findings.clips:  # now, because reading takes long
                     check_new_sequence(Workspace(self.out).sequence_dir(clip.name))
         if not self.dry_run:
+            from mien.commands.stages.importing import run_import_stage
+
             workspace, run = Workspace(self.out), self._run(dataset)
             run_import_stage(dataset, self.path, workspace, run, self.face_model, self.retrack)
 
