@@ -54,7 +54,7 @@ def read_npy(path: Path) -> np.ndarray:
     """
     try:
         return parse_npy(read_bytes(path, _MAX_NPY_BYTES))
-    except (OSError, ValueError) as error:
+    except Exception as error:  # a damaged header may fail in any way
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: cannot be read as .npy ({reason}); {REMEDY}") from None
 
