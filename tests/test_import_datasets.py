@@ -12,7 +12,7 @@ from dataset_writers import write_frame, write_imavatar, write_insta
 from mien.cli import main
 from mien.commands.stages import importing
 from mien.face import add_face_model, load_face_model
-from mien.training import OwnSplit, TrainSettings, read_own_split, read_sequence, with_own_split
+from mien.training import OwnSplit, TrainSettings, read_own_split, read_sequence, with_own_split, write_own_split
 from mien.training.footage.frames import training_frames
 
 CLIPS = ("MVI_1810", "MVI_1812")
@@ -90,7 +90,6 @@ def test_mistakes_leave_nothing(
 ) -> None:
     out = ["--out", str(tmp_path / "out")]
     refused(["import", str(subject), *out], "needs FLAME 2020", capsys)
-    refused(["import", str(subject), *out, "--face-model", "anny"], "is not in FLAME's schema", capsys)
     refused(["import", str(subject), *out, "--retrack", "--face-model", "flame"], "give only one", capsys)
     refused(["import", str(subject.parent), *out], "holds 1 people (subject1); import each", capsys)
     other = write_insta(tmp_path / "other", scene)
@@ -128,3 +127,29 @@ def test_damaged_json_is_named(
     line = ["import", str(place), "--out", str(tmp_path / "out"), "--face-model", "flame"]
     refused(line, words, capsys)
     assert not list((tmp_path / "out").glob("sequences/*"))
+
+
+def test_the_protocol_of_a_dataset_scores_its_mattes_and_its_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mien.files import write_json
+    from toy_workspace import write_toy_workspace
+
+    root = tmp_path / "W"
+    write_toy_workspace(root)
+    clip, file = root / "sequences/clip", root / "runs/toy/config.json"
+    line = ["evaluate", str(root), "--protocol", "insta", "--no-perceptual"]
+    refused(line, "was not imported; leave --protocol insta out", capsys)
+    write_own_split(clip, OwnSplit(((1, 3),)), {"imported": {"dataset": "insta", "from": "there"}})
+    refused(line, "was trained with --split", capsys)
+    config = json.loads(file.read_text())
+    config["settings"]["split"] = "dataset"
+    content = {name: value for name, value in config.items() if name not in ("format", "version", "checksum")}
+    write_json(file, config["format"], config["version"], content)
+    refused([*line[:3], "imavatar", line[4]], "was imported from insta", capsys)
+    assert main(line) == 0
+    (entry,) = json.loads((root / "runs/toy/metrics.json").read_text())["protocols"].values()
+    assert entry["per_frame"]["timestep"] == [1, 2]
+    assert (entry["split"], entry["dataset"], entry["edges"]) == ("dataset", "insta", "filmed")
+    assert entry["mask"] == "the dataset's mattes, whole, over white"
+    assert entry["scored_on"]["clip"]["mask"] == "matte"
