@@ -200,9 +200,10 @@ def _pictures(group: _Group, root: Path) -> "tuple[np.ndarray, np.ndarray]":
     from mien.datasets.pictures import collect, read_matte, read_picture
 
     first = group.frames[group.timesteps[0], group.cameras[0]]
-    size = tuple(int(numbers(first.file, first.content, name, ())) for name in ("w", "h"))
-    probe = read_picture(inner(first.file, root, first.content.get("file_path")), (size[0], size[1]))[0]
-    size = probe.shape[1], probe.shape[0]
+    announced = tuple(int(numbers(first.file, first.content, name, ())) for name in ("w", "h"))
+    probe = inner(first.file, root, first.content.get("file_path"))
+    pixels = read_picture(probe, (announced[0], announced[1]))[0]
+    size = pixels.shape[1], pixels.shape[0]
     masks = all("fg_mask_path" in frame.content for frame in group.frames.values())
 
     def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
