@@ -14,7 +14,7 @@ from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.overall import Overall
 from mien.tracking import ScoringSettings, TrackingSettings
-from mien.training import NAMED_SPLIT, TrainSettings
+from mien.training import NAMED_SPLIT, OWN_SPLIT, TrainSettings
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -63,6 +63,8 @@ class Command:
                 f"--split {NAMED_SPLIT}: needs ten sequences of calibrated cameras, and this command makes one; use "
                 f"`mien capture --calibration` for each, then `mien track` and `mien train --split {NAMED_SPLIT}`"
             )
+        if self.options.settings().split == OWN_SPLIT:
+            raise UserError(f"--split {OWN_SPLIT}: is the split of an imported dataset; use it with `mien train`")
         if self.track_apart and not self.options.hold_out:
             raise UserError("--track-apart: needs the sequences to track apart; add --hold-out NAME")
         if self.calibration is None:

@@ -12,6 +12,8 @@ from mien.errors import UserError
 from mien.terminal import show
 from mien.workspace import open_workspace
 
+Protocol = Literal["vhap", "insta", "imavatar", "nerface", "nerf-blendshape"]
+"""Datasets that name a split."""
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json")]
 
 
@@ -42,6 +44,9 @@ class Command:
     edges: Literal["cleaned", "filmed"] = "cleaned"
     """Truth at soft edges of the matte: colours of the person alone (cleaned), or pictures as they were filmed, which
     hold some of the background there (filmed), for figures beside those of other programs."""
+    protocol: Protocol | None = None
+    """Score as the authors of an imported dataset do: whole pictures over white, their mattes, their held-out frames.
+    The run has to be trained with --split dataset. It implies --edges filmed."""
     fit_faces: bool = False
     """Also score the avatar with expression and pose fitted to each held-out frame by its colours: a third figure
     beside those as tracked and corrected, never the headline. It takes longer."""
@@ -72,6 +77,8 @@ class Command:
             raise UserError(f"--fit-steps {self.fit_steps}: give a number from 1 to 10000")
         if self.fit_faces and (self.compare or self.images is not None):
             raise UserError("--fit-faces: is for one run, without --compare and --images; leave it out")
+        if self.protocol is not None and (self.compare or self.images is not None):
+            raise UserError(f"--protocol {self.protocol}: is for one run, without --compare and --images; leave it out")
         if self.edges == "filmed" and (self.compare or self.images is not None):
             raise UserError("--edges filmed: is for one run, without --compare and --images; leave it out")
         if self.images is not None or self.truth is not None:
@@ -102,7 +109,8 @@ class Command:
             perceptual=self.perceptual,
             perceptual_frames=self.perceptual_frames,
             pictures=self.pictures,
-            edges=self.edges,
+            edges="filmed" if self.protocol is not None else self.edges,
+            dataset=self.protocol,
             fit_faces=self.fit_faces,
             fit_steps=self.fit_steps,
         )

@@ -24,6 +24,8 @@ class Command:
     shareable: bool = False
     """State that the added model's licence allows avatars to carry a copy of it (FLAME's does not, FLAME Open's
     does)."""
+    teeth: bool = False
+    """Add the teeth of VHAP and GaussianAvatars to FLAME, which their trackings and avatars need."""
     bake: str | None = None
     """Name of a model to prepare now."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -31,8 +33,10 @@ class Command:
 
     def check(self) -> None:
         """Check the options without heavy libraries."""
-        if self.add is None and (self.name is not None or self.shareable):
-            raise UserError("--name and --shareable belong to a model that is added: give its file with --add FILE")
+        if self.add is None and (self.name is not None or self.shareable or self.teeth):
+            raise UserError(
+                "--name, --shareable and --teeth belong to a model that is added: give its file with --add FILE"
+            )
         if self.add is not None and not self.add.is_file():
             raise UserError(
                 f"{self.add}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz"
@@ -41,6 +45,7 @@ class Command:
     def run(self) -> None:
         """Add or bake a model if asked for, then print the table."""
         from mien.face import available_face_models, load_face_model
+        from mien.face.obtainable import OBTAINABLE
 
         if self.add is not None:
             from mien.commands.stages.face_models import add_face_model_file
@@ -51,7 +56,7 @@ class Command:
                     f"--add {self.add}: there is no folder to keep it in (no home folder, or it cannot be written to); "
                     "set MIEN_CACHE to a folder"
                 )
-            add_face_model_file(self.add, self.name, self.shareable)
+            add_face_model_file(self.add, self.name, self.shareable, self.teeth)
         if self.bake is not None:
             load_face_model(self.bake)
         rows = [asdict(info) for info in available_face_models()]
@@ -60,3 +65,7 @@ class Command:
             return
         for row in rows:
             show("  ".join(f"{key}: {value}" for key, value in row.items()))
+        for model in OBTAINABLE:
+            if all(row["name"] != model.name for row in rows):
+                show(f"not installed: {model.file}, for {model.use}; licence: {model.licence}; from {model.where}; "
+                     f"add it with mien face-models --add FILE --name {model.name}")  # fmt: skip

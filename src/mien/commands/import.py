@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.commands.help_text import Described
-from mien.commands.stages.names import check_new_run, run_name
+from mien.commands.stages.names import check_new_run, check_new_sequence, run_name
 from mien.datasets import Dataset, find_dataset, known_datasets, recognised
 from mien.errors import UserError
 from mien.workspace import Workspace, check_new_workspace
@@ -31,28 +31,49 @@ class Command:
     face_model: str | None = None
     """The face model that the files belong to: its name among your face models, or a .npz or .pkl in FLAME's schema
     (added at its first use). It is not needed for folders that `mien export` wrote with the face model inside."""
+    dry_run: bool = False
+    """Only say what was found: sequences, frames, cameras, face model, split, and what is missing."""
+    retrack: bool = False
+    """Leave out the tracking of the dataset's authors, and track the pictures with mien's own model instead."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         if not self.path.exists():
             raise UserError(f"{self.path}: no such file or folder; give one of {known_datasets()}")
         dataset, _ = self._found()
-        check_new_workspace(self.out)
+        if self.retrack and dataset.read_pictures is None:
+            raise UserError(f"--retrack: {dataset.name} has no pictures that could be tracked; leave --retrack out")
+        if self.retrack and self.face_model is not None:
+            raise UserError("--retrack and --face-model: the pictures are tracked with mien's own model; give only one")
+        if not self.dry_run:
+            check_new_workspace(self.out)
         run = run_name(self._run(dataset))
         if dataset.holds == "avatar":
-            check_new_run(Workspace(self.out).run_dir(run))
+            if not self.dry_run:
+                check_new_run(Workspace(self.out).run_dir(run))
         elif self.name is not None:
             raise UserError(f"--run {self.name}: {dataset.name} holds sequences, which are no run; leave --run out")
 
     def run(self) -> None:
         """Read the files and write what they hold."""
-        from mien.commands.stages.importing import run_import_stage
+        from mien.commands.stages.findings import findings_lines
         from mien.progress import say
 
         dataset, told = self._found()
-        if told is not None and dataset.holds == "sequences":
+        if told is not None and (self.dry_run or dataset.holds == "sequences"):
             say(f"{self.path}: {told}")  # before they are read, which takes long
-        run_import_stage(dataset, self.path, Workspace(self.out), self._run(dataset), self.face_model)
+        if dataset.survey is not None:
+            findings = dataset.survey(self.path)
+            for line in findings_lines(findings):
+                say(line)
+            if not self.dry_run:
+                for clip in findings.clips:  # now, because reading takes long
+                    check_new_sequence(Workspace(self.out).sequence_dir(clip.name))
+        if not self.dry_run:
+            from mien.commands.stages.importing import run_import_stage
+
+            workspace, run = Workspace(self.out), self._run(dataset)
+            run_import_stage(dataset, self.path, workspace, run, self.face_model, self.retrack)
 
     def _found(self) -> tuple[Dataset, str | None]:
         """The dataset, and what it found; None if the user names the dataset."""

@@ -1,14 +1,17 @@
 """Arrays in the files of strangers: nothing in them is run, their size is limited, and their shapes are checked."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from mien.bounded import read_bytes
+from mien.datasets.content import REMEDY
 from mien.errors import UserError
-from mien.face.npz import read_npz
+from mien.face.npz import parse_npy, read_npz
+from mien.limits import MAX_NUMBER
 
-REMEDY = "copy the files of the dataset again"
+_MAX_NPY_BYTES = 16 << 20
 
 
 def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -> dict[str, np.ndarray]:
@@ -41,3 +44,33 @@ def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -
                 f"{path}: {name!r} has the shape {list(shape)}, which is not [{', '.join(letters)}]; {REMEDY}"
             )
     return {name: each.astype(np.float32) if each.dtype.kind == "f" else each for name, each in arrays.items()}
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Return the array of an .npy file of plain numbers.
+
+    Raises:
+        UserError: the file is damaged or too large, or holds anything but plain numbers.
+    """
+    try:
+        return parse_npy(read_bytes(path, _MAX_NPY_BYTES))
+    except Exception as error:  # a damaged header may fail in any way
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: cannot be read as .npy ({reason}); {REMEDY}") from None
+
+
+def read_some_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Return those of the named arrays of an .npz that it has, as float64, after a check of their numbers.
+
+    Raises:
+        UserError: the file is missing, damaged or too large, or holds NaN or large numbers.
+    """
+    try:
+        arrays = read_npz(path, names)[1]
+    except Exception as error:  # a damaged archive may fail in any way
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: cannot be read as .npz ({reason}); {REMEDY}") from None
+    for name, array in arrays.items():
+        if array.size and not np.abs(array.astype(np.float64)).max() <= MAX_NUMBER:
+            raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {REMEDY}")
+    return {name: array.astype(np.float64) for name, array in arrays.items()}

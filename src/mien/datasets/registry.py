@@ -7,10 +7,22 @@ from pathlib import Path
 
 from mien.datasets.dataset import Dataset
 from mien.datasets.gaussian_avatars import GAUSSIAN_AVATARS
+from mien.datasets.imavatar import IMAVATAR
+from mien.datasets.insta import INSTA
+from mien.datasets.live_link_face_take import LIVE_LINK_FACE
+from mien.datasets.nerf_blendshape import NERF_BLENDSHAPE
+from mien.datasets.nerface import NERFACE
+from mien.datasets.nersemble import NERSEMBLE
+from mien.datasets.nersemble_benchmark import NERSEMBLE_BENCHMARK
+from mien.datasets.vhap import VHAP
 from mien.errors import UserError
 from mien.plugins import plugin, warn, with_plugins
 
-_OWN = (GAUSSIAN_AVATARS,)
+_OWN = (
+    GAUSSIAN_AVATARS, VHAP, NERSEMBLE, NERSEMBLE_BENCHMARK, INSTA, IMAVATAR, NERFACE, NERF_BLENDSHAPE, LIVE_LINK_FACE,
+)  # fmt: skip
+_MAX_NAMED, _MAX_FOLDERS = 5, 1000
+"""Most people that a message names, and most folders that are searched for people."""
 _GROUP = "mien.datasets"
 """Group of entry points of other packages."""
 
@@ -45,11 +57,26 @@ def recognised(path: Path) -> tuple[Dataset, str]:
     """
     found = [(each, told) for each in datasets() if (told := _told(each, path)) is not None]
     if not found:
+        people = _people(path)
+        if people:
+            told = (
+                f"holds {len(people)} people ({', '.join(people[:_MAX_NAMED])}{', ...' * (len(people) > _MAX_NAMED)})"
+            )
+            raise UserError(f"{path}: {told}; import each into a workspace of its own, such as {path / people[0]}")
         raise UserError(f"{path}: is no dataset that mien knows; give one of {known_datasets()}")
     if len(found) > 1:
         names = " and ".join(each.name for each, _ in found)
         raise UserError(f"{path}: is recognised as {names}; choose one with --dataset NAME")
     return found[0]
+
+
+def _people(path: Path) -> list[str]:
+    """The names of folders inside a folder that are each a dataset of one person."""
+    try:
+        inside = sorted(each for each in path.iterdir() if each.is_dir() and not each.name.startswith("."))
+    except OSError:
+        return []
+    return [each.name for each in inside[:_MAX_FOLDERS] if any(_told(one, each) is not None for one in datasets())]
 
 
 def _told(dataset: Dataset, path: Path) -> str | None:

@@ -5,19 +5,24 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from mien.capture import write_capture
-from mien.datasets.arrays import REMEDY
-from mien.datasets.dataset import Dataset, TrackedSequence
+from mien.capture import read_capture, write_capture
+from mien.datasets.content import REMEDY
+from mien.datasets.dataset import Dataset, FilmedSequence, TrackedSequence
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.inside import remove_tree
-from mien.storage import replace_folder
+from mien.storage import replace_folder, write_arrays
 from mien.tracking import make_scoring, write_scoring, write_tracking
-from mien.training import read_sequence
+from mien.training import read_sequence, write_own_split
+
+FOREIGN = "foreign.safetensors"
+"""Arrays of the dataset for which mien has no place."""
 
 
-def write_sequence(folder: Path, sequence: TrackedSequence, dataset: Dataset, source: Path) -> None:
-    """Write a sequence as `mien capture` and `mien track` leave one: capture/, tracking/ and scoring/.
+def write_sequence(folder: Path, sequence: TrackedSequence | FilmedSequence, dataset: Dataset, source: Path) -> None:
+    """Write a sequence as `mien capture` leaves one, and if it is tracked, as `mien track` leaves one.
+
+    Beside them are dataset.json, with the split of the authors, and foreign.safetensors, if there is anything for it.
 
     The folder appears as a whole, after its files were read back.
 
@@ -36,7 +41,10 @@ def write_sequence(folder: Path, sequence: TrackedSequence, dataset: Dataset, so
     try:
         _write_into(partial, sequence, dataset, source)
         try:
-            read_sequence(partial)
+            if isinstance(sequence, TrackedSequence):
+                read_sequence(partial)
+            else:
+                read_capture(partial / "capture")
         except UserError as error:
             fault = str(error).partition(": ")[2].split("; ")[0]  # without the path of a file that nobody will find
             raise UserError(f"{source} ({folder.name}): {fault}; {REMEDY}") from None
@@ -45,11 +53,21 @@ def write_sequence(folder: Path, sequence: TrackedSequence, dataset: Dataset, so
         remove_tree(aside)
 
 
-def _write_into(folder: Path, sequence: TrackedSequence, dataset: Dataset, source: Path) -> None:
-    capture, tracking, face_model = sequence.capture, sequence.tracking, sequence.face_model
-    check_face_params(face_model, tracking.face, f"{source} ({capture.name})", REMEDY)
-    capture_hash = write_capture(folder / "capture", capture)
+def _write_into(folder: Path, sequence: TrackedSequence | FilmedSequence, dataset: Dataset, source: Path) -> None:
+    capture = sequence.capture
     imported = {"dataset": dataset.name, "from": str(source.absolute())}
+    if isinstance(sequence, TrackedSequence):
+        check_face_params(sequence.face_model, sequence.tracking.face, f"{source} ({capture.name})", REMEDY)
+    capture_hash = write_capture(folder / "capture", capture)
+    write_own_split(folder, sequence.own_split, {"imported": imported})
+    if sequence.foreign:
+        write_arrays(folder / FOREIGN, dict(sequence.foreign))
+    if isinstance(sequence, TrackedSequence):
+        _write_tracking_into(folder, sequence, imported, capture_hash)
+
+
+def _write_tracking_into(folder: Path, sequence: TrackedSequence, imported: dict[str, str], capture_hash: str) -> None:
+    capture, tracking, face_model = sequence.capture, sequence.tracking, sequence.face_model
     content = json.dumps([imported["dataset"], capture_hash, face_model.name, face_model.content_hash])
     fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]
     settings = {**tracking.settings, "imported": imported, "fingerprint": fingerprint}

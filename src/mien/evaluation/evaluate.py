@@ -58,7 +58,7 @@ def _evaluate(
     run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings, driver_dirs: Items[Path]
 ) -> dict[str, Any]:
     summary = read_training_summary(run_dir)
-    experiments = load_experiments(run_dir, sequence_dirs, settings.edges)
+    experiments = load_experiments(run_dir, sequence_dirs, settings.edges, settings.dataset)
     if not experiments and not driver_dirs:
         raise UserError(
             f"{run_dir}: no frame was held out, so nothing can be scored; train with `--split blocks` or "
@@ -109,7 +109,7 @@ def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: Evaluation
         known = read_metrics(run_dir).get("fingerprints")
     except UserError:
         return False
-    experiments = load_experiments(run_dir, sequence_dirs, settings.edges)
+    experiments = load_experiments(run_dir, sequence_dirs, settings.edges, settings.dataset)
     expected = {name: _fingerprint(run_dir, name, each, settings) for name, each in experiments.items()}
     return bool(expected) and known == expected and (run_dir / "report.html").is_file()
 
@@ -129,6 +129,8 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
         file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,
         settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone, settings.edges,
     ]  # fmt: skip
+    if settings.dataset is not None:
+        content.append(settings.dataset)
     if settings.fit_faces:
         content.append(settings.fit_steps)
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

@@ -46,6 +46,8 @@ class Experiment:
     split: str
     """Name of the split: `blocks`, `tail`, `sequences`, `cameras`."""
     edges: Edges = "cleaned"
+    whole_mattes: bool = False
+    """Whether the scored pixels are those of the capture's mattes, without mien's cut at the neck."""
     digests: tuple[dict[str, str], ...] = ()
     """The hashes of the `pictures` and the `mask` of each sequence. Empty if nothing was read from disk."""
 
@@ -84,12 +86,13 @@ def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:
 
 
 def target_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
-    """The target of a rendering, at 8 bits: the person inside the frozen scoring mask, over white."""
+    """The target of a rendering, at 8 bits: the person inside the frozen scoring mask or the matte, over white."""
     capture = experiment.sequences[frame.sequence].capture
     picture = np.asarray(capture.images[frame[1:]])
     if experiment.edges == "cleaned":
         picture = foreground_colors(picture, np.asarray(capture.mattes[frame[1:]]))
-    mask = np.asarray(experiment.scorings[frame.sequence].masks[frame[1:]])
+    masks = capture.mattes if experiment.whole_mattes else experiment.scorings[frame.sequence].masks
+    mask = np.asarray(masks[frame[1:]])
     return torch.from_numpy(composite(picture, mask, np.full(3, 255, np.uint8))).float() / 255
 
 

@@ -15,10 +15,12 @@ from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_run_config
-from mien.training.footage import Frame, held_out, sequence_of, training_frames
+from mien.training.footage import OWN_SPLIT, Frame, held_out_of, imported_from, sequence_of, training_frames
 
 
-def load_experiments(run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "cleaned") -> dict[str, Experiment]:
+def load_experiments(
+    run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "cleaned", dataset: str | None = None
+) -> dict[str, Experiment]:
     """The experiments of a run, by protocol. The result is empty if nothing was held out.
 
     - `self_reenactment` (`self_reenactment_tail` for that split): held-out timesteps of the training sequences.
@@ -26,9 +28,11 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "
     - `novel_view`: held-out cameras, at timesteps that were trained with other cameras.
 
     The first two include all cameras, also held-out ones. `edges` says what the truth is at soft edges.
+    With the name of a `dataset`, its own mattes are scored, without mien's cut at the neck.
 
     Raises:
-        UserError: the run is not finished, or the sequences are not those that it was trained on.
+        UserError: the run is not finished, the sequences are not those that it was trained on, or they are not of the
+            dataset, or the run was not trained with its split.
     """
     config = read_run_config(run_dir)
     settings = decode(TrainSettings, config["settings"], str(run_dir / "config.json"), "train it again")
@@ -36,6 +40,8 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "
     if [folder.name for folder in sequence_dirs] != wanted:
         given = ", ".join(folder.name for folder in sequence_dirs)
         raise UserError(f"{run_dir}: was trained on {', '.join(wanted)}, not on {given}; give it those sequences")
+    if dataset is not None:
+        _check_dataset(run_dir, sequence_dirs, settings, dataset)
     digests = tuple(_digests(folder) for folder in sequence_dirs)
     scorings = tuple(
         read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
@@ -59,12 +65,26 @@ def load_experiments(run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "
         held_out_frames=(),
         split=settings.split,
         edges=edges,
-        digests=digests,
+        whole_mattes=dataset is not None,
+        digests=digests if dataset is None else tuple({**each, "mask": "matte"} for each in digests),
     )
     return {
         protocol: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
         for protocol, (split, frames) in held_out_by_protocol(sequences, settings).items()
     }
+
+
+def _check_dataset(run_dir: Path, sequence_dirs: Items[Path], settings: TrainSettings, dataset: str) -> None:
+    for folder in sequence_dirs:
+        found = imported_from(folder)
+        if found != dataset:
+            told = "was not imported" if found is None else f"was imported from {found}"
+            raise UserError(f"{folder}: {told}; leave --protocol {dataset} out, or give the dataset's own name")
+    if settings.split != OWN_SPLIT:
+        raise UserError(
+            f"{run_dir}: was trained with --split {settings.split}, and --protocol {dataset} needs the split of the "
+            f"dataset; train another run with --split {OWN_SPLIT}"
+        )
 
 
 def _digests(folder: Path) -> dict[str, str]:
@@ -79,7 +99,7 @@ def held_out_by_protocol(
     unseen_sequences: list[Frame] = []
     unseen_cameras: list[Frame] = []
     for index, sequence in enumerate(sequences):
-        left_out = held_out(sequence.capture.timesteps, settings.split).numpy()
+        left_out = held_out_of(sequence, settings.split).numpy()
         trained_cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
         sharp = sequence.usable() & sequence.sharp()
         seen = np.any(sharp & np.array(trained_cameras), axis=1).tolist()

@@ -38,6 +38,7 @@ _MASKS = {
     "plane": "frozen scoring mask: matte cut at the neck, over white",
     "line": "frozen scoring mask: matte above the neck line of each picture, over white",
 }
+_MATTES = "the dataset's mattes, whole, over white"
 _CROP = "frozen head box of each frame"
 _PART_CROPS = f"boxes of the tracked mesh; enlarged to {PART_SIDE} pixels for ST-LPIPS if a side is shorter"
 
@@ -54,6 +55,8 @@ class EvaluationSettings(ScoreSettings):
     """Whether to write every scored picture and its truth as png as well."""
     edges: Edges = "cleaned"
     """Colours of the truth at soft edges of the matte: cleaned of the background, or as filmed."""
+    dataset: str | None = None
+    """Name of the dataset whose protocol counts: its split, and its own mattes. None for mien's scoring masks."""
     fit_faces: bool = False
     """Whether to score the avatar a third time, with expression and pose fitted to each held-out frame's picture."""
     fit_steps: Annotated[int, Range(1, 10_000)] = 20
@@ -170,6 +173,13 @@ def _training_psnr(experiment: Experiment, threads: int) -> dict[Frame, tuple[fl
     return dict(stream_in_threads(score, drawn, threads))
 
 
+def _mask_words(experiment: Experiment, frames: Items[Frame]) -> str:
+    """What the mask of some frames is."""
+    if experiment.whole_mattes:
+        return _MATTES
+    return "; ".join(sorted({_MASKS[experiment.scorings[frame.sequence].cut] for frame in frames}))
+
+
 def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings) -> dict[str, Any]:
     """The protocol's entry of metrics.json: means over frames, how they were computed, and every frame's figures."""
     scores = evaluation.scores
@@ -179,7 +189,8 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
         "perceptual_frames": sum("perceptual" in row for row in own_rows),
         "split": experiment.split,
-        "mask": "; ".join(sorted({_MASKS[experiment.scorings[frame.sequence].cut] for frame in evaluation.frames})),
+        "mask": _mask_words(experiment, evaluation.frames),
+        **({} if settings.dataset is None else {"dataset": settings.dataset}),
         "edges": experiment.edges,
         "crop": _CROP,
         "part_crops": _PART_CROPS,

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.export.flame_params import face_of_flame_params
     from mien.export.gaussian_avatars_folder import (
         GaussianAvatarsFolder,
         read_gaussian_avatars_folder,
@@ -32,6 +33,7 @@ __all__ = [
     "WebcamFiles",
     "WrittenGlb",
     "WrittenPage",
+    "face_of_flame_params",
     "find_webcam_files",
     "in_world",
     "pack",

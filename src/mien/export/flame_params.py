@@ -7,6 +7,7 @@ head rotation = R0 R1, head translation = R0 (J1 - R1 J1 - J0) + J0 + o + t, nec
 """
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +80,23 @@ def read_flame_params(path: Path, face_model: FaceModel) -> FaceParams:
         UserError: it is missing, a link, damaged or incomplete, holds NaN or large numbers, or belongs to another
             model.
     """
-    arrays = _read_arrays(path)
+    return face_of_flame_params(path, _read_arrays(path), face_model)
+
+
+@torch.no_grad()
+def face_of_flame_params(path: Path, arrays: Mapping[str, np.ndarray], face_model: FaceModel) -> FaceParams:
+    """Return parameters of a face model from arrays with the names and shapes of flame_param.npz.
+
+    Args:
+        path: The file or folder that they come from, for messages.
+        arrays: `shape` [n], `expr` [t, e], `rotation`, `translation`, `neck_pose` and `jaw_pose` [t, 3], `eyes_pose`
+            [t, 6] (left, then right), and perhaps `static_offset` [1, v, 3].
+        face_model: The face model that they belong to.
+
+    Raises:
+        UserError: an array is missing, of another shape, holds NaN or large numbers, or belongs to another model.
+    """
+    arrays = _checked(path, arrays)
     v = len(face_model.template)
     face = FaceParams(
         identity=_padded(path, "shape", arrays["shape"], len(face_model.identity_basis)),
@@ -96,10 +113,10 @@ def read_flame_params(path: Path, face_model: FaceModel) -> FaceParams:
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The wanted arrays as float32, with their leading axes checked."""
+    """The wanted arrays of the file."""
     try:
         open_to_read(path).close()
-        arrays = read_npz(path, _WANTED)[1]
+        return read_npz(path, _WANTED)[1]
     except UserError:
         raise
     except FileNotFoundError:
@@ -110,6 +127,10 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:  # a damaged archive may fail in any way
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: cannot be read as .npz ({reason}); {_REMEDY}") from None
+
+
+def _checked(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays as float32, with their numbers and axes checked."""
     for name in ("shape", *_PER_FRAME):
         if name not in arrays:
             raise UserError(f"{path}: has no {name!r}; {_REMEDY}")

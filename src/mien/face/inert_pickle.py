@@ -71,6 +71,29 @@ def read_inert_pickle(path: Path, wanted: Collection[str] | None = None) -> dict
     return values
 
 
+def parse_inert_pickle(data: bytes) -> dict[str, Any]:
+    """Return the arrays, numbers and texts of a pickled dictionary of dictionaries, by names such as "outer.inner".
+
+    Raises:
+        ValueError: it is no pickle, damaged or too large, or holds no dictionary.
+    """
+    try:
+        content = _Machine(data).run()
+        named = content.entries if isinstance(content, _StandIn) else content
+        if not isinstance(named, dict):
+            raise ValueError(f"it holds a {type(content).__name__}, not named arrays")
+        flat: dict[str, Any] = {}
+        for key, value in named.items():
+            inner = value.entries if isinstance(value, _StandIn) else value
+            if isinstance(inner, dict):
+                flat |= {f"{key}.{name}": each for name, each in inner.items()}
+            else:
+                flat[str(key)] = value
+        return _arrays(flat, None)
+    except Exception as error:  # a damaged pickle may fail in any way
+        raise ValueError(" ".join(str(error).split())[:200]) from None
+
+
 class _Machine:
     """Executes the opcodes of a pickle."""
 

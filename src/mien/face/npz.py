@@ -3,6 +3,7 @@
 `numpy.load` trusts the headers, and a member of 6 MB may unpack to gigabytes.
 """
 
+import io
 import math
 import zipfile
 from collections.abc import Collection
@@ -49,22 +50,33 @@ def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int) -> np.ndarray:
     with open_member(archive, member) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in _HEADERS:
-            raise ValueError(f"is of version {version} of numpy's format")
-        shape, by_column, kind = _HEADERS[version](file)
-        if kind.kind not in "biuf":
-            raise ValueError(f"holds {kind}, not plain numbers")
-        size = math.prod(shape) * kind.itemsize
-        if not all(length >= 0 for length in shape):
-            raise ValueError(f"has the shape {shape}")
-        if size > limit:
-            raise ValueError(
-                f"has {size:,} bytes; the arrays of a face model have at most {MAX_MODEL_BYTES:,} together"
-            )
-        data = file.read(size)
-        # Reading to the end makes zipfile compare the checksum.
-        if len(data) != size or file.read(1):
-            raise ValueError("is not as long as its header states")
+        return _read_array(file, limit)
+
+
+def parse_npy(data: bytes) -> np.ndarray:
+    """Return the array in the bytes of an .npy file.
+
+    Raises:
+        ValueError: it is no array of plain numbers, or damaged.
+    """
+    return _read_array(io.BytesIO(data), len(data))
+
+
+def _read_array(file: io.BufferedIOBase, limit: int) -> np.ndarray:
+    version = np.lib.format.read_magic(file)
+    if version not in _HEADERS:
+        raise ValueError(f"is of version {version} of numpy's format")
+    shape, by_column, kind = _HEADERS[version](file)
+    if kind.kind not in "biuf":
+        raise ValueError(f"holds {kind}, not plain numbers")
+    size = math.prod(shape) * kind.itemsize
+    if not all(length >= 0 for length in shape):
+        raise ValueError(f"has the shape {shape}")
+    if size > limit:
+        raise ValueError(f"has {size:,} bytes; the arrays of a face model have at most {MAX_MODEL_BYTES:,} together")
+    data = file.read(size)
+    # Reading to the end makes zipfile compare the checksum.
+    if len(data) != size or file.read(1):
+        raise ValueError("is not as long as its header states")
     values = np.frombuffer(data, kind).reshape(shape, order="F" if by_column else "C")
     return values.astype(kind.newbyteorder("="))

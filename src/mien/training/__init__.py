@@ -7,15 +7,21 @@ from mien.lazy import lazy_names
 if TYPE_CHECKING:
     from mien.training.footage import (
         NAMED_SPLIT,
+        OWN_SPLIT,
         NamedSplit,
+        OwnSplit,
         Sequence,
         confidence_picture,
         filmed_words,
         held_out,
+        ranges_of,
         read_coverage,
+        read_own_split,
         read_sequence,
         split_by_name,
         with_named_split,
+        with_own_split,
+        write_own_split,
     )
     from mien.training.run import (
         check_data,
@@ -46,8 +52,10 @@ else:
 __all__ = [
     "MAIN_SETTINGS",
     "NAMED_SPLIT",
+    "OWN_SPLIT",
     "PRESETS",
     "NamedSplit",
+    "OwnSplit",
     "Preset",
     "Sequence",
     "Split",
@@ -62,9 +70,11 @@ __all__ = [
     "filmed_words",
     "held_out",
     "outdated_sequences",
+    "ranges_of",
     "read_coverage",
     "read_curves",
     "read_face_track",
+    "read_own_split",
     "read_run_config",
     "read_sequence",
     "read_training_summary",
@@ -72,5 +82,7 @@ __all__ = [
     "split_by_name",
     "train",
     "with_named_split",
+    "with_own_split",
     "write_imported_run",
+    "write_own_split",
 ]

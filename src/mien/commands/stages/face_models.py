@@ -7,6 +7,7 @@ from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
 from mien.face.flame import flame_face_model, read_flame
 from mien.face.loading import cache_folder, is_built_in
+from mien.face.teeth import TOOTH_VERTICES, VERTICES, with_teeth
 from mien.locks import hold
 from mien.progress import say
 from mien.storage import file_digest
@@ -35,11 +36,11 @@ def face_model_of(choice: str) -> FaceModel:
     return load_face_model(choice)
 
 
-def add_face_model_file(path: Path, name: str | None = None, shareable: bool = False) -> FaceModel:
+def add_face_model_file(path: Path, name: str | None = None, shareable: bool = False, teeth: bool = False) -> FaceModel:
     """Add a file in FLAME's schema to this user's face models, unless it is already there.
 
     The default name is the file's. Landmarks are placed by running the landmark detector on pictures of the model (some
-    minutes, once).
+    minutes, once). With `teeth`, FLAME gets those of GaussianAvatars.
 
     Raises:
         UserError: the file is missing, damaged or in another schema, or the name is taken.
@@ -50,10 +51,10 @@ def add_face_model_file(path: Path, name: str | None = None, shareable: bool = F
     if not path.is_file():
         raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
     with hold(cache_folder() / "face_models" / "added" / name):
-        return _add(path, name, shareable)
+        return _add(path, name, shareable, teeth)
 
 
-def _add(path: Path, name: str, shareable: bool) -> FaceModel:
+def _add(path: Path, name: str, shareable: bool, teeth: bool) -> FaceModel:
     digest, known = file_digest(path), read_added_source(name)
     other = f"add this one under another name: mien face-models --add {path} --name NAME"
     if is_built_in(name):
@@ -61,9 +62,13 @@ def _add(path: Path, name: str, shareable: bool) -> FaceModel:
     if known is not None and known["sha256"] != digest:
         raise UserError(f"{path}: another file has the name {name!r}, {known['path']}; {other}")
     if known is None:
-        model = _calibrated(flame_face_model(read_flame(path), name, shareable))
+        flame = read_flame(path)
+        flame = with_teeth(flame, str(path)) if teeth else flame
+        model = _calibrated(flame_face_model(flame, name, shareable))
     else:
         model = load_face_model(name)
+        if teeth and len(model.template) != VERTICES + TOOTH_VERTICES:
+            raise UserError(f"{path}: {name!r} was added without teeth; {other}")
         if model.shareable or not shareable:
             return model
         model = replace(model, shareable=True)

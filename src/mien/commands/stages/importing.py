@@ -1,6 +1,7 @@
 """From the files of other programs to runs and sequences of a workspace."""
 
 import math
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -9,12 +10,15 @@ import torch
 from mien.avatar import Avatar
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.commands.stages.face_models import face_model_of
+from mien.commands.stages.import_footage import write_footage
 from mien.commands.stages.names import check_new_run, check_new_sequence
-from mien.datasets import Dataset, TrackedSequence, TrainedAvatar, write_sequence
+from mien.commands.stages.tracking import run_tracking_stage
+from mien.datasets import Dataset, Footage, ReadSequence, TrackedSequence, TrainedAvatar, write_sequence
 from mien.inside import remove_tree
 from mien.locks import check_free, hold
 from mien.progress import say
 from mien.terminal import counted
+from mien.tracking import TrackingSettings
 from mien.training import write_imported_run
 from mien.training.run import BUSY_REMEDY
 from mien.workspace import Workspace
@@ -26,7 +30,9 @@ _MARGIN = 1.15
 """Size of the picture relative to the largest extent of the head's mesh."""
 
 
-def run_import_stage(dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None) -> None:
+def run_import_stage(
+    dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None, retrack: bool = False
+) -> None:
     """Read a dataset, and write its avatar as a run, or its sequences.
 
     Args:
@@ -35,6 +41,7 @@ def run_import_stage(dataset: Dataset, path: Path, workspace: Workspace, run: st
         workspace: The workspace.
         run: Name of the run that an avatar becomes.
         face_model: Name or file of the face model that the files belong to, if the user gives one.
+        retrack: Whether to leave out the tracking of the authors, and to track the pictures with mien.
 
     Raises:
         UserError: the files or the face model cannot be read, or the run or a sequence is there already or cannot be
@@ -44,11 +51,19 @@ def run_import_stage(dataset: Dataset, path: Path, workspace: Workspace, run: st
     run_dir = workspace.run_dir(run)
     if dataset.holds == "avatar":
         check_free(run_dir, BUSY_REMEDY)
-    content = dataset.read(path, None if face_model is None else face_model_of(face_model))
+    if retrack:
+        assert dataset.read_pictures is not None  # the command checks it
+        content: Iterable[ReadSequence] | TrainedAvatar = dataset.read_pictures(path)
+    else:
+        content = dataset.read(path, None if face_model is None else face_model_of(face_model))
     if isinstance(content, TrainedAvatar):
         _write_run(content, run_dir, path)
     else:
-        _write_sequences(content, workspace, dataset, path)
+        untracked = _write_sequences(content, workspace, dataset, path)
+        if retrack:
+            run_tracking_stage(workspace, "anny", TrackingSettings())
+        elif untracked:
+            say(f"{', '.join(untracked)}: without a tracking; run `mien track {shlex.quote(str(workspace.root))}`")
 
 
 def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
@@ -65,16 +80,29 @@ def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
 
 
 def _write_sequences(
-    sequences: Iterable[TrackedSequence], workspace: Workspace, dataset: Dataset, source: Path
-) -> None:
+    sequences: Iterable[ReadSequence], workspace: Workspace, dataset: Dataset, source: Path
+) -> list[str]:
+    """Write the sequences, and return the names of those without a tracking."""
+    untracked = []
     for sequence in sequences:
+        if isinstance(sequence, Footage):
+            folder = workspace.sequence_dir(sequence.name)
+            with hold(folder):
+                check_new_sequence(folder)
+                write_footage(folder, sequence, dataset, source)
+            untracked.append(sequence.name)
+            continue
         capture = sequence.capture
         folder = workspace.sequence_dir(capture.name)
         with hold(folder):
             check_new_sequence(folder)
             write_sequence(folder, sequence, dataset, source)
         cameras = counted(len(capture.camera_ids), "camera")
-        say(f"{folder}: {counted(capture.timesteps, 'timestep')}, {cameras}, tracked on {sequence.face_model.name}")
+        tracked = f", tracked on {sequence.face_model.name}" if isinstance(sequence, TrackedSequence) else ""
+        say(f"{folder}: {counted(capture.timesteps, 'timestep')}, {cameras}{tracked}")
+        if not tracked:
+            untracked.append(capture.name)
+    return untracked
 
 
 @torch.no_grad()

@@ -8,15 +8,18 @@ from mien.commands.stages.live_view import LiveView
 from mien.face import FaceModel, load_face_model
 from mien.locks import read_beside_writers
 from mien.progress import say
+from mien.terminal import counted
 from mien.training import (
     NamedSplit,
     Sequence,
     TrainSettings,
     check_untouched,
+    read_own_split,
     read_sequence,
     read_training_summary,
     train,
     with_named_split,
+    with_own_split,
 )
 from mien.training.trainer import check_trackings
 from mien.workspace import Workspace
@@ -36,6 +39,25 @@ def fill_in_named_split(workspace: Workspace, settings: TrainSettings, split: Na
         f"subject {split.subject} of GaussianAvatars: held out are the sequence {split.held_out} and camera "
         f"{', '.join(settings.held_out_cameras)}{left_out}"
     )
+    return settings
+
+
+def fill_in_own_split(workspace: Workspace, settings: TrainSettings, names: list[str]) -> TrainSettings:
+    """The settings with the sequences and cameras that the dataset's authors held out, after a message that says so.
+
+    Raises:
+        UserError: a sequence has no split, or the settings hold out something else.
+    """
+    splits = {name: read_own_split(workspace.sequence_dir(name)) for name in names}
+    timesteps = {name: read_capture(workspace.sequence_dir(name) / "capture").timesteps for name in names}
+    settings = with_own_split(settings, splits, timesteps)
+    parts = [counted(len(settings.held_out_sequences), "sequence"), counted(len(settings.held_out_cameras), "camera")]
+    frames = sum(
+        split is not None and name not in settings.held_out_sequences and split.holds_out(timestep)
+        for name, split in splits.items()
+        for timestep in range(timesteps[name])
+    )
+    say(f"the dataset's own split: held out are {', '.join(parts)}, and {counted(frames, 'timestep')} of the others")
     return settings
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         evenly_spread,
         expression_rarity,
         held_out,
+        held_out_of,
         resolved,
         side_random,
         spread_frames,
@@ -47,6 +48,15 @@ if TYPE_CHECKING:
         split_by_name,
         with_named_split,
     )
+    from mien.training.footage.own_split import (
+        OWN_SPLIT,
+        OwnSplit,
+        imported_from,
+        ranges_of,
+        read_own_split,
+        with_own_split,
+        write_own_split,
+    )
     from mien.training.footage.sequence import Sequence, Target, Targets, composite, read_sequence, sequence_of
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
@@ -59,6 +69,8 @@ __all__ = [
     "FrameOrder",
     "NAMED_SPLIT",
     "NamedSplit",
+    "OWN_SPLIT",
+    "OwnSplit",
     "Sequence",
     "Target",
     "Targets",
@@ -77,10 +89,14 @@ __all__ = [
     "filmed_words",
     "foreground_colors",
     "held_out",
+    "held_out_of",
     "hidden_triangles",
+    "imported_from",
     "inside_triangles",
     "measure_coverage",
+    "ranges_of",
     "read_coverage",
+    "read_own_split",
     "read_sequence",
     "resolved",
     "sample_picture",
@@ -92,6 +108,8 @@ __all__ = [
     "training_frames",
     "vertex_colors",
     "with_named_split",
+    "with_own_split",
     "with_shown_angles",
     "write_coverage",
+    "write_own_split",
 ]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mien.errors import UserError
 from mien.training.footage.constants import FOOTAGE
+from mien.training.footage.own_split import OWN_SPLIT, read_own_split
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 
@@ -39,7 +40,7 @@ def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
     - `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
       training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one.
     - `tail`: the last 20 %, which may show things that were never seen.
-    - `none` and `gaussian-avatars`: nothing. The latter holds out a whole sequence and a camera.
+    - `none`, `gaussian-avatars` and `dataset`: nothing. The latter two hold out what is listed elsewhere.
     """
     index = torch.arange(timesteps)
     if split == "blocks":
@@ -48,6 +49,24 @@ def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
     if split == "tail":
         return index >= timesteps - round(_TAIL_SHARE * timesteps)
     return torch.zeros(timesteps, dtype=torch.bool)
+
+
+def held_out_of(sequence: Sequence, split: Split) -> Bool[Tensor, " t"]:
+    """Which timesteps of a sequence are held out: by `held_out`, or by the dataset that the sequence comes from.
+
+    Raises:
+        UserError: the split is the dataset's, and the sequence has none.
+    """
+    timesteps = sequence.capture.timesteps
+    if split != OWN_SPLIT:
+        return held_out(timesteps, split)
+    own = read_own_split(sequence.folder)
+    if own is None:
+        raise UserError(f"--split {OWN_SPLIT}: the sequence {sequence.name} has no split; choose another --split")
+    mask = torch.zeros(timesteps, dtype=torch.bool)
+    for start, stop in own.timesteps:
+        mask[start:stop] = True
+    return mask
 
 
 def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
@@ -73,7 +92,7 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     frames = []
     for index, sequence in enumerate(sequences):
         usable = sequence.usable() & sequence.sharp()
-        usable = usable & ~held_out(sequence.capture.timesteps, settings.split).numpy()[:, None]
+        usable = usable & ~held_out_of(sequence, settings.split).numpy()[:, None]
         cameras = [camera_id not in settings.held_out_cameras for camera_id in sequence.capture.camera_ids]
         if sequence.name not in settings.held_out_sequences:
             frames += [Frame(index, int(t), int(c)) for t, c in np.argwhere(usable & np.array(cameras))]

@@ -1,0 +1,24 @@
+"""What a dataset holds, in lines for people."""
+
+from mien.datasets import Clip, Findings
+from mien.terminal import counted
+
+_MAX_CLIPS = 12
+"""Most sequences that are listed one by one."""
+
+
+def findings_lines(findings: Findings) -> list[str]:
+    """Return the sequences, the face model, the split and what is missing, a line each."""
+    clips = findings.clips
+    lines = [f"  {_clip_line(clip)}" for clip in clips[:_MAX_CLIPS]]
+    if len(clips) > _MAX_CLIPS:
+        lines.append(f"  and {counted(len(clips) - _MAX_CLIPS, 'more sequence')}")
+    lines = [f"  one person, {counted(len(clips), 'sequence')}", *lines]
+    lines.append(f"  face model: {findings.face_model or 'none, or none that can be used'}")
+    lines.append(f"  split: {findings.split or 'none'}")
+    return lines + [f"  missing or not used: {each}" for each in findings.missing]
+
+
+def _clip_line(clip: Clip) -> str:
+    frames = "as many frames as its videos" if clip.frames is None else counted(clip.frames, "frame")
+    return f"{clip.name}: {frames}, {counted(clip.cameras, 'camera')}"

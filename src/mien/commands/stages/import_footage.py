@@ -1,0 +1,65 @@
+"""Sequences of datasets that are videos go through `mien capture`, with the cameras and plates of the dataset."""
+
+import json
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from mien.camera import Camera
+from mien.capture import CaptureSettings, capture_cameras, capture_video
+from mien.datasets import Dataset, Footage
+from mien.inside import inside, remove_tree
+from mien.storage import write_atomically
+from mien.training import write_own_split
+
+
+def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path) -> None:
+    """Capture the videos of a sequence into its folder, and write what else the dataset has beside it.
+
+    Args:
+        folder: The sequence's folder, which is missing.
+        footage: The videos and what is known of them.
+        dataset: The dataset that it comes from.
+        source: The place that it was read from.
+
+    Raises:
+        UserError: a video is damaged, shows no face, or does not fit the cameras. Nothing is left then.
+    """
+    settings = CaptureSettings(stride=footage.stride)
+    try:
+        if footage.cameras is None:
+            capture_video(footage.videos[0], folder / "capture", settings, footage.name)
+        else:
+            _capture_rig(folder / "capture", footage, footage.cameras)
+        imported = {"dataset": dataset.name, "from": str(source.absolute())}
+        write_own_split(folder, footage.own_split, {"imported": imported})
+        for name, content in footage.files.items():
+            write_atomically(inside(folder, name), lambda place, content=content: place.write_bytes(content))
+    except BaseException:
+        remove_tree(folder)
+        raise
+
+
+def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera]) -> None:
+    """Capture calibrated videos. They get the names of their cameras by links, which the capture expects."""
+    with tempfile.TemporaryDirectory(prefix="mien-import-") as name:
+        place = Path(name)
+        videos = []
+        for camera_id, video in zip(cameras, footage.videos, strict=True):
+            videos.append(place / f"{camera_id}{video.suffix}")
+            videos[-1].symlink_to(video.resolve())
+        plates = None
+        if footage.clean_plates is not None:
+            plates = place / "plates"
+            plates.mkdir()
+            for camera_id, plate in footage.clean_plates.items():
+                (plates / f"{camera_id}{plate.suffix}").symlink_to(plate.resolve())
+        calibration = place / "cameras.json"
+        entries = [
+            {"id": camera_id, "K": camera.K.double().tolist(), "viewmat": camera.viewmat.double().tolist(),
+             "width": camera.width, "height": camera.height}
+            for camera_id, camera in cameras.items()
+        ]  # fmt: skip
+        calibration.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": entries}))
+        settings = CaptureSettings(stride=footage.stride, clean_plate=plates)
+        capture_cameras(videos, calibration, out, footage.name, settings)

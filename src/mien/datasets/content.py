@@ -1,0 +1,158 @@
+"""Files of strangers inside a dataset: paths that stay in it, json with checked numbers, pictures of checked sizes.
+
+This file needs no torch, because datasets are surveyed before any work.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mien.bounded import open_ordinary, parse_json, read_bytes
+from mien.errors import UserError
+from mien.inside import is_one_line
+from mien.limits import MAX_NUMBER
+
+REMEDY = "copy the files of the dataset again"
+_MAX_JSON_BYTES = 512 << 20
+"""Largest json file in bytes. The json of 20,000 frames with 100 numbers each has some 50 MB."""
+_MAX_SNIFFED = 1 << 20
+_MAX_SHOWN = 60
+"""Most characters of a name that a message shows."""
+
+
+def sniff(path: Path) -> bytes:
+    """Return the beginning of a file, in which the keys of a json's first frame are; nothing if it cannot be read."""
+    try:
+        with open_ordinary(path) as file:
+            return file.read(_MAX_SNIFFED)
+    except (OSError, ValueError):
+        return b""
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a json object. Its numbers may be NaN, because those that are used are checked by `numbers`.
+
+    Raises:
+        UserError: the file is missing, too large, no json, or no object.
+    """
+    try:
+        content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"), constants=True)
+    except FileNotFoundError:
+        raise UserError(f"{path}: is missing; {REMEDY}") from None
+    except (OSError, ValueError) as error:  # UnicodeDecodeError is a ValueError
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: cannot be read as json ({reason}); {REMEDY}") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: holds no object with names; {REMEDY}")
+    return content
+
+
+def frames_of(path: Path, content: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the list `frames` of a json file.
+
+    Raises:
+        UserError: it is missing or empty, or an entry is no object.
+    """
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{path}: has no list 'frames' with an entry for each frame; {REMEDY}")
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise UserError(f"{path}: frame {number} is no object with names; {REMEDY}")
+    return frames
+
+
+def numbers(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return an entry of a json object as a float64 array.
+
+    Args:
+        path: The file, for messages.
+        content: The object.
+        name: The entry's name.
+        shape: Its shape. None stands for any length above 0, and () for a single number.
+
+    Raises:
+        UserError: it is missing, has another shape, or holds anything but finite numbers of moderate size.
+    """
+    if name not in content:
+        raise UserError(f"{path}: has no {name!r}; {REMEDY}")
+    try:
+        values = np.array(content[name], np.float64) if _is_numeric(content[name]) else None
+    except (ValueError, TypeError, OverflowError):  # such as rows of different lengths
+        values = None
+    if values is None or values.ndim != len(shape) or 0 in values.shape or any(
+        size is not None and size != found for size, found in zip(shape, values.shape, strict=True)
+    ):  # fmt: skip
+        told = "a number" if not shape else f"numbers in the shape {[size or 'n' for size in shape]}"
+        raise UserError(f"{path}: {name!r} is not {told}; {REMEDY}")
+    if not np.abs(values).max() <= MAX_NUMBER:
+        raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {REMEDY}")
+    return values
+
+
+def rotation_part(path: Path, name: str, matrix: np.ndarray) -> np.ndarray:
+    """Return the matrix after a check that its first three columns and rows are orthonormal, up to a reflection.
+
+    Raises:
+        UserError: they are not.
+    """
+    rotation = matrix[:3, :3]
+    if not np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3:
+        raise UserError(f"{path}: the rotation in {name!r} is not orthonormal; {REMEDY}")
+    return matrix
+
+
+def inner(path: Path, root: Path, name: object, endings: Sequence[str] = ("",)) -> Path:
+    """Return the path of a file that another file of the dataset names.
+
+    Args:
+        path: The file that names it, for messages. The name is relative to its folder.
+        root: The folder that the named file must be in.
+        name: The name.
+        endings: Endings that the name may lack; the first one whose file exists is added.
+
+    Raises:
+        UserError: the name is no text, leads out of the folder, also through a link, or the file is missing.
+    """
+    if not is_one_line(name) or not name or Path(str(name)).is_absolute():
+        raise UserError(f"{path}: {str(name)[:_MAX_SHOWN]!r} is not the name of a file in the dataset; {REMEDY}")
+    named = path.parent / str(name)
+    for ending in endings:
+        place = named.with_name(named.name + ending)
+        if is_file_inside(root, place):
+            return place
+    raise UserError(f"{named}{endings[0]}: is missing; {REMEDY}")
+
+
+def is_file_inside(root: Path, place: Path) -> bool:
+    """Whether a file is there.
+
+    Raises:
+        UserError: it is outside of the folder `root`, perhaps through a link.
+    """
+    try:
+        whole = place.resolve()
+        if not whole.is_relative_to(root.resolve()):
+            raise UserError(f"{place}: leads out of the dataset {root}; copy the file to its place instead")
+        return whole.is_file()
+    except (OSError, ValueError, RuntimeError):  # a name that is too long, or a link to itself
+        return False
+
+
+def numbered_files(folder: Path, ending: str) -> dict[int, Path]:
+    """Return the files of a folder whose names are whole numbers, by their numbers, in increasing order."""
+    if not folder.is_dir():
+        return {}
+    found = {}
+    for place in folder.iterdir():
+        if place.suffix.lower() == ending and place.stem.isascii() and place.stem.isdigit() and len(place.stem) < 10:
+            found[int(place.stem)] = place
+    return dict(sorted(found.items()))
+
+
+def _is_numeric(content: Any) -> bool:
+    if isinstance(content, list):
+        return all(map(_is_numeric, content))
+    return isinstance(content, (int, float)) and not isinstance(content, bool)

@@ -1,0 +1,194 @@
+"""IMavatar, PointAvatar, MonoGaussianAvatar and SplattingAvatar: clips with a flame_params.json.
+
+FLAME 2020 with 100 identity and 50 expression coefficients, in a world that is four times as large. Cameras have
+OpenGL-like axes and a first intrinsic that is negative, which together give no mirror image.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, rotation_part, sniff
+from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
+from mien.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mien.face import FaceModel
+
+_FILE = "flame_params.json"
+_VERSION = "FLAME 2020 (generic_model.pkl)"
+_FPS = 25.0
+_SCALE = 4.0
+"""Size of the data set's world in metres' units: a head is four times as large."""
+_OLD_SIZE = 512
+"""Width of the pictures of the old format, whose intrinsics are in pixels."""
+_TEST = ("MVI_1812", "MVI_1802", "test", "wlz0318_test")
+"""Clips that the authors hold out as a whole. The other clips of the same subject are trained on."""
+_TAIL = 350
+"""Number of frames at the end that SplattingAvatar holds out of its one clip."""
+_ENDINGS = (".png", ".jpg", "")
+
+
+@dataclass(frozen=True)
+class _Clip:
+    file: Path
+    content: dict[str, Any]
+    frames: list[dict[str, Any]]
+
+    @property
+    def name(self) -> str:
+        return self.file.parent.name
+
+
+def _files(path: Path) -> list[Path]:
+    """The json files of the clips: in the folder itself, in its clips, or with the subject's name twice."""
+    for pattern in (_FILE, f"*/{_FILE}", f"*/*/{_FILE}"):
+        found = sorted(each for each in path.glob(pattern) if b'"world_mat"' in sniff(each))
+        if found:
+            return found
+    return []
+
+
+def _recognises(path: Path) -> str | None:
+    if not path.is_dir():
+        return None
+    count = len(_files(path))
+    return f"a subject of IMavatar's layout ({_FILE} of {count} clip{'s' * (count != 1)})" if count else None
+
+
+def _clips(path: Path) -> list[_Clip]:
+    clips = [_Clip(file, content, frames_of(file, content)) for file in _files(path)
+             for content in [read_object(file)]]  # fmt: skip
+    if not clips:
+        raise UserError(f"{path}: has no {_FILE} with world_mat; {REMEDY}")
+    names = [clip.name for clip in clips]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UserError(f"{path}: has two clips {twice!r}, of several subjects; import each subject by itself")
+    return clips
+
+
+def _held_out(clips: list[_Clip]) -> dict[str, tuple[tuple[int, int], ...]]:
+    """The ranges of timesteps that are held out, by the clip's name. It is empty if no split is known."""
+    tests = [clip.name for clip in clips if clip.name in _TEST]
+    if tests and len(tests) < len(clips):
+        return {clip.name: ((0, len(clip.frames)),) if clip.name in tests else () for clip in clips}
+    if len(clips) == 1 and len(clips[0].frames) > _TAIL and not tests:
+        count = len(clips[0].frames)
+        return {clips[0].name: ((count - _TAIL, count),)}
+    return {}
+
+
+def _survey(path: Path) -> Findings:
+    clips = _clips(path)
+    held, split = _held_out(clips), None
+    whole = [clip.name for clip in clips if held.get(clip.name) == ((0, len(clip.frames)),)]
+    if whole:
+        split = f"the clip {', '.join(whole)} is held out"
+    elif held:
+        split = f"the last {_TAIL} frames are held out (SplattingAvatar)"
+    missing = () if held else ("a split: no clip has the name of a test clip",)
+    return Findings(tuple(Clip(clip.name, len(clip.frames)) for clip in clips), "FLAME 2020", split, missing)
+
+
+def camera_from_imavatar(intrinsics: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
+    """Intrinsics in pixels from the four of the file, which are relative to the picture's size.
+
+    Rays go through whole pixels there, which are the corners of pixels here, so half a pixel is added to the centre.
+    Files of the old format have pixels of pictures of 512x512; their fourth number is above 1.
+    """
+    from mien.datasets.flame_poses import pinhole
+
+    fx, fy, cx, cy = intrinsics / _OLD_SIZE if intrinsics[3] > 1 else intrinsics
+    width, height = size
+    return pinhole(abs(fx) * width, abs(fy) * height, cx * width + 0.5, cy * height + 0.5)
+
+
+def pose_from_imavatar(world_mats: "np.ndarray") -> "tuple[np.ndarray, np.ndarray]":
+    """Rotations and translations [t, 3, 3], [t, 3] from FLAME's world to that of the camera `flame_poses.FRONT`.
+
+    The cameras' axes are those of that world, because OpenCV's axes are turned twice.
+    """
+    return world_mats[:, :3, :3], world_mats[:, :3, 3] / _SCALE
+
+
+def _pictures(clip: _Clip, root: Path) -> "tuple[np.ndarray, np.ndarray]":
+    import numpy as np
+
+    from mien.datasets.pictures import collect, read_matte, read_picture
+
+    places = [inner(clip.file, root, frame.get("file_path"), _ENDINGS) for frame in clip.frames]
+    first = read_picture(places[0])[0]
+    size = first.shape[1], first.shape[0]
+
+    def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
+        colors, matte = read_picture(places[timestep], size)
+        beside = clip.file.parent / "mask" / places[timestep].name
+        if matte is None or beside.exists():
+            matte = read_matte(inner(clip.file, root, f"mask/{places[timestep].name}"), size)
+        return colors, matte
+
+    return collect(len(places), 1, size, read, f"read {clip.name}")
+
+
+def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
+    import numpy as np
+
+    from mien.datasets.flame_poses import FRONT, camera_of, carried, face_of_flame, needed_flame
+    from mien.datasets.overlay import check_overlay
+    from mien.datasets.sequences import tracked_sequence
+
+    model, clips = needed_flame(path, face_model, _VERSION), _clips(path)
+    held = _held_out(clips)
+    for clip in clips:
+        file = clip.file
+        poses = np.stack([numbers(file, frame, "pose", (15,)) for frame in clip.frames])
+        mats = np.stack(
+            [rotation_part(file, "world_mat", numbers(file, frame, "world_mat", (3, 4))) for frame in clip.frames]
+        )
+        arrays = {
+            "shape": numbers(file, clip.content, "shape_params", (None,)),
+            "expr": np.stack([numbers(file, frame, "expression", (50,)) for frame in clip.frames]),
+            "rotation": poses[:, :3], "neck_pose": poses[:, 3:6], "jaw_pose": poses[:, 6:9], "eyes_pose": poses[:, 9:],
+        }  # fmt: skip
+        face = carried(face_of_flame(file, model, arrays), *pose_from_imavatar(mats))
+        images, mattes = _pictures(clip, path)
+        size = images.shape[3], images.shape[2]
+        K = camera_from_imavatar(numbers(file, clip.content, "intrinsics", (4,)), size)
+        camera = {"0": camera_of(K, FRONT, size)}
+        sequence = tracked_sequence(file, clip.name, images, mattes, camera, model, face, _FPS)
+        yield _with_split(check_overlay(file, sequence, _VERSION), held)
+
+
+def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import FRONT, camera_of
+    from mien.datasets.sequences import filmed_sequence
+
+    clips = _clips(path)
+    held = _held_out(clips)
+    for clip in clips:
+        images, mattes = _pictures(clip, path)
+        size = images.shape[3], images.shape[2]
+        K = camera_from_imavatar(numbers(clip.file, clip.content, "intrinsics", (4,)), size)
+        camera = {"0": camera_of(K, FRONT, size)}
+        yield _with_split(filmed_sequence(clip.file, clip.name, images, mattes, camera, _FPS), held)
+
+
+def _with_split(sequence: Any, held: dict[str, tuple[tuple[int, int], ...]]) -> ReadSequence:
+    from mien.training import OwnSplit
+
+    return replace(sequence, own_split=OwnSplit(held[sequence.capture.name]) if held else None)
+
+
+IMAVATAR = Dataset(
+    "imavatar",
+    "a subject of IMavatar, PointAvatar, MonoGaussianAvatar or SplattingAvatar with flame_params.json",
+    "sequences",
+    _recognises,
+    _read,
+    _survey,
+    _read_pictures,
+)

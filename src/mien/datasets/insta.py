@@ -1,0 +1,216 @@
+"""INSTA's data set and the folders of programs that lay its data out in other ways.
+
+- INSTA: transforms.json, images (RGBA), and in some copies checkpoint; metrical-tracker's output: input, checkpoint.
+- GaussianBlendshapes, RGBAvatar: images (RGBA), checkpoint. Pictures and checkpoints are paired by their numbers.
+- FlashAvatar: imgs, alpha, and metrical-tracker/output/NAME/checkpoint, whose numbers are smaller by one.
+
+Without checkpoints, only pictures and the camera are read: the release lacks jaw, eyes and identity.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mien.datasets.content import (
+    frames_of,
+    inner,
+    is_file_inside,
+    numbered_files,
+    numbers,
+    read_object,
+    rotation_part,
+    sniff,
+)
+from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
+from mien.errors import UserError
+from mien.terminal import counted
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mien.face import FaceModel
+
+_FPS = 25.0
+_TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500}
+"""Number of frames at the end that the authors hold out."""
+_FOLDERS = ("images", "input", "matted")
+"""Folders with pictures, of which the first one is used."""
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The files of one frame."""
+
+    picture: Path
+    matte: Path | None
+    """A separate matte. None if the picture has an opacity."""
+    checkpoint: Path | None
+
+
+@dataclass(frozen=True)
+class _Layout:
+    kind: str
+    name: str
+    root: Path
+    frames: tuple[_Frame, ...]
+    test: int
+    """Number of frames at the end that are held out."""
+    unpaired: int
+    """Number of pictures without a checkpoint, which are left out."""
+
+
+def _recognises(path: Path) -> str | None:
+    if _flash_avatar(path) is not None:
+        return "FlashAvatar's folders with checkpoints of metrical-tracker"
+    head = sniff(path / "transforms.json")
+    if b'"exp_path"' in head and b'"timestep_index"' not in head and b'"flame_param_path"' not in head:
+        return "a subject of INSTA's data set"
+    if any((path / name).is_dir() for name in _FOLDERS) and numbered_files(path / "checkpoint", ".frame"):
+        return "pictures with checkpoints of metrical-tracker"
+    return None
+
+
+def _flash_avatar(path: Path) -> tuple[Path, Path] | None:
+    """The folder with `imgs` and that of the checkpoints, from the root of FlashAvatar or from dataset/NAME."""
+    if (path / "imgs").is_dir() and (path / "alpha").is_dir():
+        return path, path.parent.parent / "metrical-tracker" / "output" / path.name / "checkpoint"
+    subjects = [each for each in sorted(path.glob("dataset/*")) if (each / "imgs").is_dir()]
+    if len(subjects) == 1:
+        return subjects[0], path / "metrical-tracker" / "output" / subjects[0].name / "checkpoint"
+    return None
+
+
+def _layout(path: Path) -> _Layout:
+    flash = _flash_avatar(path)
+    if flash is not None:
+        folder, checkpoints = flash
+        pictures = numbered_files(folder / "imgs", ".jpg") or numbered_files(folder / "imgs", ".png")
+        mattes = numbered_files(folder / "alpha", ".jpg") or numbered_files(folder / "alpha", ".png")
+        saved = {number + 1: place for number, place in numbered_files(checkpoints, ".frame").items()}
+        return _paired("FlashAvatar", folder, checkpoints.parents[3], pictures, mattes, saved)
+    saved = numbered_files(path / "checkpoint", ".frame")
+    if (path / "transforms.json").exists():
+        file = path / "transforms.json"
+        listed = [inner(file, path, frame.get("file_path")) for frame in frames_of(file, read_object(file))]
+        pictures = {
+            int(place.stem) if place.stem.isascii() and place.stem.isdigit() else number: place
+            for number, place in enumerate(listed)
+        }
+        return _paired("INSTA", path, path, pictures, {}, saved)
+    folder = next((path / name for name in _FOLDERS if (path / name).is_dir()), path / _FOLDERS[0])
+    return _paired("INSTA", path, path, numbered_files(folder, ".png"), {}, saved)
+
+
+def _paired(
+    kind: str, folder: Path, root: Path, pictures: dict[int, Path], mattes: dict[int, Path], saved: dict[int, Path]
+) -> _Layout:
+    if not pictures:
+        raise UserError(f"{folder}: has no numbered pictures; copy the files of the dataset again")
+    both = sorted(pictures.keys() & saved.keys()) if saved else sorted(pictures)
+    if not both:
+        raise UserError(f"{folder}: no picture has the number of a checkpoint; copy the files of the dataset again")
+    for place in (*pictures.values(), *mattes.values(), *saved.values()):
+        is_file_inside(root, place)
+    frames = tuple(_Frame(pictures[number], mattes.get(number), saved.get(number)) for number in both)
+    test = _TEST_FRAMES[kind] if len(frames) > _TEST_FRAMES[kind] else 0
+    return _Layout(kind, folder.name, root, frames, test, len(pictures) - len(both))
+
+
+def _survey(path: Path) -> Findings:
+    layout = _layout(path)
+    tracked = layout.frames[0].checkpoint is not None
+    missing = [] if tracked else ["checkpoint (*.frame), so jaw, eyes and identity are not known: use `mien track`"]
+    if tracked:
+        missing += ["the lids of the tracker, which FLAME has no place for"]
+    if layout.unpaired:
+        missing.append(f"checkpoints of {counted(layout.unpaired, 'picture')}, which are left out")
+    split = f"the last {layout.test} frames are held out ({layout.kind})" if layout.test else None
+    if not layout.test:
+        missing.append(f"a split: {counted(len(layout.frames), 'frame')} are too few for {layout.kind}'s")
+    clips = (Clip(layout.name, len(layout.frames)),)
+    return Findings(clips, "FLAME 2020" if tracked else None, split, tuple(missing))
+
+
+def _pictures(layout: _Layout) -> "tuple[np.ndarray, np.ndarray]":
+    import numpy as np
+
+    from mien.datasets.pictures import collect, read_matte, read_picture
+
+    first = read_picture(layout.frames[0].picture)[0]
+    size = first.shape[1], first.shape[0]
+
+    def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
+        frame = layout.frames[timestep]
+        colors, matte = read_picture(frame.picture, size)
+        if frame.matte is not None:
+            matte = read_matte(frame.matte, size)
+        if matte is None:
+            raise UserError(f"{frame.picture}: has no opacity and no matte; copy the folder with the mattes as well")
+        return colors, matte
+
+    return collect(len(layout.frames), 1, size, read, f"read {layout.name}")
+
+
+def _with_split(sequence: ReadSequence, layout: _Layout) -> ReadSequence:
+    from mien.training import OwnSplit
+
+    if not layout.test:
+        return sequence
+    count = len(layout.frames)
+    return replace(sequence, own_split=OwnSplit(((count - layout.test, count),)))
+
+
+def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import FRONT, camera_of, needed_flame
+    from mien.datasets.metrical_tracker import VERSION, read_tracker_frames
+    from mien.datasets.overlay import check_overlay
+    from mien.datasets.sequences import tracked_sequence
+    from mien.progress import say
+
+    layout = _layout(path)
+    checkpoints = [frame.checkpoint for frame in layout.frames if frame.checkpoint is not None]
+    if not checkpoints:
+        yield from _read_pictures(path)
+        return
+    model = needed_flame(path, face_model, VERSION)
+    found = read_tracker_frames(checkpoints, model)
+    if found.blinks:
+        say(f"{layout.name}: lids are closed in {found.blinks:.0%} of the frames, which FLAME's parameters do not show")
+    images, mattes = _pictures(layout)
+    camera = camera_of(found.K, FRONT, (images.shape[3], images.shape[2]))
+    sequence = tracked_sequence(path, layout.name, images, mattes, {"0": camera}, model, found.face, _FPS)
+    yield _with_split(check_overlay(path, sequence, VERSION), layout)
+
+
+def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+    """Pictures with the camera of transforms.json, or else without checkpoints with that of the first one."""
+    import numpy as np
+
+    from mien.datasets.flame_poses import FRONT, camera_of, pinhole
+    from mien.datasets.sequences import filmed_sequence
+
+    layout, file = _layout(path), path / "transforms.json"
+    if not file.exists():
+        raise UserError(f"{file}: is missing, so the camera is not known; import the tracking with --face-model")
+    content = read_object(file)
+    K = pinhole(*(float(numbers(file, content, name, ())) for name in ("fl_x", "fl_y", "cx", "cy")))
+    foreign = [numbers(file, frame, "transform_matrix", (4, 4)) for frame in frames_of(file, content)]
+    for matrix in foreign:
+        rotation_part(file, "transform_matrix", matrix)
+    images, mattes = _pictures(layout)
+    camera = camera_of(K, FRONT, (images.shape[3], images.shape[2]))
+    sequence = filmed_sequence(path, layout.name, images, mattes, {"0": camera}, _FPS)
+    poses = {"camera_to_head": np.stack(foreign).astype(np.float32)}
+    yield _with_split(replace(sequence, foreign=poses), layout)
+
+
+INSTA = Dataset(
+    "insta",
+    "a subject of INSTA, FlashAvatar, GaussianBlendshapes or RGBAvatar: images and checkpoints of metrical-tracker",
+    "sequences",
+    _recognises,
+    _read,
+    _survey,
+    _read_pictures,
+)

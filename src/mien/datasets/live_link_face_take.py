@@ -1,0 +1,73 @@
+"""A take folder of the Live Link Face app: a video, and a csv of ARKit's coefficients that can drive avatars."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mien.bounded import read_bytes
+from mien.datasets.content import REMEDY, is_file_inside, sniff
+from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
+from mien.errors import UserError
+
+if TYPE_CHECKING:
+    from mien.face import FaceModel
+
+_MAX_CSV_BYTES = 256 << 20
+_DEPTH = "depth_data.bin"
+DRIVER = "driving.csv"
+"""Name that the csv gets beside the capture."""
+
+
+def _video(path: Path) -> Path | None:
+    found = sorted(each for each in path.glob("*") if each.suffix.lower() in (".mov", ".mp4"))
+    return found[0] if len(found) == 1 else None
+
+
+def _table(path: Path) -> Path | None:
+    """The csv of coefficients: the calibrated one, or the only one."""
+    tables = [each for each in sorted(path.glob("*.csv")) if b"blendshapecount" in sniff(each)[:4096].lower()]
+    for ending in ("_cal.csv", ""):
+        chosen = [each for each in tables if each.name.lower().endswith(ending)]
+        chosen = chosen if ending else [each for each in chosen if not each.stem.lower().endswith(("_raw", "_neutral"))]
+        if chosen:
+            return chosen[0]
+    return tables[0] if tables else None
+
+
+def _recognises(path: Path) -> str | None:
+    if not path.is_dir() or _video(path) is None:
+        return None
+    is_take = (path / "take.json").exists() or (path / "frame_log.csv").exists() or _table(path) is not None
+    return "a take of Live Link Face" if is_take else None
+
+
+def _survey(path: Path) -> Findings:
+    missing = ["cameras and tracking: use `mien track`"]
+    if _table(path) is None:
+        missing.append("a csv of coefficients" + (
+            f": takes with {_DEPTH} have none, and only their video is used" if (path / _DEPTH).exists() else ""
+        ))  # fmt: skip
+    return Findings((Clip(path.resolve().name, None),), None, None, tuple(missing))
+
+
+def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
+    video, table = _video(path), _table(path)
+    if video is None:
+        raise UserError(f"{path}: has not exactly one video (.mov); copy the whole take")
+    is_file_inside(path, video)
+    files = {}
+    if table is not None:
+        is_file_inside(path, table)
+        try:
+            files[DRIVER] = read_bytes(table, _MAX_CSV_BYTES)
+        except (OSError, ValueError) as error:
+            raise UserError(f"{table}: cannot be read ({' '.join(str(error).split())[:200]}); {REMEDY}") from None
+        from mien.driving.live_link_face import read_live_link_face
+
+        read_live_link_face(table)  # a damaged one is refused before the video is processed
+    yield Footage(path.resolve().name, (video,), files=files)
+
+
+LIVE_LINK_FACE = Dataset(
+    "live-link-face", "a take folder of the Live Link Face app: .mov and .csv", "sequences", _recognises, _read, _survey
+)

@@ -1,0 +1,125 @@
+"""Checkpoints of metrical-tracker: `NUMBER.frame`, a zip with one pickle, whose arrays are read without running it.
+
+FLAME 2020 with the root and the neck at rest; the head's motion is that of the camera. Cameras are in OpenCV's
+convention (`opencv.R`, `opencv.t`, `opencv.K`). The two numbers of the eyelids move vertices by fields that only
+MPI may give away, and mien's FLAME has no place for them, so they are only counted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.bounded import open_archive, open_member, open_ordinary
+from mien.datasets.content import REMEDY, rotation_part
+from mien.datasets.flame_poses import axis_angles, face_of_flame, in_front, matrices_from_rows_6d
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams
+from mien.face.inert_pickle import parse_inert_pickle
+from mien.limits import MAX_NUMBER
+from mien.progress import progress_bar
+
+VERSION = "FLAME 2020 (generic_model.pkl)"
+_MAX_FRAME_BYTES = 8 << 20
+"""Largest unpacked pickle in bytes. They have about 60 kB."""
+_SHAPES = {
+    "flame.exp": (1, 100), "flame.shape": (1, 300), "flame.jaw": (1, 6), "flame.eyes": (1, 12), "opencv.R": (1, 3, 3),
+    "opencv.t": (1, 3), "opencv.K": (1, 3, 3),
+}  # fmt: skip
+_EYELIDS = "flame.eyelids"
+_CLOSED = 0.3
+"""Number of an eyelid above which a blink counts."""
+_MAX_CHANGE = 0.005
+"""Largest relative change of a focal length in a sequence. The tracker keeps it constant."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerFrames:
+    """The checkpoints of one sequence, t of them."""
+
+    face: FaceParams
+    """The faces, seen by a camera with the matrix `flame_poses.FRONT`."""
+    K: Float[np.ndarray, "3 3"]
+    """The median intrinsics, in pixels."""
+    blinks: float
+    """Share of frames in which a lid is closed, which the face does not show."""
+
+
+def read_tracker_frames(paths: Sequence[Path], face_model: FaceModel) -> TrackerFrames:
+    """Read the checkpoints of a sequence, in order.
+
+    Raises:
+        UserError: one is damaged or has impossible numbers, or the focal length changes.
+    """
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in (*_SHAPES, _EYELIDS)}
+    with progress_bar("read checkpoints", len(paths)) as advance:
+        for path in paths:
+            for name, array in _read_frame(path).items():
+                rows[name].append(array)
+            advance()
+    arrays = {name: np.stack(each) for name, each in rows.items() if each}
+    place = paths[0].parent
+    K = np.median(arrays["opencv.K"][:, 0], axis=0)
+    focal = arrays["opencv.K"][:, 0, 0, 0]
+    if not np.abs(focal - K[0, 0]).max() <= _MAX_CHANGE * abs(K[0, 0]):
+        raise UserError(
+            f"{place}: the focal length changes from {focal.min():.1f} to {focal.max():.1f} pixels, and a sequence has "
+            "one camera; track the pictures again (--retrack)"
+        )
+    eyes = matrices_from_rows_6d(arrays["flame.eyes"][:, 0].reshape(-1, 2, 6))
+    face = face_of_flame(
+        place,
+        face_model,
+        {
+            "shape": arrays["flame.shape"][0, 0],
+            "expr": arrays["flame.exp"][:, 0],
+            "jaw_pose": axis_angles(matrices_from_rows_6d(arrays["flame.jaw"][:, 0])),
+            "eyes_pose": axis_angles(eyes).reshape(-1, 6),
+        },
+    )
+    viewmats = np.tile(np.eye(4), (len(paths), 1, 1))
+    viewmats[:, :3, :3], viewmats[:, :3, 3] = arrays["opencv.R"][:, 0], arrays["opencv.t"][:, 0]
+    lids = arrays.get(_EYELIDS)
+    blinks = 0.0 if lids is None or len(lids) < len(paths) else float((lids > _CLOSED).any((1, 2)).mean())
+    return TrackerFrames(in_front(face, viewmats), K, blinks)
+
+
+def _read_frame(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of one checkpoint, checked."""
+    try:
+        with open_ordinary(path) as file, open_archive(file) as archive:
+            members = [member for member in archive.infolist() if member.filename.endswith("data.pkl")]
+            if len(members) != 1:
+                raise ValueError("it has no data.pkl")
+            with open_member(archive, members[0]) as member:
+                data = member.read(_MAX_FRAME_BYTES + 1)
+            if len(data) > _MAX_FRAME_BYTES:
+                raise ValueError(f"its data.pkl has more than {_MAX_FRAME_BYTES:,} bytes")
+        found = parse_inert_pickle(data)
+    except UserError:
+        raise
+    except FileNotFoundError:
+        raise UserError(f"{path}: is missing; {REMEDY}") from None
+    except Exception as error:  # a damaged archive may fail in any way
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: cannot be read as a checkpoint of metrical-tracker ({reason}); {REMEDY}") from None
+    arrays = {}
+    for name, shape in _SHAPES.items():
+        array = found.get(name)
+        if not isinstance(array, np.ndarray) or array.shape != shape:
+            told = list(array.shape) if isinstance(array, np.ndarray) else "nothing"
+            raise UserError(f"{path}: {name!r} should have the shape {list(shape)}, here is {told}; {REMEDY}")
+        if not np.abs(array).max() <= MAX_NUMBER:
+            raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {REMEDY}")
+        arrays[name] = array.astype(np.float64)
+    rotation_part(path, "opencv.R", arrays["opencv.R"][0])
+    for name in ("flame.jaw", "flame.eyes"):
+        rows = arrays[name].reshape(-1, 2, 3)
+        if not np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=-1).min() > 1e-3:
+            raise UserError(f"{path}: {name!r} is no rotation of six numbers; {REMEDY}")
+    lids = found.get(_EYELIDS)
+    if isinstance(lids, np.ndarray) and lids.shape == (1, 2) and np.isfinite(lids).all():
+        arrays[_EYELIDS] = lids.astype(np.float64)
+    return arrays

@@ -1,0 +1,136 @@
+"""NeRSemble's raw recordings: videos of 16 calibrated cameras for each sequence of a person.
+
+They have no mattes and no tracking, so `mien capture` processes the videos. The picture of the empty scene, in the
+sequence BACKGROUND, serves as its clean plate. Every third frame of 73 a second is taken, as in other work (24.3).
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mien.datasets.content import REMEDY, is_file_inside, numbers, read_object, rotation_part
+from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
+from mien.errors import UserError
+from mien.inside import is_plain_name
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mien.camera import Camera
+    from mien.face import FaceModel
+
+SIZE = (2200, 3208)
+"""Width and height that the intrinsics are for."""
+SERIALS = (
+    "222200042", "222200044", "222200046", "222200040", "222200036", "222200048", "220700191", "222200041", "222200037",
+    "222200038", "222200047", "222200043", "222200049", "222200039", "222200045", "221501007",
+)  # fmt: skip
+"""The cameras in the order of the indices 0 to 15 that papers use. Index 8 is the frontal camera."""
+FRONTAL = SERIALS[8]
+_STRIDE = 3
+_EMPTY = "BACKGROUND"
+
+
+def _calibration(path: Path) -> Path:
+    return path / "calibration" / "camera_params.json"
+
+
+def _recognises(path: Path) -> str | None:
+    if not _calibration(path).is_file() or not (path / "sequences").is_dir():
+        return None
+    names = _names(path)
+    if not names or any((path / "sequences" / name / "alpha_maps").is_dir() for name in names):
+        return None
+    return f"a person of NeRSemble ({len(names)} sequence{'s' * (len(names) != 1)})"
+
+
+def _names(path: Path) -> list[str]:
+    folders = sorted(path.glob("sequences/*/images"))
+    return [folder.parent.name for folder in folders if any(folder.glob("cam_*.mp4"))]
+
+
+def read_cameras(file: Path, size: tuple[int, int]) -> "dict[str, Camera]":
+    """Return each camera by its serial number, for pictures of this width and height.
+
+    World-to-camera matrices are OpenCV's, in metres. Intrinsics are one matrix for all cameras, or one for each.
+
+    Raises:
+        UserError: the file is damaged, or a camera is impossible.
+    """
+    import numpy as np
+
+    from mien.datasets.flame_poses import camera_of
+
+    content = read_object(file)
+    poses = content.get("world_2_cam")
+    if not isinstance(poses, dict) or not poses or not all(is_plain_name(serial) for serial in poses):
+        raise UserError(f"{file}: has no 'world_2_cam' with a matrix for each camera; {REMEDY}")
+    shared, cameras = content.get("intrinsics"), {}
+    for serial in poses:
+        viewmat = rotation_part(file, serial, numbers(file, poses, serial, (4, 4)))
+        given = numbers(file, shared, serial, (3, 3)) if isinstance(shared, dict) else numbers(
+            file, content, "intrinsics", (3, 3)
+        )  # fmt: skip
+        cameras[serial] = camera_of(scaled_intrinsics(given, size), np.asarray(viewmat), size)
+    return cameras
+
+
+def scaled_intrinsics(K: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
+    """Intrinsics for pictures of another size than `SIZE`. A principal point beyond the picture shows which they are.
+
+    Raw calibrations are for full pictures. Those of the benchmark are for its own pictures already.
+    """
+    import numpy as np
+
+    width, height = size
+    if K[0, 2] < width and K[1, 2] < height and K[0, 2] > 0.25 * width:
+        return K
+    return np.diag([width / SIZE[0], height / SIZE[1], 1.0]) @ K
+
+
+def _survey(path: Path) -> Findings:
+    names = _names(path)
+    clips = tuple(
+        Clip(name, None, len(list((path / "sequences" / name / "images").glob("cam_*.mp4")))) for name in names
+    )
+    missing = [
+        "mattes and tracking: `mien capture` and `mien track` make them",
+        "colour calibration, which is not used",
+    ]
+    if not any((path / "sequences" / _EMPTY).glob("image_*.jpg")):
+        missing.append(f"pictures of the empty scene (sequences/{_EMPTY}): mattes are less exact without them")
+    return Findings(clips, None, None, tuple(missing))
+
+
+def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+    cameras = read_cameras(_calibration(path), SIZE)
+    for name in _names(path):
+        videos = {}
+        for video in sorted((path / "sequences" / name / "images").glob("cam_*.mp4")):
+            is_file_inside(path, video)
+            videos[video.stem.removeprefix("cam_")] = video
+        unknown = [serial for serial in videos if serial not in cameras]
+        if unknown:
+            raise UserError(f"{_calibration(path)}: has no camera {unknown[0]}, of which {name} has a video; {REMEDY}")
+        yield Footage(
+            name,
+            tuple(videos.values()),
+            {serial: cameras[serial] for serial in videos},
+            clean_plates=_plates(path, videos),
+            stride=_STRIDE,
+        )
+
+
+def _plates(path: Path, videos: dict[str, Path]) -> "dict[str, Path] | None":
+    plates = {serial: path / "sequences" / _EMPTY / f"image_{serial}.jpg" for serial in videos}
+    return plates if all(is_file_inside(path, plate) for plate in plates.values()) else None
+
+
+def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
+    return _read_pictures(path)
+
+
+NERSEMBLE = Dataset(
+    "nersemble", "a person's folder of NeRSemble's raw recordings: calibration and sequences", "sequences", _recognises,
+    _read, _survey, _read_pictures,
+)  # fmt: skip

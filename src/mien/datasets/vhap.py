@@ -1,0 +1,304 @@
+"""VHAP's export and GaussianAvatars' data set: transforms, pictures, masks, and FLAME's parameters for each timestep.
+
+A folder holds one tracked sequence, or a UNION that names the files of several such folders beside it. Each sequence
+has a world of its own, so each becomes a sequence of mien.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, rotation_part, sniff
+from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
+from mien.errors import UserError
+from mien.inside import is_plain_name
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mien.datasets.dataset import TrackedSequence
+    from mien.face import FaceModel
+    from mien.training import OwnSplit
+
+_VERSION = "FLAME 2023 (flame2023.pkl) with GaussianAvatars' teeth"
+_WHOLE, _TRAIN = "transforms.json", "transforms_train.json"
+_PARTS = (_WHOLE, _TRAIN, "transforms_val.json", "transforms_test.json")
+_FPS = 25.0
+"""VHAP stores no frame rate; it resamples videos to this one."""
+_PARAMETERS = ("translation", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "expr")
+_SHARED = ("shape", "static_offset")
+"""Arrays that are the same in all files of a sequence."""
+_SAME_PLACE = 1e-4
+"""Largest difference of a camera's matrix within a sequence."""
+
+
+@dataclass(frozen=True)
+class _Frame:
+    file: Path
+    content: dict[str, Any]
+    trained: bool
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The frames of one sequence."""
+
+    name: str
+    timesteps: tuple[int, ...]
+    cameras: tuple[str, ...]
+    frames: dict[tuple[int, str], _Frame]
+
+
+def _recognises(path: Path) -> str | None:
+    if not path.is_dir():
+        return None
+    known = [name for name in _PARTS if b'"flame_param_path"' in sniff(path / name)]
+    return f"an export of VHAP ({', '.join(known)})" if known else None
+
+
+def _groups(path: Path) -> list[_Group]:
+    """The sequences of the folder, each with the frames of all its json files."""
+    parts = [_WHOLE] if (path / _WHOLE).exists() else [name for name in _PARTS if (path / name).exists()]
+    trained = _keys(path / _TRAIN) if (path / _TRAIN).exists() else set()
+    found: dict[str, dict[tuple[int, str], _Frame]] = {}
+    for part in parts:
+        file = path / part
+        for number, frame in enumerate(frames_of(file, read_object(file))):
+            timestep, camera = _place(file, number, frame)
+            name = _folder_of(path, file, frame)
+            key = (timestep, camera)
+            own = _Frame(file, frame, (str(frame.get("file_path"))) in trained)
+            if found.setdefault(name, {}).setdefault(key, own).content is not frame:
+                raise UserError(f"{file}: holds camera {camera} of timestep {timestep} twice; {REMEDY}")
+    return [_group(path, name, frames) for name, frames in found.items()]
+
+
+def _keys(file: Path) -> set[str]:
+    return {str(frame.get("file_path")) for frame in frames_of(file, read_object(file))}
+
+
+def _place(file: Path, number: int, frame: dict[str, Any]) -> tuple[int, str]:
+    timestep = frame.get("timestep_index")
+    camera = frame.get("camera_id", frame.get("camera_index"))
+    if type(timestep) is not int or timestep < 0 or not (type(camera) is int or is_plain_name(camera)):
+        raise UserError(f"{file}: frame {number} has no 'timestep_index' and 'camera_id'; {REMEDY}")
+    return timestep, camera if isinstance(camera, str) else f"{camera:02d}"
+
+
+def _folder_of(path: Path, file: Path, frame: dict[str, Any]) -> str:
+    """The name of the folder that a frame's files are in."""
+    parts = Path(str(frame.get("flame_param_path"))).parts
+    name = parts[1] if len(parts) > 2 and parts[0] == ".." else path.resolve().name
+    if not is_plain_name(name):
+        raise UserError(f"{file}: {name[:60]!r} cannot be the name of a sequence; {REMEDY}")
+    return name
+
+
+def _group(path: Path, name: str, frames: dict[tuple[int, str], _Frame]) -> _Group:
+    timesteps = tuple(sorted({timestep for timestep, _ in frames}))
+    cameras = tuple(sorted({camera for _, camera in frames}))
+    for timestep in timesteps:
+        for camera in cameras:
+            if (timestep, camera) not in frames:
+                raise UserError(f"{path}: timestep {timestep} of {name} has no picture of camera {camera}; {REMEDY}")
+    return _Group(name, timesteps, cameras, frames)
+
+
+def _own_split(group: _Group) -> "OwnSplit | None":
+    """What transforms_train.json does not list: whole timesteps, and cameras."""
+    from mien.training import OwnSplit, ranges_of
+
+    trained = {key for key, frame in group.frames.items() if frame.trained}
+    by_time = {timestep for timestep, _ in trained}
+    held = [index for index, timestep in enumerate(group.timesteps) if timestep not in by_time]
+    seen = {camera for _, camera in trained} or set(group.cameras)
+    return OwnSplit(ranges_of(held), tuple(camera for camera in group.cameras if camera not in seen))
+
+
+def _survey(path: Path) -> Findings:
+    groups = _groups(path)
+    split = "what transforms_train.json does not list is held out" if (path / _TRAIN).exists() else None
+    missing = [] if split else [f"a split ({_TRAIN})"]
+    if any("fg_mask_path" not in frame.content for group in groups for frame in group.frames.values()):
+        missing.append("fg_masks: mattes are made by mien")
+    clips = tuple(Clip(group.name, len(group.timesteps), len(group.cameras)) for group in groups)
+    return Findings(clips, "FLAME 2023 with teeth", split, tuple(missing))
+
+
+def viewmat_from_vhap(pose: "np.ndarray") -> "np.ndarray":
+    """World-to-camera matrix with OpenCV's axes, from a camera-to-world matrix with OpenGL's."""
+    import numpy as np
+
+    return np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
+def intrinsics_from_vhap(frame: _Frame, from_below: bool) -> "np.ndarray":
+    """Intrinsics in pixels. Exports since November 2024 count the principal point's cy from below."""
+    from mien.datasets.flame_poses import pinhole
+
+    fx, fy, cx, cy = (float(numbers(frame.file, frame.content, name, ())) for name in ("fl_x", "fl_y", "cx", "cy"))
+    height = float(numbers(frame.file, frame.content, "h", ()))
+    return pinhole(fx, fy, cx, height - cy if from_below else cy)
+
+
+def _viewmats(group: _Group) -> "dict[str, np.ndarray]":
+    import numpy as np
+
+    matrices = {}
+    for camera in group.cameras:
+        poses = []
+        for timestep in group.timesteps:
+            frame = group.frames[timestep, camera]
+            pose = numbers(frame.file, frame.content, "transform_matrix", (4, 4))
+            poses.append(rotation_part(frame.file, "transform_matrix", pose))
+        if not np.abs(np.stack(poses) - poses[0]).max() < _SAME_PLACE:
+            raise UserError(f"{group.name}: the camera {camera} moves, and mien's cameras stand still; {REMEDY}")
+        matrices[camera] = viewmat_from_vhap(poses[0])
+    return matrices
+
+
+def _flame_arrays(group: _Group, root: Path) -> "dict[str, np.ndarray]":
+    """The arrays of all timesteps, as in flame_param.npz of GaussianAvatars."""
+    import numpy as np
+
+    from mien.datasets.arrays import read_some_arrays
+
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in (*_PARAMETERS, "dynamic_offset")}
+    shared: dict[str, np.ndarray] = {}
+    for timestep in group.timesteps:
+        frame = group.frames[timestep, group.cameras[0]]
+        file = inner(frame.file, root, frame.content.get("flame_param_path"))
+        arrays = read_some_arrays(file, (*rows, *_SHARED))
+        for name in _PARAMETERS:
+            array = arrays.get(name)
+            if (
+                array is None
+                or array.ndim != 2
+                or len(array) != 1
+                or (rows[name] and array.shape != rows[name][0].shape)
+            ):
+                raise UserError(f"{file}: {name!r} is not one row of numbers as in the other files; {REMEDY}")
+            rows[name].append(array)
+        if "dynamic_offset" in arrays and arrays["dynamic_offset"].any():
+            raise UserError(
+                f"{file}: 'dynamic_offset' is not zero, and mien has no offsets by timestep; set it to zero"
+            )
+        for name in _SHARED:
+            if name not in arrays:
+                continue
+            kept = shared.setdefault(name, arrays[name])
+            if kept.shape != arrays[name].shape or not np.allclose(kept, arrays[name], atol=1e-6):
+                raise UserError(f"{file}: {name!r} is not that of the files before it; import each sequence by itself")
+    return {**{name: np.concatenate(each) for name, each in rows.items() if each}, **shared}
+
+
+def _pictures(group: _Group, root: Path) -> "tuple[np.ndarray, np.ndarray]":
+    import numpy as np
+
+    from mien.datasets.matting import fill_mattes
+    from mien.datasets.pictures import collect, read_matte, read_picture
+
+    first = group.frames[group.timesteps[0], group.cameras[0]]
+    announced = tuple(int(numbers(first.file, first.content, name, ())) for name in ("w", "h"))
+    probe = inner(first.file, root, first.content.get("file_path"))
+    pixels = read_picture(probe, (announced[0], announced[1]))[0]
+    size = pixels.shape[1], pixels.shape[0]
+    masks = all("fg_mask_path" in frame.content for frame in group.frames.values())
+
+    def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
+        frame = group.frames[group.timesteps[timestep], group.cameras[camera]]
+        colors, matte = read_picture(inner(frame.file, root, frame.content.get("file_path")), size)
+        if masks:
+            matte = read_matte(inner(frame.file, root, frame.content.get("fg_mask_path")), size)
+        return colors, np.zeros((size[1], size[0]), np.uint8) if matte is None else matte
+
+    images, mattes = collect(len(group.timesteps), len(group.cameras), size, read, f"read {group.name}")
+    if not masks and not mattes.any():
+        fill_mattes(images, mattes)
+    return images, mattes
+
+
+def _root(path: Path, groups: list[_Group]) -> Path:
+    """The folder that files must be in: the dataset's own, or that beside it for a UNION."""
+    own = path.resolve().name
+    return path if all(group.name == own for group in groups) else path.parent
+
+
+def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import FRONT, camera_of, face_of_flame, in_front, needed_flame
+    from mien.datasets.overlay import check_overlay
+    from mien.datasets.sequences import tracked_sequence
+
+    model, groups = needed_flame(path, face_model, _VERSION), _groups(path)
+    root = _root(path, groups)
+    for group in groups:
+        face = face_of_flame(path, model, _flame_arrays(group, root))
+        images, mattes = _pictures(group, root)
+        size = images.shape[3], images.shape[2]
+        viewmats = _viewmats(group)
+        if len(viewmats) == 1:
+            import numpy as np
+
+            (camera, viewmat) = next(iter(viewmats.items()))
+            face, viewmats = in_front(face, np.repeat(viewmat[None], len(face), 0)), {camera: FRONT}
+
+        def built(
+            from_below: bool, group: _Group = group, viewmats: Any = viewmats, face: Any = face, images: Any = images,
+            mattes: Any = mattes, size: tuple[int, int] = size,
+        ) -> "TrackedSequence":  # fmt: skip
+            cameras = {
+                camera: camera_of(intrinsics_from_vhap(group.frames[group.timesteps[0], camera], from_below),
+                                  viewmats[camera], size)
+                for camera in group.cameras
+            }  # fmt: skip
+            return tracked_sequence(path, group.name, images, mattes, cameras, model, face, _FPS)
+
+        sequence = check_overlay(path, _better(built, group), _VERSION)
+        yield replace(sequence, own_split=_own_split(group) if (path / _TRAIN).exists() else None)
+
+
+def _better(built: Any, group: _Group) -> "TrackedSequence":
+    """The sequence with cy counted from above or from below, whichever fits the pictures better."""
+    from mien.datasets.overlay import measure_overlay
+    from mien.progress import say
+
+    above = built(False)
+    frames = [group.frames[group.timesteps[0], camera] for camera in group.cameras]
+    shifts = [abs(float(frame.content["h"]) - 2 * float(frame.content["cy"])) for frame in frames]
+    if max(shifts) < 1:
+        return above
+    below = built(True)
+    fits = [measure_overlay(sequence) for sequence in (above, below)]
+    distances = [fit.distance for fit in fits]
+    if distances[0] is not None and distances[1] is not None:
+        is_below = distances[1] < distances[0]
+    else:
+        is_below = fits[1].agreement > fits[0].agreement
+    say(f"{group.name}: cy is counted from {'below' if is_below else 'above'}, which fits the pictures better")
+    return below if is_below else above
+
+
+def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import FRONT, camera_of
+    from mien.datasets.sequences import filmed_sequence
+
+    groups = _groups(path)
+    root = _root(path, groups)
+    for group in groups:
+        images, mattes = _pictures(group, root)
+        size = images.shape[3], images.shape[2]
+        viewmats = _viewmats(group)
+        viewmats = viewmats if len(viewmats) > 1 else dict.fromkeys(viewmats, FRONT)
+        cameras = {
+            camera: camera_of(intrinsics_from_vhap(group.frames[group.timesteps[0], camera], False), viewmat, size)
+            for camera, viewmat in viewmats.items()
+        }
+        sequence = filmed_sequence(path, group.name, images, mattes, cameras, _FPS)
+        yield replace(sequence, own_split=_own_split(group) if (path / _TRAIN).exists() else None)
+
+
+VHAP = Dataset(
+    "vhap", "an export of VHAP, or a UNION folder of GaussianAvatars, with flame_param", "sequences", _recognises,
+    _read, _survey, _read_pictures,
+)  # fmt: skip

@@ -1,0 +1,148 @@
+"""Random damage to every file of every dataset: one line of complaint, or content that can be written.
+
+MIEN_DATASET_FUZZ=2000 damages each layout so often. Nothing outside the output may change, and no pickle may run.
+"""
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+import torch
+
+import dataset_scene
+import dataset_writers
+from capture_helpers import tree_bytes
+from dataset_scene import Scene, scene_of
+from dataset_writers import (
+    FRONTAL,
+    write_benchmark,
+    write_flash_avatar,
+    write_imavatar,
+    write_insta,
+    write_nerf_blendshape,
+    write_nerface,
+    write_nersemble,
+    write_vhap,
+)
+from flame_like import write_npz
+from fuzzing.faults import Place, faulty_file, faulty_place
+from fuzzing.material import tiny_flame
+from mien.datasets import Footage, datasets, matting, overlay, sequences, write_sequence
+from mien.errors import UserError
+from mien.face import Landmarks
+from mien.face.flame import flame_face_model, read_flame
+from mien.training import read_own_split
+
+CASES = int(os.environ.get("MIEN_DATASET_FUZZ", "40"))
+SIDE = 32
+
+LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
+    "insta": write_insta,
+    "flash-avatar": write_flash_avatar,
+    "imavatar": write_imavatar,
+    "vhap": lambda folder, scene: write_vhap(folder, scene, size=(SIDE, SIDE + 8)),
+    "nerface": write_nerface,
+    "nerf-blendshape": write_nerf_blendshape,
+    "nersemble-benchmark": lambda folder, scene: write_benchmark(folder, scene, (FRONTAL,)),
+    "nersemble": lambda folder, scene: write_nersemble(folder),
+}
+
+
+class NoDetector:
+    """A detector that finds nothing, since loading the real one for each case would take minutes."""
+
+    def __init__(self, several_faces: bool) -> None:
+        pass
+
+    def __enter__(self) -> "NoDetector":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def detect(self, image: np.ndarray) -> np.ndarray:
+        return np.zeros((0, 478, 2))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the networks, and draw small pictures."""
+
+    def found(images: np.ndarray) -> np.ndarray:
+        return np.full((*images.shape[:2], 478, 2), 5, np.float32)
+
+    monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
+    monkeypatch.setattr(sequences, "detected_landmarks", found)
+    monkeypatch.setattr(matting, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
+    K = np.array([[40.0, 0, 16.6], [0, 40.0, 15.5], [0, 0, 1]])
+    for module in (dataset_scene, dataset_writers):
+        monkeypatch.setattr(module, "SIDE", SIDE)
+    monkeypatch.setattr(dataset_writers, "OFF_CENTRE", K)
+    monkeypatch.setattr(dataset_writers, "UNEQUAL", K * [[1.05], [1.0], [1.0]])
+
+
+def tiny_scene(folder: Path) -> Scene:
+    """Return a head of 200 vertices."""
+    arrays = tiny_flame()
+    model = flame_face_model(read_flame(write_npz(folder / "tiny.npz", arrays)), "tiny")
+    marks = Landmarks(torch.arange(478) % len(model.faces), torch.full((478, 3), 1 / 3))
+    return scene_of(arrays, replace(model, landmarks={"mediapipe": marks}), 6)
+
+
+def used(path: Path, scene: Scene, out: Path) -> None:
+    """Read and write a dataset as `mien import` does.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    known = [each for each in datasets() if each.recognises(path) is not None]
+    if not known:
+        raise UserError(f"{path}: is no dataset")
+    assert len(known) == 1, [each.name for each in known]
+    assert known[0].survey is not None
+    known[0].survey(path)
+    for sequence in known[0].read(path, scene.model):  # type: ignore[union-attr]
+        if isinstance(sequence, Footage):
+            continue
+        folder = out / "sequences" / sequence.capture.name
+        write_sequence(folder, sequence, known[0], path)  # type: ignore[arg-type]
+        read_own_split(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_damage_is_told_in_one_line(layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    scene = tiny_scene(tmp_path)
+    material = LAYOUTS[layout](tmp_path / "material", scene)
+    used(material, scene, tmp_path / "whole")
+    canary = tmp_path / "canary"
+    canary.mkdir()
+    (canary / "file").write_text("a secret")
+    refused = 0
+    for seed in range(CASES):
+        dice, root, out = Random(f"{layout} {seed}"), tmp_path / f"case{seed}", tmp_path / f"out{seed}"
+        shutil.copytree(material, root)
+        file = dice.choice(sorted(each for each in root.rglob("*") if each.is_file()))
+        fault = dice.choice([faulty_file, faulty_file, faulty_file, faulty_place])
+        told = fault(Place(root, file, canary, 9), dice)
+        complaint, before = "", tree_bytes(canary)  # some faults move the file there
+        try:
+            used(root, scene, out)
+        except UserError as error:
+            complaint = str(error)
+        except Exception as error:
+            raise AssertionError(f"{layout} {seed}: {told}: {error!r}") from error
+        refused += bool(complaint)
+        assert "\n" not in complaint, (seed, told, complaint)
+        assert len(complaint) < 1000, (seed, told, complaint)
+        assert tree_bytes(canary) == before, (seed, told)
+        shutil.rmtree(root)
+        shutil.rmtree(out, ignore_errors=True)
+    assert refused > CASES / 10, "faults that nobody notices"

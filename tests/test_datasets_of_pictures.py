@@ -1,0 +1,207 @@
+"""Datasets whose tracking mien cannot use, and the NeRSemble benchmark: what independent writers wrote is imported."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dataset_scene import Scene, draw, head_view, make_scene, projected
+from dataset_writers import (
+    BENCHMARK_SCALE,
+    FRONTAL,
+    UNEQUAL,
+    benchmark_vertices,
+    write_benchmark,
+    write_insta,
+    write_nerf_blendshape,
+    write_nerface,
+    write_nersemble,
+)
+from mien.capture import CaptureSettings
+from mien.capture.calibration import read_calibration
+from mien.commands.stages import import_footage
+from mien.datasets import FilmedSequence, Footage, TrackedSequence, find_dataset, recognised, sequences
+from mien.errors import UserError
+from mien.render import rasterize_mesh
+from recordings import live_link_face
+
+
+@pytest.fixture(scope="module")
+def scene(anny, tmp_path_factory) -> Scene:
+    return make_scene(anny, tmp_path_factory.mktemp("flame"))
+
+
+@pytest.fixture
+def undetected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the detector, which finds no face in drawings this small."""
+
+    def found(images: np.ndarray) -> np.ndarray:
+        return np.full((*images.shape[:2], 478, 2), 5, np.float32)
+
+    monkeypatch.setattr(sequences, "detected_landmarks", found)
+
+
+def read(path: Path, name: str, model: Any = None) -> list[Any]:
+    dataset, _ = recognised(path)
+    assert dataset.name == name
+    return list(dataset.read(path, model))  # type: ignore[arg-type]
+
+
+def check_poses(matrices: np.ndarray, vertices: np.ndarray, timestep: int, K: np.ndarray, scale: float = 1.0) -> None:
+    """Check a head-to-camera matrix by projected vertices, in a world of another scale."""
+    seen = (vertices * scale) @ matrices[:3, :3].T + matrices[:3, 3]
+    pixels = seen @ K.T
+    expected = projected(vertices, UNEQUAL, *head_view(timestep))
+    assert np.abs(pixels[:, :2] / pixels[:, 2:] - expected).max() < 0.02
+    assert np.linalg.det(matrices[:3, :3]) == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.usefixtures("undetected")
+def test_nerface(scene: Scene, tmp_path: Path) -> None:
+    folder = write_nerface(tmp_path / "person_1", scene)
+    train, test = read(folder, "nerface")
+    assert isinstance(train, FilmedSequence)
+    assert (train.capture.name, test.capture.name) == ("train", "test")
+    assert train.foreign["expression"][:, 0].tolist() == [0, 1, 2, 3], "the order of time"
+    camera = train.capture.calibration[0]
+    for sequence, timesteps in ((train, range(4)), (test, [5])):
+        for index, timestep in enumerate(timesteps):
+            vertices = scene.vertices(timestep, root=False)
+            image, _ = draw(scene, vertices, UNEQUAL, *head_view(timestep))
+            assert np.array_equal(sequence.capture.images[index, 0], image)
+            check_poses(sequence.foreign["head_to_camera"][index], vertices, timestep, camera.K.numpy(), 0.6)
+    assert not train.own_split.timesteps
+    assert test.own_split.whole(1)
+
+
+def test_nerface_that_is_not_mirrored_is_plain_opengl() -> None:
+    from mien.datasets.nerface import viewmats_from_nerface
+
+    rotation, translation = head_view(1)
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = rotation, translation
+    pose = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    assert np.abs(viewmats_from_nerface(pose[None], 100.0)[0] - view).max() < 1e-12
+
+
+def test_nerf_blendshape(scene: Scene, tmp_path: Path) -> None:
+    folder = write_nerf_blendshape(tmp_path / "id1", scene)
+    (sequence,) = read(folder, "nerf-blendshape")
+    for timestep in range(len(scene)):
+        vertices = scene.vertices(timestep, root=False)
+        image, matte = draw(scene, vertices, UNEQUAL, *head_view(timestep))
+        assert np.array_equal(sequence.capture.mattes[timestep, 0], (matte > 127) * np.uint8(255))
+        assert np.abs(sequence.capture.images[timestep, 0].astype(int) - image).mean() < 3, "a jpg"
+        assert np.allclose(sequence.capture.landmarks[timestep, 0, 130], (2, timestep + 0.25))
+        K = sequence.capture.calibration[0].K.numpy()
+        check_poses(sequence.foreign["head_to_camera"][timestep], vertices, timestep, K)
+    assert np.allclose(sequence.foreign["expression"][:, 45], np.arange(6) / 10)
+    assert sequence.own_split is None
+
+
+def test_benchmark_of_one_camera(scene: Scene, tmp_path: Path) -> None:
+    folder = write_benchmark(tmp_path / "393", scene)
+    (sequence,) = read(folder, "nersemble-benchmark", scene.model)
+    assert isinstance(sequence, TrackedSequence)
+    assert sequence.capture.name == "EXP-2-eyes"
+    truth = np.load(folder / "truth.npz")
+    view = head_view(2, 1.0)
+    for timestep in range(len(scene)):
+        vertices = benchmark_vertices(scene, timestep, truth["angles"][timestep], truth["shifts"][timestep])
+        mesh = sequence.face_model(sequence.tracking.face[timestep])[0]
+        camera = sequence.tracking.cameras[0]
+        pixels = camera.project(mesh)[0].numpy()
+        assert np.abs(pixels - projected(vertices, UNEQUAL, *view)).max() < 0.02
+        seen = mesh.numpy() @ camera.viewmat[:3, :3].numpy().T
+        assert np.abs(seen * BENCHMARK_SCALE - (vertices @ view[0].T + view[1])).max() < 2e-5
+        drawn = (rasterize_mesh(mesh, sequence.face_model.faces, camera).face_index >= 0).numpy()
+        person = sequence.capture.mattes[timestep, 0] > 127
+        assert (drawn & person).sum() / (drawn | person).sum() > 0.97
+    survey = recognised(folder)[0].survey
+    assert survey is not None
+    assert any("pictures of FREE, which are hidden" in each for each in survey(folder).missing)
+
+
+def test_benchmark_with_euler_angles_of_another_order_is_refused(scene: Scene, tmp_path: Path) -> None:
+    folder = write_benchmark(tmp_path / "393", scene)
+    file = folder / "sequences/EXP-2-eyes/tracking/flame2023_tracking_v2.npz"
+    arrays = dict(np.load(file))
+    arrays["rotation"] = arrays["rotation"][:, ::-1]
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="'rotation' and 'rotation_matrices' differ"):
+        read(folder, "nersemble-benchmark", scene.model)
+
+
+@pytest.mark.usefixtures("undetected")
+def test_benchmark_of_novel_views(scene: Scene, tmp_path: Path) -> None:
+    folder = write_benchmark(tmp_path / "388", scene, ("222200042", "222200044"), tracked=False)
+    (sequence,) = read(folder, "nersemble-benchmark")
+    assert sequence.capture.camera_ids == ("222200042", "222200044")
+    truth = np.load(folder / "truth.npz")
+    for camera in range(2):
+        view = head_view(2 + camera, 1.0)
+        vertices = benchmark_vertices(scene, 1, truth["angles"][1], truth["shifts"][1])
+        image, matte = draw(scene, vertices, UNEQUAL, *view)
+        assert np.abs(sequence.capture.images[1, camera].astype(int) - image).mean() < 4
+        assert np.abs(sequence.capture.mattes[1, camera].astype(int) - matte).mean() < 4
+        imported = sequence.capture.calibration[camera]
+        assert np.abs(imported.viewmat[:3, :3].numpy() - view[0]).max() < 1e-6
+
+
+def test_nersemble_is_captured_with_its_cameras_and_clean_plates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_nersemble(tmp_path / "017")
+    (footage,) = read(folder, "nersemble")
+    assert isinstance(footage, Footage)
+    assert footage.stride == 3
+    asked: list[Any] = []
+
+    def capture(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
+        assert settings.clean_plate is not None
+        asked.append(([video.name for video in videos], sorted(each.name for each in settings.clean_plate.iterdir())))
+        for entry in read_calibration(calibration):
+            assert (entry.camera.width, entry.camera.height) == (2200, 3208)
+            assert entry.camera.K[0, 2] == 1100
+        out.mkdir(parents=True)
+
+    monkeypatch.setattr(import_footage, "capture_cameras", capture)
+    import_footage.write_footage(tmp_path / "out", footage, find_dataset("nersemble"), folder)
+    names = ["222200036", FRONTAL]
+    assert asked == [([f"{name}.mp4" for name in names], [f"{name}.jpg" for name in names])]
+    assert (tmp_path / "out/dataset.json").is_file()
+
+
+TAKE = "Timecode,BlendshapeCount,"
+
+
+def test_a_take_of_live_link_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "20240131_Me_3"
+    folder.mkdir()
+    live_link_face(folder, [{"jawOpen": 0.1 * index} for index in range(5)]).rename(folder / "Me_3_iPhone_cal.csv")
+    (folder / "Me_3_iPhone_raw.csv").write_text(TAKE)
+    (folder / "Me_3_iPhone.mov").write_bytes(b"0")
+    (folder / "take.json").write_text("{}")
+    (footage,) = read(folder, "live-link-face")
+    assert (footage.name, footage.videos[0].name) == ("20240131_Me_3", "Me_3_iPhone.mov")
+    assert footage.files["driving.csv"] == (folder / "Me_3_iPhone_cal.csv").read_bytes()
+    monkeypatch.setattr(import_footage, "capture_video", lambda video, out, settings, name: out.mkdir(parents=True))
+    import_footage.write_footage(tmp_path / "out", footage, find_dataset("live-link-face"), folder)
+    assert (tmp_path / "out/driving.csv").is_file()
+    (folder / "Me_3_iPhone_cal.csv").write_text(TAKE + "EyeBlinkLeft\nnothing\n")
+    with pytest.raises(UserError):
+        read(folder, "live-link-face")
+
+
+@pytest.mark.usefixtures("undetected")
+def test_insta_without_checkpoints_is_pictures(scene: Scene, tmp_path: Path) -> None:
+    folder = write_insta(tmp_path / "me", scene, checkpoints=False)
+    (sequence,) = read(folder, "insta")
+    assert isinstance(sequence, FilmedSequence)
+    view = np.linalg.inv(sequence.foreign["camera_to_head"][1])
+    assert np.abs(view[:3, :3] - head_view(1)[0]).max() < 1e-6
+    shutil.rmtree(folder / "images")
+    with pytest.raises(UserError, match=r"images/00000.png: is missing"):
+        read(folder, "insta")

