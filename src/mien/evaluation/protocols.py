@@ -173,7 +173,7 @@ def _training_psnr(experiment: Experiment, threads: int) -> dict[Frame, tuple[fl
     return dict(stream_in_threads(score, drawn, threads))
 
 
-def _mask_words(experiment: Experiment, frames: Items[Frame]) -> str:
+def _mask_words(experiment: Experiment, frames: Sequence[Frame]) -> str:
     """What the mask of some frames is."""
     if experiment.whole_mattes:
         return _MATTES
