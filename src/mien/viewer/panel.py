@@ -8,10 +8,11 @@ from typing import Any, get_args
 import numpy as np
 import viser
 
+from mien import runtime
 from mien.errors import UserError
 from mien.terminal import printable
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
-from mien.viewer.faces import grouped, matches, presets_for, readable
+from mien.viewer.faces import grouped, matches, readable
 from mien.viewer.files import Stopped, screenshot, video
 from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Session, center_of
@@ -181,7 +182,8 @@ class Panel:
         with gui.add_folder("Face"):
             rest = gui.add_button("At rest")
             anyone = gui.add_button("Random face")
-            names = presets_for(session.avatar.expression_names)
+            avatar = session.avatar
+            names = {readable(name): name for name in runtime.presets_for(avatar.expression_names, avatar.joint_names)}
             preset = gui.add_dropdown("Preset", (_NOTHING, *names), initial_value=_NOTHING) if names else None
 
         @rest.on_click
@@ -201,7 +203,7 @@ class Panel:
                 if preset.value == _NOTHING:
                     session.rest()
                 else:
-                    session.take_preset(preset.value)
+                    session.take_preset(names[preset.value])
                 self.move_sliders()
 
     def _add_expressions(self) -> None:
