@@ -8,7 +8,7 @@ import { element, find, readable } from "./page_sliders";
 import type { Viewer } from "./viewer";
 
 /** Most faces that have a button. */
-const MOST_FACES = 9;
+const MOST_FACES = 8;
 /** Time in which a face goes two thirds of its way, that of the eyes, and how long the first turn takes, in seconds. */
 const SOFT = 0.07, EYES = 0.12, FIRST = 1.6;
 /** Turn of the camera when the page opens, in radians, and seconds after which eyes look ahead again. */

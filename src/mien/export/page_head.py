@@ -104,11 +104,7 @@ def _icon(avatar: runtime.Avatar) -> UInt8[np.ndarray, "h w 4"]:
 
 def _drawn(avatar: runtime.Avatar, side: int) -> tuple[np.ndarray, np.ndarray]:
     """The person at rest in a square picture, premultiplied, and its alpha."""
-    camera = avatar.camera
-    scale = side / max(camera.width, camera.height)
-    K = camera.K * np.array([[scale], [scale], [1]], np.float32)
-    K[:2, 2] += (np.array([side, side]) - scale * np.array([camera.width, camera.height])) / 2
-    return avatar.render(camera=runtime.Camera(K, camera.viewmat, side, side), background=(0, 0, 0))
+    return avatar.render(camera=avatar.camera.square(side), background=(0, 0, 0))
 
 
 def _to_uint8(picture: np.ndarray) -> np.ndarray:

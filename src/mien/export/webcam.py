@@ -1,7 +1,8 @@
 """A webcam in a page: MediaPipe's face landmarker, embedded with its model (docs/web.md).
 
 webcam.html beside this file is built from web/ and committed. The landmarker's model comes with mien, in the folder
-`landmarker` beside this file. Its code is that of the npm package @mediapipe/tasks-vision, which `make setup` puts there.
+`landmarker` beside this file. Its code is that of the npm package @mediapipe/tasks-vision, which `make setup` puts
+there.
 """
 
 import base64
@@ -24,7 +25,8 @@ PACKAGE, VERSION = "@mediapipe/tasks-vision", "0.10.35"
 PACKAGE_VARIABLE, MODEL_VARIABLE = "MIEN_TASKS_VISION", "MIEN_FACE_LANDMARKER"
 """Environment variables that name the package's folder and the model's file, in place of mien's own."""
 OWN = Path(__file__).with_name("landmarker")
-"""Folder of what comes with mien: the model, its licence, and the package's files, which `make landmarker` puts there."""
+"""Folder of what comes with mien: the model, its licence, and the files of the package, which `make landmarker` puts
+there."""
 POLICY = " blob: 'wasm-unsafe-eval'; worker-src blob:; connect-src 'none'; form-action 'none'; base-uri 'none'"
 """What the page's policy allows in addition: scripts and a worker that are in the page itself. Nothing else, and no
 connection at all."""

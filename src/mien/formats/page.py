@@ -31,6 +31,11 @@ def _told(content: Content, motion: "export.Motion | None", page: "export.Writte
 
 
 PAGE = Format(
-    "html", "avatar", _write_page, (".html",), options=frozenset({"webgpu", "webcam", "title", "address"}), refusals=_ITSELF
-)  # fmt: skip
+    "html",
+    "avatar",
+    _write_page,
+    (".html",),
+    options=frozenset({"webgpu", "webcam", "title", "address"}),
+    refusals=_ITSELF,
+)
 PACKED = Format("packed", "avatar", _write_packed, (".packed",), refusals=_ITSELF)
