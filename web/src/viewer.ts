@@ -21,6 +21,8 @@ export interface Matrices {
 export class Viewer {
   /** The face that is drawn. After changing it, call `change`. */
   readonly face: Face;
+  /** The face of the last picture: `face`, with the signs of life that `alive` added. */
+  shown: Face;
   /** Turn of the camera about the head, in radians, and its zoom. */
   yaw = 0;
   pitch = 0;
@@ -48,7 +50,6 @@ export class Viewer {
   private renderer: Drawer;
   /** Coefficients of the gaze that `setExpression` set. */
   private readonly gaze = new Map<string, number>();
-  private shown: Face;
   private posed = false;
   private waiting = 0;
   private stale = true;
