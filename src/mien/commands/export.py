@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _REFUSED = {
     "webgpu": "only an .html page draws with WebGPU; leave --webgpu out",
     "sh": "only a .ply has a degree to choose; leave --sh out",
+    "spz_version": "only a .spz has a version to choose; leave --spz-version out",
     "webcam": "only an .html page has a webcam; leave --webcam out, or write a .html file",
     "title": "only an .html page has a title; leave --title out",
     "address": "only an .html page has an address; leave --address out",
@@ -83,6 +84,8 @@ class Command:
     sh: Literal[0, 1, 2, 3] | None = None
     """For .ply: degree of the spherical harmonics in the file. Coefficients that the avatar lacks are zeros, for
     programs that expect those of degree 3: 248 bytes for each Gaussian (default: the avatar's own degree)."""
+    spz_version: Literal[3, 4] | None = None
+    """For .spz: version of the format. PlayCanvas reads only 4, and older programs only 3 (default: 4)."""
     webgpu: bool = False
     """For .html: the page draws with WebGPU where the browser has it on a GPU, and with WebGL2 elsewhere. The page
     becomes 22 kB larger."""
@@ -180,6 +183,7 @@ class Command:
         from mien.export.webcam import find_webcam_files
 
         given = {"webgpu": self.webgpu, "sh": self.sh is not None, "webcam": self.webcam}
+        given |= {"spz_version": self.spz_version is not None}
         given |= {"title": self.title is not None, "address": self.address is not None}
         for option, is_given in given.items():
             if is_given and option not in kind.options:
@@ -197,7 +201,7 @@ class Command:
         from mien.formats import Options
 
         webcam = find_webcam_files(self.webcam_model) if self.webcam else None
-        return Options(self.sh, self.webgpu, webcam, self.title, self.address)
+        return Options(self.sh, self.webgpu, webcam, self.spz_version or 4, self.title, self.address)
 
     def _check_file(self, kind: Format) -> None:
         from mien.files import check_writable
