@@ -10,8 +10,8 @@ UNLESS_STRICT := test -z "$$MIEN_STRICT"
 UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 
-.PHONY: setup web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs bench gpu lock clean
-setup: $(VENV)/.built
+.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs bench gpu lock clean
+setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
 	@"$(PYTHON)" -c "" 2>/dev/null || { echo "mien needs Python 3.11 or 3.12: install it, or run 'make PYTHON=/path/to/python3.11 ...'"; exit 1; }
@@ -31,6 +31,17 @@ $(VENV)/.built: $(VENV)/.packages pyproject.toml $(NATIVE)
 	touch $@
 
 build: setup
+
+# MediaPipe's face landmarker for pages, for `mien export --webcam` and the wheel: one package of npm, in a version that
+# sends nothing (src/mien/export/webcam.py checks its files by hash). Everything else works without it.
+LANDMARKER := src/mien/export/landmarker
+TASKS_VISION := @mediapipe/tasks-vision@0.10.35
+landmarker: $(LANDMARKER)/vision_wasm_internal.wasm
+$(LANDMARKER)/vision_wasm_internal.wasm:
+	@if command -v npm >/dev/null; then mkdir -p build/landmarker && npm pack --silent --pack-destination build/landmarker $(TASKS_VISION) >/dev/null \
+	  && tar -xzf build/landmarker/*.tgz -C build/landmarker && mv build/landmarker/package/vision_bundle.cjs \
+	  build/landmarker/package/wasm/vision_wasm_internal.js build/landmarker/package/wasm/vision_wasm_internal.wasm $(LANDMARKER)/ \
+	  && rm -r build/landmarker; else echo "No npm: pages have no webcam (mien export --webcam) until 'make landmarker' runs with it."; fi
 
 # The web runtime's packages, for its build and its tests. Without npm, the tests that need them are skipped; MIEN_STRICT
 # makes that an error, here and below.

@@ -159,12 +159,14 @@ def damaged_files(content: bytes, seed: int) -> list[bytes]:
 
 def test_random_damage_to_splat_files_is_told(tmp_path: Path) -> None:
     """Damage behind the checksums, too: of the numbers in gzip, and of the json in a zip."""
-    write_spz(tmp_path / "a.spz", some(50, 4))
+    write_spz(tmp_path / "b.spz", some(50, 4))
+    write_spz(tmp_path / "a.spz", some(50, 4), version=3)
     write_sog(tmp_path / "a.sog", some(50, 4))
     packed = (tmp_path / "a.spz").read_bytes()
     plain = gzip.decompress(packed)
     members = members_of(tmp_path / "a.sog")
     spz = damaged_files(packed, 1) + [gzip.compress(one) for one in damaged_files(plain, 2)]
+    spz += damaged_files((tmp_path / "b.spz").read_bytes(), 1)
     inner = [
         write_members(tmp_path / "b.sog", members | {name: one}).read_bytes()
         for name in members

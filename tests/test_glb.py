@@ -14,7 +14,7 @@ import torch
 from mien import runtime
 from mien.avatar import GaussianAvatars, make_portable
 from mien.cli import main
-from mien.driving.motion import ARKIT_NAMES, LOOK_ANGLE, within_lids
+from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
 from mien.export import Glb, MeshModel, read_glb, write_glb
 from mien.export.glb import joint_positions, morph_targets
@@ -22,6 +22,7 @@ from mien.export.glb_avatar import EXTENSION
 from mien.export.glb_file import GlbWriter
 from mien.export.texture import Shot, Surface, bake_texture
 from mien.face import load_face_model
+from mien.runtime.named import LOOK_ANGLE, within_lids
 from mien.runtime.posing import SH_C0, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 from needs import NO_VALIDATOR

@@ -10,11 +10,12 @@ import torch
 
 from mien.camera import camera_from_fov, look_at
 from mien.driving import ARKIT_NAMES, drive, face_of_motion, read_blendshape_json, read_live_link_face
-from mien.driving.motion import LOOK_ANGLE, Motion, gaze_of
+from mien.driving.motion import Motion, gaze_of
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
+from mien.runtime.named import LOOK_ANGLE
 from recordings import COLUMNS, row, write_csv, write_json
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model

@@ -4,28 +4,34 @@ import gzip
 import importlib.util
 import json
 import math
+import struct
 import subprocess
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import zstandard
 
+from mien.camera import Camera
 from mien.cli import main
 from mien.errors import UserError
 from mien.export import in_world, read_ply, read_sog, read_spz, read_usd, write_sog, write_spz, write_usd
 from mien.export.sog import _cells
 from mien.gaussians import Gaussians
+from mien.render import rasterize
 from mien.rotation import multiply_quaternions
 from needs import NO_PACKAGE, NO_SPLAT_TRANSFORM
 from toy_workspace import write_toy_workspace
 from web_case import WEB, node
 
 WRITERS: dict[str, Callable[[Path, Gaussians], object]] = {
-    ".spz": write_spz, ".sog": write_sog, ".usda": lambda path, gaussians: write_usd(path, [gaussians]),
+    ".spz": write_spz, "3.spz": partial(write_spz, version=3), ".sog": write_sog,
+    ".usda": lambda path, gaussians: write_usd(path, [gaussians]),
 }  # fmt: skip
 SPLAT_TRANSFORM = WEB / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
 HALF_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -99,7 +105,10 @@ def opened_elsewhere(path: Path, out: Path) -> Gaussians:
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-@pytest.mark.parametrize(("ending", "read", "loss"), [(".spz", read_spz, SPZ_LOSS), (".sog", read_sog, SOG_LOSS)])
+@pytest.mark.parametrize(
+    ("ending", "read", "loss"),
+    [(".spz", read_spz, SPZ_LOSS), ("3.spz", read_spz, SPZ_LOSS), (".sog", read_sog, SOG_LOSS)],
+)
 def test_round_trip(
     tmp_path: Path, coefficients: int, ending: str, read: Callable[[Path], Gaussians], loss: Loss
 ) -> None:
@@ -130,7 +139,7 @@ three in that order, a sign and 9 bits of size each, in steps of sqrt(1/2) / 511
 def test_quaternions_lie_in_spz_in_the_order_of_its_specification(tmp_path: Path) -> None:
     """Writer and reader could swap components alike, which no round trip would see."""
     one = replace(some(len(QUATS_IN_SPZ), 1), quats=torch.tensor(list(QUATS_IN_SPZ)))
-    write_spz(tmp_path / "a.spz", one)
+    write_spz(tmp_path / "a.spz", one, version=3)
     content = gzip.decompress((tmp_path / "a.spz").read_bytes())
     words = np.frombuffer(content[-4 * len(one) :], "<u4")
     assert [f"{word:032b}" for word in words.tolist()] == [f"{word:032b}" for word in QUATS_IN_SPZ.values()]
@@ -139,11 +148,12 @@ def test_quaternions_lie_in_spz_in_the_order_of_its_specification(tmp_path: Path
     torch.testing.assert_close(same, torch.ones(len(one)), atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("coefficients", [1, 4, 16])
-def test_another_program_opens_spz(tmp_path: Path, coefficients: int) -> None:
+def test_another_program_opens_spz(tmp_path: Path, coefficients: int, version: int) -> None:
     """It knows that .spz has +y up, and turns its .ply into the frame of captures."""
     written = some(1000, coefficients)
-    write_spz(tmp_path / "a.spz", written)
+    write_spz(tmp_path / "a.spz", written, version)
     found = opened_elsewhere(tmp_path / "a.spz", tmp_path / "a.ply")
     back = in_world(replace(found, T_world_local=HALF_TURN))
     expect_near(back, written, SPZ_LOSS)
@@ -239,7 +249,7 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path, ending: str) ->
 
 def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
-    write_spz(path, some(50, 4))
+    write_spz(path, some(50, 4), version=3)
     content = path.read_bytes()
     plain = gzip.decompress(content)
     many = plain[:8] + (2**31).to_bytes(4, "little") + plain[12:]
@@ -253,6 +263,51 @@ def test_damaged_spz_is_refused(tmp_path: Path) -> None:
             read_spz(path)
     with pytest.raises(UserError, match="No such file"):
         read_spz(tmp_path / "gone.spz")
+
+
+def test_damaged_spz_of_version_4_is_refused(tmp_path: Path) -> None:
+    """A table that lies, a stream that unpacks to more than its place, and what is cut off."""
+    path = tmp_path / "a.spz"
+    write_spz(path, some(50, 4))
+    content = path.read_bytes()
+    assert struct.unpack_from("<4sII4B", content) == (b"NGSP", 4, 50, 1, content[13], 0, 6)
+    many = content[:8] + (2**31).to_bytes(4, "little") + content[12:]
+    first = struct.unpack_from("<Q", content, 32)[0]
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 26))
+    long = content[:32] + struct.pack("<Q", len(bomb)) + content[40:128] + bomb + content[128 + first :]
+    cases = (
+        (content[:20], "cannot be read as"),
+        (content[:-1], "truncated, or a column has another size"),
+        (content[:4] + b"\x05" + content[5:], "of another version"),
+        (content[:15] + b"\x05" + content[16:], "its table is damaged"),
+        (content[:16] + b"\x10" + content[17:], "its table is damaged"),
+        (content[:40] + b"\xff" * 8 + content[48:], "a column has another size"),
+        (content[:130] + b"\xff" * 8 + content[138:], "cannot be read as"),
+        (many, "at most 2,000,000 are read"),
+        (long, "a column has another size"),
+    )
+    for damaged, reason in cases:
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match=reason):
+            read_spz(path)
+
+
+def test_the_program_that_reads_spz_4_sees_the_same_picture(tmp_path: Path) -> None:
+    """PlayCanvas' reader: a picture of what it reads, against one of what mien reads."""
+    written = some(1000, 4)
+    write_spz(tmp_path / "a.spz", written)
+    found = opened_elsewhere(tmp_path / "a.spz", tmp_path / "a.ply")
+    camera = Camera(torch.tensor([[60.0, 0, 64], [0, 60, 64], [0, 0, 1]]), torch.eye(4), 128, 128)
+    turned = torch.eye(4)
+    turned[2, 3] = 4
+    camera = replace(camera, viewmat=turned)
+    pictures = [
+        rasterize(each, camera, torch.ones(3)).image
+        for each in (in_world(replace(found, T_world_local=HALF_TURN)), read_spz(tmp_path / "a.spz"), written)
+    ]
+    theirs, ours, exact = pictures
+    assert float(exact.std()) > 0.05
+    assert -10 * math.log10(float((theirs - ours).square().mean()) + 1e-12) >= 40
 
 
 def test_damaged_sog_is_refused(tmp_path: Path) -> None:

@@ -18,13 +18,10 @@ from mien.face import load_face_model
 from mien.runtime.posing import rig_points
 from mien.viewer.drawing import Look, Mesh, View, beside, draw, words_about_view
 from mien.viewer.faces import (
-    PRESETS,
     RANDOM_EXPRESSIONS,
     group_of,
     grouped,
     matches,
-    preset_expression,
-    presets_for,
     random_expression,
     readable,
 )
@@ -80,17 +77,6 @@ def test_expressions_are_in_groups_for_people() -> None:
 )
 def test_search_finds_words_in_any_order(text: str, found: bool) -> None:
     assert matches(text, "mouthSmileLeft") is found
-
-
-def test_presets_stay_in_bounds_and_need_their_expressions() -> None:
-    assert presets_for(NAMES) == list(PRESETS)
-    assert presets_for(("jawOpen", "expr_1")) == ["open mouth"]
-    rest = np.full(len(NAMES), 0.5, np.float32)
-    for preset in PRESETS:
-        values = preset_expression(preset, NAMES, rest, BOUNDS)
-        assert (values >= BOUNDS[:, 0]).all()
-        assert (values <= BOUNDS[:, 1]).all()
-    assert preset_expression("open mouth", NAMES, rest * 0, BOUNDS)[NAMES.index("jawOpen")] == pytest.approx(0.7)
 
 
 def test_random_faces_differ_and_are_alike_on_both_sides() -> None:

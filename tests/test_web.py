@@ -35,7 +35,7 @@ def test_the_committed_page_is_that_of_a_fresh_build(built: Path) -> None:
 
 
 def test_the_package_is_small(built: Path) -> None:
-    assert len(gzip.compress((built / "mien.js").read_bytes())) <= 12_750
+    assert len(gzip.compress((built / "mien.js").read_bytes())) <= 13_600
 
 
 def posed_by_node(built: Path, path: Path, portable: runtime.PortableAvatar, faces: list[runtime.Face]) -> list[Any]:
@@ -180,7 +180,8 @@ CLEAR = """(async () => {
 TURN = """(async () => {
   const viewer = await mien;
   viewer.background = [1, 1, 1, 1];
-  for (let i = 0; i < 4; ++i) viewer.canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft" }));
+  const key = { key: "ArrowLeft", bubbles: true };
+  for (let i = 0; i < 4; ++i) viewer.canvas.dispatchEvent(new KeyboardEvent("keydown", key));
   viewer.draw();
   return [viewer.yaw, viewer.canvas.toDataURL("image/png")];
 })()"""

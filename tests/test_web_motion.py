@@ -209,7 +209,7 @@ DROP = """(async () => {
 })()"""
 
 LIVE = """(async () => {
-  const viewer = await mien, { expression, joints, head_rotation } = viewer.face;
+  const viewer = await mien;
   document.getElementById("reset").click();
   for (const id of ["idle", "gaze"]) document.getElementById(id).click();
   const box = viewer.canvas.getBoundingClientRect(), blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft");
@@ -217,13 +217,15 @@ LIVE = """(async () => {
   const eye = 3 * viewer.avatar.joint_names.indexOf("left_eye"), began = performance.now();
   let closed = 0;
   while (performance.now() - began < 30000 && closed < 0.3) {
-    closed = Math.max(closed, expression[blink]);
+    closed = Math.max(closed, viewer.shown.expression[blink]);
     await new Promise((done) => setTimeout(done, 10));
   }
-  const gaze = Array.from(joints.subarray(eye, eye + 3)), turned = Array.from(head_rotation);
+  const { joints, head_rotation } = viewer.shown, gaze = Array.from(joints.subarray(eye, eye + 3));
+  const turned = Array.from(head_rotation), blinks = () => viewer.shown.expression[blink] > 0;
   for (const id of ["idle", "gaze"]) document.getElementById(id).click();
-  for (let i = 0; i < 100 && expression[blink] > 0; ++i) await new Promise((done) => setTimeout(done, 50));
-  return [closed, gaze, turned, expression[blink], Array.from(head_rotation)];
+  for (let i = 0; i < 100 && viewer.shown !== viewer.face && blinks(); ++i)
+    await new Promise((done) => setTimeout(done, 50));
+  return [closed, gaze, turned, viewer.shown.expression[blink], Array.from(viewer.shown.head_rotation)];
 })()"""
 
 

@@ -67,6 +67,7 @@ def browse(
     fragment: str = "",
     webgpu: bool = False,
     flags: Sequence[str] = (),
+    device: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
 
@@ -79,9 +80,11 @@ def browse(
         fragment: What follows the address after a #.
         webgpu: Whether the browser has WebGPU, in software.
         flags: Further options of Chromium.
+        device: What the browser is: `lively` (it does not ask for reduced motion), `dark` (it asks for dark colours),
+            `touch` (it has a touch screen).
     """
     given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or []}
-    given |= {"webgpu": webgpu, "flags": list(flags)}
+    given |= {"webgpu": webgpu, "flags": list(flags), **dict.fromkeys(device, True)}
     told = json.dumps(given | ({"downloads": str(downloads)} if downloads else {}))
     address = f"{page}#{fragment}" if fragment else str(page)
     command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), address]

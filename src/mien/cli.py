@@ -22,8 +22,14 @@ from mien.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
 from mien.threads import asked_threads
 
+GROUPS = {
+    "Make an avatar": ("demo", "create", "capture", "track", "train", "import"),
+    "Use it": ("view", "render", "drive", "export"),
+    "Research": ("evaluate", "analyze", "study", "bench", "face-models"),
+}
+"""The sub-commands as `mien --help` lists them."""
 COMMANDS = {
-    "create": "video -> avatar, report and metrics: all stages in one command",
+    "create": "video -> avatar, page, film and report: all stages in one command",
     "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
     "track": "capture -> face parameters, cameras, overlay video",
     "train": "captures + trackings -> an avatar, by the method of your choice",
@@ -252,7 +258,10 @@ def _use_one_torch_thread() -> None:
 
 def _overview() -> str:
     width = max(len(name) for name in COMMANDS)
-    rows = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
+    rows = "\n\n".join(
+        "\n".join([f"{title}:", *(f"  {name:<{width}}  {COMMANDS[name]}" for name in names)])
+        for title, names in GROUPS.items()
+    )
     return (
         f"mien {mien.__version__}: video of a head in, an animatable avatar of 3D Gaussians out.\n\n"
         f"usage: mien COMMAND [options]      mien COMMAND --help\n\n{rows}\n\n"

@@ -60,7 +60,7 @@ def _write_exports(folder: Path, avatar: Avatar) -> None:
     with torch.no_grad():
         posed = in_world(avatar.pose(avatar.subject).gaussians.timestep(0))
     rich = _with_coefficients(posed)
-    write_spz(folder / "head.spz", rich)
+    write_spz(folder / "head.spz", rich, version=3)  # the faults lie behind gzip
     write_sog(folder / "head.sog", rich)
     if find_spec("pxr") is not None:
         for ending in ("usda", "usdc", "usdz"):

@@ -7,6 +7,8 @@ import { axisAngle, multiplied, rotationMatrix } from "./rigid";
 const BETWEEN = 3.5, CLOSING = 0.08, OPENING = 0.17;
 /** Largest turn of the eyes towards the pointer: sideways, up and down, in radians. */
 const MOST_GAZE = [0.45, 0.3];
+/** Share of this turn by which the head follows the eyes. */
+const HEAD_SHARE = 0.2;
 
 /** A number from 0 to 1 that an integer decides. */
 function random(seed: number): number {
@@ -35,22 +37,23 @@ export interface Life {
   pointer: [number, number] | null;
 }
 
-/** Changes lids, head and eyes of a face, whose other values stay. */
+/** Adds signs of life to a face: blinks, a head that is never quite still, and eyes that look aside. */
 export function enliven(face: Face, avatar: Avatar, life: Life, seconds: number): void {
-  const { neutral, expression_names: names, expression_bounds: bounds, joint_names: joints } = avatar;
-  for (const name of ["eyeBlinkLeft", "eyeBlinkRight"]) {
-    const e = names.indexOf(name);
-    if (e < 0) continue;
-    const rest = neutral.expression[e], closed = Math.min(1, bounds[2 * e + 1]);
-    face.expression[e] = life.idle ? rest + (closed - rest) * blinkAt(seconds) : rest;
-  }
-  const rest = rotationMatrix(neutral.head_rotation, 0);
-  face.head_rotation.set(life.idle ? axisAngle(multiplied(rest, rotationMatrix(swayAt(seconds), 0))) : neutral.head_rotation);
+  const { expression_names: names, expression_bounds: bounds, joint_names: joints } = avatar;
+  /** Turns an axis-angle vector further. */
+  const turn = (vectors: Float32Array, at: number, by: number[]) =>
+    vectors.set(axisAngle(multiplied(rotationMatrix(vectors, at), rotationMatrix(by, 0))), at);
   const [right, up] = life.pointer ?? [0, 0];
+  if (life.idle) {
+    const blink = blinkAt(seconds);
+    for (const name of ["eyeBlinkLeft", "eyeBlinkRight"]) {
+      const e = names.indexOf(name), open = face.expression[e];
+      if (e >= 0) face.expression[e] = open + Math.max(Math.min(1, bounds[2 * e + 1]) - open, 0) * blink;
+    }
+    turn(face.head_rotation, 0, swayAt(seconds).map((angle, k) => angle + HEAD_SHARE * [-MOST_GAZE[1] * up, MOST_GAZE[0] * right, 0][k]));
+  }
   for (const name of ["left_eye", "right_eye"]) {
     const j = 3 * joints.indexOf(name);
-    if (j < 0) continue;
-    const gaze = rotationMatrix([-MOST_GAZE[1] * up, MOST_GAZE[0] * right, 0], 0);
-    face.joints.set(axisAngle(multiplied(rotationMatrix(neutral.joints, j), gaze)), j);
+    if (j >= 0 && life.pointer) turn(face.joints, j, [-MOST_GAZE[1] * up, MOST_GAZE[0] * right, 0]);
   }
 }

@@ -131,6 +131,12 @@ export interface Motion extends Face {
   fps: number;
 }
 
+/** What training saw: the smallest and largest value of each expression, then of each joint's angles in radians. */
+export interface Filmed {
+  lowest: Float32Array; // [e + 3 j]
+  highest: Float32Array;
+}
+
 export interface Avatar {
   baked: Baked;
   expression_names: string[];
@@ -139,6 +145,7 @@ export interface Avatar {
   neutral: Face;
   camera: Camera;
   about: { name: string; method: string; face_model: string; licence: string };
+  filmed?: Filmed | null;
 }
 
 /** A copy of a face, so that changing it leaves the original alone. */

@@ -5,19 +5,23 @@ import type { Viewer } from "./viewer";
 /** Most pixels of a picture: more would make telephones stutter. */
 const MOST_PIXELS = 1_600_000;
 
-/** One finger or the mouse turns, two fingers or the wheel zoom, arrow keys turn. */
-export function addTurning(viewer: Viewer): void {
+/** Listens to events, whose names are apart by blanks. */
+export const on = (target: EventTarget, names: string, act: (event: any) => void, options?: AddEventListenerOptions): void =>
+  names.split(" ").forEach((name) => target.addEventListener(name, act, options));
+
+/** One finger or the mouse turns, two fingers or the wheel zoom, arrow keys turn. `keys` is where keys are heard. */
+export function addTurning(viewer: Viewer, keys: EventTarget = viewer.canvas): void {
   const { canvas } = viewer, pointers = new Map<number, { x: number; y: number }>();
   const span = () => {
     const [a, b] = [...pointers.values()];
     return Math.hypot(a.x - b.x, a.y - b.y);
   };
-  canvas.addEventListener("pointerdown", (event) => {
+  on(canvas, "pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
   });
-  for (const name of ["pointerup", "pointercancel"] as const) canvas.addEventListener(name, (event) => pointers.delete(event.pointerId));
-  canvas.addEventListener("pointermove", (event) => {
+  on(canvas, "pointerup pointercancel", (event) => pointers.delete(event.pointerId));
+  on(canvas, "pointermove", (event) => {
     const last = pointers.get(event.pointerId);
     if (!last) return;
     const apart = pointers.size === 2 ? span() : 0;
@@ -29,18 +33,18 @@ export function addTurning(viewer: Viewer): void {
     }
     viewer.look();
   });
-  canvas.addEventListener("wheel", (event) => {
+  on(canvas, "wheel", (event) => {
     event.preventDefault();
     viewer.zoom *= Math.exp(-0.0015 * event.deltaY);
     viewer.look();
   }, { passive: false });
-  canvas.addEventListener("keydown", (event) => {
+  on(keys, "keydown", (event) => {
     const turns: Record<string, () => void> = {
       ArrowLeft: () => (viewer.yaw += 0.1), ArrowRight: () => (viewer.yaw -= 0.1),
       ArrowUp: () => (viewer.pitch -= 0.1), ArrowDown: () => (viewer.pitch += 0.1),
       "+": () => (viewer.zoom *= 1.1), "-": () => (viewer.zoom /= 1.1),
     };
-    if (!turns[event.key]) return;
+    if (!turns[event.key] || isTyping(event)) return;
     event.preventDefault();
     turns[event.key]();
     viewer.look();
@@ -58,3 +62,7 @@ export function fit(viewer: Viewer): void {
     viewer.look();
   }
 }
+
+/** Whether a key belongs to the control that has the focus, such as a slider. */
+export const isTyping = ({ target, ctrlKey, metaKey, altKey }: KeyboardEvent): boolean =>
+  ctrlKey || metaKey || altKey || (target instanceof Element && target.matches("input, select, textarea"));

@@ -13,7 +13,7 @@ const STYLE = ":host{display:inline-block;width:320px;height:320px}canvas{displa
 /**
  * An avatar as an element. Attributes:
  * `src`: address of a .packed or .mien file.
- * `expression`: names and strengths, `jawOpen:0.5 eyeBlinkLeft:1`; all others are those of the person at rest.
+ * `expression`: names and strengths, `smile:0.4 jawOpen:0.5 eyeLookUpLeft:1`; all others are those of the person at rest.
  * `yaw`, `pitch`, `zoom`: the camera, in degrees to the person's left and upwards.
  * `backend`: `auto` or `webgpu` loads webgpu.js, which lies beside this file; without it, WebGL2 draws.
  * `controls`: may be turned by hand. `idle`: blinks and moves a little.
@@ -65,7 +65,7 @@ export class MienAvatar extends HTMLElement {
     this.setAttribute("expression", text);
   }
 
-  /** Sets one expression, and leaves the others. False if the avatar has none of that name, or is not there yet. */
+  /** Sets an expression, a gaze or a whole face, and leaves the others. False if the name does nothing, or the avatar is not there yet. */
   setExpression(name: string, value: number): boolean {
     return this.viewer?.setExpression(name, value) ?? false;
   }
@@ -125,10 +125,10 @@ export class MienAvatar extends HTMLElement {
   private pose(): void {
     const { viewer } = this;
     if (!viewer) return;
-    viewer.face.expression.set(viewer.avatar.neutral.expression);
+    viewer.take(viewer.avatar.neutral);
     for (const one of this.expression.split(/[\s,]+/).filter(Boolean)) {
       const [name, value] = one.split(":");
-      if (!viewer.setExpression(name, Number(value) || 0)) console.warn(`<mien-avatar>: no expression ${name}`);
+      if (!viewer.setExpression(name, Number(value) || 0)) console.warn(`<mien-avatar>: ${name} does nothing`);
     }
     viewer.change();
   }
@@ -141,15 +141,15 @@ export class MienAvatar extends HTMLElement {
   }
 
   private live(): void {
-    if (this.beating || !this.viewer) return;
-    const beat = (now: number) => {
-      const { viewer } = this, idle = this.hasAttribute("idle") && viewer !== null;
-      this.beating = idle ? requestAnimationFrame(beat) : 0;
-      if (!viewer || viewer.playing) return;
-      enliven(viewer.face, viewer.avatar, { idle, pointer: null }, now / 1000);
-      viewer.change();
+    const { viewer } = this, idle = this.hasAttribute("idle");
+    if (!viewer) return;
+    viewer.alive = idle ? (face) => enliven(face, viewer.avatar, { idle, pointer: null }, performance.now() / 1000) : null;
+    viewer.change();
+    const beat = () => {
+      this.beating = this.viewer?.alive ? requestAnimationFrame(beat) : 0;
+      if (!this.viewer?.playing) this.viewer?.change();
     };
-    if (this.hasAttribute("idle")) this.beating = requestAnimationFrame(beat);
+    if (idle && !this.beating) this.beating = requestAnimationFrame(beat);
   }
 }
 

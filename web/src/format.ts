@@ -243,12 +243,13 @@ function isFree(baked: BlendSkinned | Static, neutral: Face, count: number): boo
 
 /** Refuses what this runtime cannot draw, and arrays that do not fit together. */
 function checked(avatar: Avatar): Avatar {
-  const { baked, neutral, camera } = avatar, { attributes } = baked, count = attributes.opacity_logits.length;
+  const { baked, neutral, camera, filmed } = avatar, inputs = neutral.expression.length + neutral.joints.length, { attributes } = baked, count = attributes.opacity_logits.length;
   const coefficients = attributes.sh.length / 3 / Math.max(count, 1);
   const whole =
     [1, 4, 9, 16].includes(coefficients) && fits(attributes, { quats: 4 * count, log_scales: 3 * count, opacity_logits: count, sh: 3 * count * coefficients }) &&
     fits(camera, { K: 9, viewmat: 16 }) && camera.width > 0 && camera.height > 0 &&
     fits(avatar, { expression_bounds: 2 * neutral.expression.length }) && isFace(neutral, neutral, 1) &&
+    (!filmed || fits(filmed, { lowest: inputs, highest: inputs })) &&
     (baked.kind === "MeshBound" ? isBound(baked, neutral, count) : isFree(baked, neutral, count));
   if (!whole) throw new AvatarError(APART);
   return avatar;

@@ -2,6 +2,7 @@
 export { copyFace, motionFace, motionLength } from "./avatar";
 export type { Avatar, Baked, BlendSkinned, Camera, Face, MeshBound, Motion, Rig, Static } from "./avatar";
 export { AvatarError, readAny, readMien, readPacked } from "./format";
+export { presets, rangeOf, setNamed } from "./named";
 export { Poser } from "./rig";
 export { DepthSorter } from "./sort";
 export { Renderer } from "./renderer";

@@ -2,12 +2,8 @@
 // is added to the avatar at rest, within the limits that the avatar has.
 
 import type { Avatar, Face } from "./avatar";
+import { turnEye } from "./named";
 import { axisAngle, multiplied, rotationMatrix } from "./rigid";
-
-/** Angle of the eyes at a coefficient eyeLook of 1, in radians. */
-const LOOK_ANGLE = Math.PI / 6;
-/** Pitch that eyes come near but do not exceed, up and down, in radians: beyond it, the lids would cover the iris. */
-const MOST_UP = (14 * Math.PI) / 180, MOST_DOWN = (18 * Math.PI) / 180;
 
 /** Limits of a turn of the head at rest, in radians: up to the first it is at rest, from the second on it is motion (src/mien/driving/rest.py). */
 const HEAD = [0.524, 0.785];
@@ -30,20 +26,13 @@ export function headAtRest(usual: readonly number[]): number[] {
  * @param shift Motion of the head relative to the driver at rest, in the axes of the head at rest, in metres.
  */
 export function transfer(scores: ReadonlyMap<string, number>, turn: ArrayLike<number>, avatar: Avatar, face: Face, shift: readonly number[] = [0, 0, 0]): void {
-  const { neutral, expression_names: names, expression_bounds: bounds, joint_names: joints } = avatar;
+  const { neutral, expression_names: names, expression_bounds: bounds } = avatar;
   const score = (name: string) => scores.get(name) ?? 0;
   names.forEach((name, e) => {
     face.expression[e] = Math.min(Math.max(neutral.expression[e] + score(name.toLowerCase()), bounds[2 * e]), bounds[2 * e + 1]);
   });
   face.joints.set(neutral.joints);
-  for (const [joint, side, left, right] of [["left_eye", "left", "out", "in"], ["right_eye", "right", "in", "out"]]) {
-    const j = joints.indexOf(joint);
-    if (j < 0) continue;
-    const look = (way: string) => LOOK_ANGLE * score(`eyelook${way}${side}`);
-    const pitch = look("down") - look("up"), most = pitch < 0 ? MOST_UP : MOST_DOWN;
-    const gaze = rotationMatrix([most * Math.tanh(pitch / most), look(left) - look(right), 0], 0);
-    face.joints.set(axisAngle(multiplied(rotationMatrix(neutral.joints, 3 * j), gaze)), 3 * j);
-  }
+  for (const side of ["left", "right"]) turnEye(avatar, face, side, score);
   const rest = rotationMatrix(neutral.head_rotation, 0);
   face.head_rotation.set(axisAngle(multiplied(rest, turn)));
   face.head_translation.set(neutral.head_translation.map((at, k) => at + rest[3 * k] * shift[0] + rest[3 * k + 1] * shift[1] + rest[3 * k + 2] * shift[2]));

@@ -1,6 +1,7 @@
 // An avatar on a canvas: face, camera, a packed motion, and drawing when something has changed.
 
 import { copyFace, motionFace, motionLength, type Avatar, type Face, type Motion } from "./avatar";
+import { setNamed } from "./named";
 import { Renderer, type Backend, type Color, type Drawer, type View } from "./renderer";
 import { Poser } from "./rig";
 import { chained, moved, rigid, rotationMatrix } from "./rigid";
@@ -20,6 +21,8 @@ export interface Matrices {
 export class Viewer {
   /** The face that is drawn. After changing it, call `change`. */
   readonly face: Face;
+  /** The face of the last picture: `face`, with the signs of life that `alive` added. */
+  shown: Face;
   /** Turn of the camera about the head, in radians, and its zoom. */
   yaw = 0;
   pitch = 0;
@@ -31,6 +34,10 @@ export class Viewer {
   /** Timestep of the motion, and whether it runs. */
   timestep = 0;
   playing = false;
+  /** Whether the motion begins again at its end. */
+  loop = true;
+  /** Changes a copy of the face before it is drawn, while no motion plays: signs of life (`enliven`). */
+  alive: ((face: Face) => void) | null = null;
   /** Called after each timestep of the motion, so that a page can move its sliders. */
   onMotion: () => void = () => {};
   /** Time to pose, sort and hand over the last picture, in milliseconds. */
@@ -41,6 +48,8 @@ export class Viewer {
   private readonly depths: Float32Array;
   private readonly middle: number[];
   private renderer: Drawer;
+  /** Coefficients of the gaze that `setExpression` set. */
+  private readonly gaze = new Map<string, number>();
   private posed = false;
   private waiting = 0;
   private stale = true;
@@ -49,6 +58,7 @@ export class Viewer {
 
   constructor(readonly canvas: HTMLCanvasElement, readonly avatar: Avatar, public motion: Motion | null = null, backend?: Backend) {
     this.face = copyFace(avatar.neutral);
+    this.shown = this.face;
     this.poser = new Poser(avatar.baked);
     const count = this.poser.faceIndex.length;
     this.sorter = new DepthSorter(count);
@@ -62,14 +72,14 @@ export class Viewer {
     });
   }
 
-  /** Sets one expression by name, clamped to its bounds. False if the avatar has none of that name. */
+  /**
+   * Sets an expression, a gaze (eyeLookUpLeft, ...) or a whole face (smile, ...) by name, within its range. A whole face
+   * changes its expressions relative to the person at rest, and leaves the others. False if the name does nothing.
+   */
   setExpression(name: string, value: number): boolean {
-    const index = this.avatar.expression_names.indexOf(name);
-    if (index < 0) return false;
-    const [least, most] = this.avatar.expression_bounds.subarray(2 * index, 2 * index + 2);
-    this.face.expression[index] = Math.min(Math.max(value, least), most);
-    this.change();
-    return true;
+    const works = setNamed(this.avatar, this.face, this.gaze, name, value);
+    if (works) this.change();
+    return works;
   }
 
   /** Goes back to the person at rest, seen by the first camera. */
@@ -81,6 +91,7 @@ export class Viewer {
 
   /** Shows a face. */
   take(face: Face): void {
+    this.gaze.clear();
     for (const part of ["expression", "joints", "head_rotation", "head_translation"] as const) this.face[part].set(face[part]);
     this.change();
   }
@@ -109,6 +120,7 @@ export class Viewer {
   /** Draws soon, because the face has changed. */
   change(): void {
     this.posed = false;
+    this.shown = this.face;
     this.look();
   }
 
@@ -123,7 +135,7 @@ export class Viewer {
   /** The view for a picture of that size: the whole first camera's picture fits into it. */
   view(width: number, height: number): View {
     const { K, viewmat, width: w, height: h } = this.avatar.camera, scale = Math.min(width / w, height / h);
-    const pose = rigid(rotationMatrix(this.face.head_rotation, 0), this.face.head_translation);
+    const pose = rigid(rotationMatrix(this.shown.head_rotation, 0), this.shown.head_translation);
     const { head_rotation, head_translation } = this.avatar.neutral;
     const rest = rigid(rotationMatrix(head_rotation, 0), head_translation);
     // The camera turns about the middle of the head at rest, seen from where the first camera stands.
@@ -152,7 +164,8 @@ export class Viewer {
     const began = performance.now(), { width, height } = this.canvas;
     this.stale = false;
     if (!this.posed) {
-      this.poser.pose(this.face);
+      if (this.alive && !this.playing) this.alive((this.shown = copyFace(this.face)));
+      this.poser.pose(this.shown);
       this.renderer.upload();
       this.posed = true;
     }
@@ -184,8 +197,12 @@ export class Viewer {
       this.before = now;
       const steps = Math.floor(this.since / period);
       this.since -= steps * period;
-      if (steps) this.seek((this.timestep + steps) % motionLength(this.motion));
-      this.wait();
+      const next = this.timestep + steps, length = motionLength(this.motion);
+      if (!this.loop && next >= length) {
+        this.play(false);
+        this.onMotion();
+      } else if (steps) this.seek(next % length);
+      if (this.playing) this.wait();
     }
     if (this.stale) this.draw();
   }

@@ -25,7 +25,11 @@ const WORDS: Record<WebcamState, string> = {
 };
 
 function addCamera(viewer: Viewer): Webcam {
-  find("sliders").before(find<HTMLTemplateElement>("camera-template").content);
+  const { content } = find<HTMLTemplateElement>("camera-template"), [first, card, notices] = content.children;
+  find("more").before(first);
+  find("faces").before(card);
+  find("panel").append(notices);
+  (card as HTMLElement).hidden = true;
   const webcam = new Webcam(parts), button = find<HTMLButtonElement>("camera"), neutral = find<HTMLButtonElement>("neutral");
   const mirrored = find<HTMLInputElement>("mirrored"), preview = find<HTMLInputElement>("preview"), told = find("camera-state");
   const more = find("camera-more"), { video } = webcam;
@@ -42,16 +46,24 @@ function addCamera(viewer: Viewer): Webcam {
   mirrored.addEventListener("change", show);
   preview.addEventListener("change", show);
   show();
-  /** Other drivers rest while the camera drives. */
-  const others = ["idle", "gaze"].map((id) => find<HTMLInputElement>(id));
+  /** Other drivers rest while the camera drives, and go on after it. */
+  const others = ["idle", "gaze"].map((id) => find<HTMLInputElement>(id)), resting = new Set<HTMLInputElement>();
+  const tell = (text: string) => {
+    told.textContent = text;
+    (card as HTMLElement).hidden = !text;
+  };
   webcam.onState = (state, why) => {
     const on = state !== "off";
-    button.textContent = on ? "Stop the camera" : "Use my camera";
-    neutral.hidden = more.hidden = !on;
-    told.textContent = why ?? WORDS[state];
+    button.textContent = on ? "Stop the camera" : "Be me";
+    more.hidden = !on;
+    tell(why ?? WORDS[state]);
     for (const box of others) {
-      if (on && box.checked) box.click();
+      if (on && box.checked) {
+        resting.add(box);
+        box.click();
+      }
       box.disabled = on;
+      if (!on && resting.delete(box)) box.click();
     }
     if (on || viewer.playing) return;
     viewer.take(viewer.avatar.neutral);
@@ -64,7 +76,7 @@ function addCamera(viewer: Viewer): Webcam {
     try {
       await webcam.start();
     } catch (error) {
-      told.textContent = error instanceof WebcamError ? error.message : `${error}`;
+      tell(error instanceof WebcamError ? error.message : `${error}`);
     }
   });
   neutral.addEventListener("click", () => webcam.calibrate());

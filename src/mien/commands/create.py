@@ -1,6 +1,5 @@
 """`mien create`: from videos to an avatar."""
 
-import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from mien.workspace import Workspace, check_new_workspace
 
 @dataclass(frozen=True)
 class Command:
-    """Make an avatar, metrics and a report from videos of one person. A stopped command continues if you run it again.
+    """Make an avatar, a page, a film and a report from videos of one person. A stopped command continues.
 
     Each video is captured separately. All sequences of the workspace are tracked together, with one identity. The
     avatar is trained on the videos given here.
@@ -82,6 +81,7 @@ class Command:
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
         from mien.commands.stages.tracking import check_masks
+        from mien.commands.stages.showing import show_avatar
         from mien.progress import say, whole_command
         from mien.training import check_run, check_untouched
 
@@ -101,9 +101,8 @@ class Command:
                 say(f"warning: {warning}")
         with whole_command(self._overall(settings)):
             self._run_stages(workspace, run, method, settings)
-        which = ["--run", run] if len(workspace.run_names()) > 1 else []
-        command = shlex.join(["mien", "render", str(self.out), *which, "--out", "turntable.mp4"])
-        say(f"Done in {time.monotonic() - began:.0f} s. Next: {command}")
+        say(f"Done in {time.monotonic() - began:.0f} s.")
+        show_avatar(workspace, run)
 
     def _overall(self, settings: TrainSettings) -> Overall:
         """What is to be done, with expected times."""

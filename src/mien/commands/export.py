@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 _REFUSED = {
     "webgpu": "only an .html page draws with WebGPU; leave --webgpu out",
     "sh": "only a .ply has a degree to choose; leave --sh out",
+    "spz_version": "only a .spz has a version to choose; leave --spz-version out",
     "webcam": "only an .html page has a webcam; leave --webcam out, or write a .html file",
+    "title": "only an .html page has a title; leave --title out",
+    "address": "only an .html page has an address; leave --address out",
 }
 """Messages for options that the format does not take."""
 
@@ -68,8 +71,8 @@ class Command:
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
-    """Expressions by name, and joint angles in radians, for example --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2
-    (default: the person's neutral)."""
+    """Expressions and whole faces by name, and joint angles in radians, for example --set smile=0.6 jawOpen=0.3
+    eyeLookUpLeft=0.5 left_eye_y=0.2 (default: the person's neutral). An unknown name lists all of them."""
     series: str | None = None
     """A motion: the name of a sequence of the workspace, or anything that `mien drive --by` takes. A page plays it. For
     Gaussians in a pose, every frame becomes a file, or a time sample of the file; the head stays at the origin."""
@@ -81,14 +84,22 @@ class Command:
     sh: Literal[0, 1, 2, 3] | None = None
     """For .ply: degree of the spherical harmonics in the file. Coefficients that the avatar lacks are zeros, for
     programs that expect those of degree 3: 248 bytes for each Gaussian (default: the avatar's own degree)."""
+    spz_version: Literal[3, 4] | None = None
+    """For .spz: version of the format. PlayCanvas reads only 4, and older programs only 3 (default: 4)."""
     webgpu: bool = False
     """For .html: the page draws with WebGPU where the browser has it on a GPU, and with WebGL2 elsewhere. The page
     becomes 22 kB larger."""
     webcam: bool = False
     """For .html: a button with which the viewer's own face drives the avatar. The page becomes 9 MB larger; nothing of
-    the camera leaves it. Needs `make web-packages`, and MediaPipe's model."""
+    the camera leaves it."""
     webcam_model: Path | None = None
-    """With --webcam, MediaPipe's face_landmarker.task (default: the file that MIEN_FACE_LANDMARKER names)."""
+    """With --webcam, another face_landmarker.task than that of mien (default: the file that MIEN_FACE_LANDMARKER names,
+    or mien's)."""
+    title: str | None = None
+    """For .html: the title of the page (default: the avatar's name)."""
+    address: str | None = None
+    """For .html: the address at which you will publish the page, such as https://example.org/me.html. Messengers then
+    show a picture of the avatar, which is written beside the page."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -168,12 +179,17 @@ class Command:
         return UserError(f"{self.out}: cannot write {ending}; use {use}{folder}")
 
     def _check_options(self, kind: Format) -> None:
+        from mien.export.page_head import check_address
         from mien.export.webcam import find_webcam_files
 
         given = {"webgpu": self.webgpu, "sh": self.sh is not None, "webcam": self.webcam}
+        given |= {"spz_version": self.spz_version is not None}
+        given |= {"title": self.title is not None, "address": self.address is not None}
         for option, is_given in given.items():
             if is_given and option not in kind.options:
                 raise UserError(f"{self.out}: {_REFUSED[option]}")
+        if self.address is not None:
+            check_address(self.address)
         if self.webcam_model is not None and not self.webcam:
             raise UserError(f"--webcam-model {self.webcam_model}: give it together with --webcam")
         if self.webcam:
@@ -184,7 +200,8 @@ class Command:
         from mien.export import find_webcam_files
         from mien.formats import Options
 
-        return Options(self.sh, self.webgpu, find_webcam_files(self.webcam_model) if self.webcam else None)
+        webcam = find_webcam_files(self.webcam_model) if self.webcam else None
+        return Options(self.sh, self.webgpu, webcam, self.spz_version or 4, self.title, self.address)
 
     def _check_file(self, kind: Format) -> None:
         from mien.files import check_writable

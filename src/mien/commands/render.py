@@ -36,8 +36,8 @@ class Command:
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
-    """Expressions by name, and joint angles in radians, for example --set jawOpen=0.6 mouthSmileLeft=0.4 left_eye_y=0.2
-    (default: the person's neutral)."""
+    """Expressions and whole faces by name, and joint angles in radians, for example --set smile=0.6 jawOpen=0.3
+    eyeLookUpLeft=0.5 left_eye_y=0.2 (default: the person's neutral). An unknown name lists all of them."""
     path: Literal["turntable", "orbit", "sway", "still", "captured"] = "turntable"
     """Path of the camera: to both sides (turntable), an oval (orbit), a figure eight (sway), no motion (still), or from
     camera to camera of the capture (captured). A .png is always a still."""
@@ -126,7 +126,7 @@ class Command:
         check_face_params(avatar.face_model, face, f"--sequence {self.sequence}", told)
         face = with_expression(face, avatar.face_model, self.set)
         if self.set:
-            tell_of_unfilmed(self.set, avatar.face_model, filmed_range(run_dir, avatar))
+            tell_of_unfilmed(self.set, face, avatar.face_model, filmed_range(run_dir, avatar))
         if self.sheet != "none":
             self._draw_sheet(run_dir, avatar, face, output)
             return

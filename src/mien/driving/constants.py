@@ -57,13 +57,6 @@ class DrivingConstants:
     """Cutoff of the low pass of the speeds, in Hz. Chosen for the exported page with the other two numbers of its
     filter (log, "One Euro filter")."""
 
-    # motion.py
-    most_up: float = 14.0
-    """Pitch that a driven eye comes near upwards but does not exceed, in degrees. Beyond it, lids that follow the gaze
-    hide the iris; measured at 30 (log, "Mouth")."""
-    most_down: float = 18.0
-    """The same downwards."""
-
     # neutral.py
     first_seconds: float = 0.5
     """Length of the beginning that --neutral first takes, in seconds. Not varied."""

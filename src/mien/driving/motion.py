@@ -1,6 +1,5 @@
 """Motion of a driver's face over time, in ARKit's terms, from any recorder."""
 
-import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mien.bounded import NotOrdinaryError, open_ordinary
-from mien.driving.constants import DRIVING
 from mien.errors import UserError
+from mien.runtime.named import gaze_of as pitch_and_yaw
 
 ARKIT_NAMES = (
     "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft",
@@ -27,9 +26,6 @@ ARKIT_NAMES = (
 )  # fmt: skip
 """ARKit's 52 blend shapes, in the order of Live Link Face's columns."""
 
-LOOK_ANGLE = math.radians(30)
-"""Rotation of an eye for an eyeLook coefficient of 1, in radians. Apple gives no angle; this is about the most that
-eyes turn."""
 MAX_GAP_SECONDS = 60.0
 """Longest gap between two moments, in seconds, that is interpolated. A longer gap means another recording."""
 MAX_MOMENTS = 500_000
@@ -71,21 +67,9 @@ def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t
     """Rotations of the eyes for eyeLook coefficients: positive about x is down, about y to the subject's left."""
     look = {name: coefficients[:, index] for index, name in enumerate(ARKIT_NAMES) if name.startswith("eyeLook")}
     eyes = np.zeros((len(coefficients), 2, 3), np.float32)
-    for index, (side, left, right) in enumerate((("Left", "Out", "In"), ("Right", "In", "Out"))):
-        eyes[:, index, 0] = LOOK_ANGLE * (look[f"eyeLookDown{side}"] - look[f"eyeLookUp{side}"])
-        eyes[:, index, 1] = LOOK_ANGLE * (look[f"eyeLook{left}{side}"] - look[f"eyeLook{right}{side}"])
+    for index, side in enumerate(("Left", "Right")):
+        eyes[:, index, 0], eyes[:, index, 1] = pitch_and_yaw(look, side)
     return eyes
-
-
-def within_lids(eyes: Float32[np.ndarray, "*t 3"]) -> Float32[np.ndarray, "*t 3"]:
-    """Rotations of eyes with a softly limited pitch: small ones hardly change, and large ones keep the eye open.
-
-    The face model's lids follow the gaze in proportion, as they do at 10 degrees. At 25 degrees up or down, the lids
-    would cover the iris, which a person's lids do not.
-    """
-    limited, most = eyes.copy(), np.radians(np.where(eyes[..., 0] < 0, DRIVING.most_up, DRIVING.most_down))
-    limited[..., 0] = most * np.tanh(eyes[..., 0] / most)
-    return limited
 
 
 def resample_evenly(

@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.driving.motion import ARKIT_NAMES, Motion, within_lids
+from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime.named import within_lids
 
 
 def drive(

@@ -9,6 +9,7 @@ from typing import Any
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
 from mien.evaluation.experiment import Experiment
+from mien.evaluation.living import FILM, living, write_film
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
 from mien.evaluation.page import ReportVideo
@@ -21,7 +22,7 @@ from mien.inside import check_tree
 from mien.locks import hold
 from mien.ranges import check_ranges
 from mien.storage import file_digest, write_json
-from mien.training import read_coverage, read_curves, read_run_config, read_training_summary
+from mien.training import read_coverage, read_curves, read_run_config, read_training_summary, run_camera
 
 _RECIPE = 4
 """Version of the scoring. It is raised whenever the same frame would get other figures."""
@@ -89,9 +90,12 @@ def _evaluate(
             write_scored_pictures(run_dir / "pictures" / name, experiment)
     avatars = [experiment.avatar for experiment in experiments.values()]
     covered = read_coverage(run_dir, avatars[0].face_model) if avatars else None
+    alive = living(avatars[0], run_camera(run_dir), run_dir.name) if avatars and settings.video_frames else None
+    if alive is not None:
+        write_film(run_dir / FILM, alive)
     run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir), covered)
     section = cross_section(driven["cross_reenactment"], driven_videos, run_dir) if driven else None
-    write_report(run_dir / "report.html", run, protocols, results, videos, section)
+    write_report(run_dir / "report.html", run, protocols, results, videos, section, alive)
     write_json(run_dir / "metrics.json", FORMAT, VERSION, content)
     for partial in partials.values():
         partial.remove()

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from mien import runtime
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
+from mien.evaluation.living import FILM
 from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FITTED_NAME, PART_NAMES, figure
 from mien.evaluation.page import (
     FITTED_GLOSSARY,
@@ -64,6 +66,7 @@ def write_report(
     results: Mapping[str, tuple[Experiment, Evaluation]],
     videos: Mapping[str, ReportVideo] = MappingProxyType({}),
     driven: sections.CrossSection | None = None,
+    alive: runtime.Avatar | None = None,
 ) -> None:
     """Write the page of a run.
 
@@ -74,9 +77,12 @@ def write_report(
         results: The experiment and every frame's figures, by protocol.
         videos: Side-by-side videos by protocol, in or below the page's folder.
         driven: The section on cross-reenactment.
+        alive: The avatar whose film lies beside the page.
     """
+    first = next(iter(results.values()), None)
+    hero = sections.hero(alive, path.parent / FILM, first) if alive is not None and first is not None else None
     shown = {name: video.on_page(path.parent) for name, video in videos.items()}
-    text = report_html(run, protocols, results, shown, driven)
+    text = report_html(run, protocols, results, shown, driven, hero)
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
@@ -86,6 +92,7 @@ def report_html(
     results: Mapping[str, tuple[Experiment, Evaluation]],
     videos: Mapping[str, Video] = MappingProxyType({}),
     driven: sections.CrossSection | None = None,
+    hero: sections.Hero | None = None,
 ) -> str:
     """The page as text. `videos` holds a video by protocol."""
     command_line = _shortened(run.config["command_line"])
@@ -106,6 +113,7 @@ def report_html(
         name=run.name,
         version=run.config["mien"],
         command=shlex.join(command_line),
+        hero=hero,
         tiles=_tiles(run, protocols),
         tables=_tables(protocols),
         glossary=_glossary(protocols),

@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from mien import runtime
 from mien.avatar import Avatar
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
+from mien.evaluation.living import SIDE, strip, to_bytes
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import BASELINE_NAMES
 from mien.evaluation.page import Card, Cell, DataTable, Picture, Video, figure_text, picture_of, video_of
 from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
-from mien.pictures import Box, error_heat, to_uint8
+from mien.pictures import Box, error_heat, picture_uri, to_uint8
 from mien.render.mesh import render_mesh
 from mien.training.footage import Coverage, Frame, confidence_picture, filmed_words
 
@@ -44,6 +46,17 @@ _CROSS_NOTE = (
     "openings of mouth and eyes over the frames. The figures show how much of the motion arrives, not how good the "
     "pictures look."
 )
+
+
+@dataclass(frozen=True)
+class Hero:
+    """What a report opens with: the avatar alive, a filmed frame beside it, and a strip of its faces."""
+
+    film: Video
+    poster: str
+    """Data URI of the first picture of the film."""
+    filmed: Picture
+    faces: Sequence[Picture]
 
 
 @dataclass(frozen=True)
@@ -242,6 +255,23 @@ def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder:
     ]
     shown = [video_of(path, page_folder, "Driver, avatar") for path in videos]
     return CrossSection(DataTable([head], rows, _CROSS_NOTE), shown)
+
+
+def hero(alive: runtime.Avatar, film: Path, result: tuple[Experiment, Evaluation]) -> Hero:
+    """The avatar alive. The filmed frame is the first held-out one."""
+    experiment, evaluation = result
+    picture = to_bytes(alive.render(camera=alive.camera.square(SIDE))[0])
+    filmed = to_uint8(target_image(experiment, evaluation.frames[0]))
+    faces = [
+        picture_of(face, f"The avatar: {name}", _OVERLAY_SIZE, name.replace("_", " ").capitalize())
+        for name, face in strip(alive)
+    ]
+    return Hero(
+        video_of(film, film.parent, "The avatar in motion"),
+        picture_uri(picture),
+        picture_of(filmed, "A filmed frame", SIDE, "A filmed frame that training never saw"),
+        faces,
+    )
 
 
 def frame_name(experiment: Experiment, frame: Frame) -> str:

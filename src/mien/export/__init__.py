@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mien.export.glb_avatar import read_glb_avatar
     from mien.export.glb_file import Glb, read_glb
     from mien.export.packed import Motion, pack, unpacked
+    from mien.export.page_head import Described
     from mien.export.ply import read_ply, write_ply
     from mien.export.sog import read_sog, write_sog
     from mien.export.spz import read_spz, write_spz
@@ -26,6 +27,7 @@ else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
+    "Described",
     "GaussianAvatarsFolder",
     "Glb",
     "MeshModel",

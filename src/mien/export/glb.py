@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float32, Int
 
 from mien import runtime
-from mien.driving.motion import ARKIT_NAMES, gaze_of, within_lids
+from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
 from mien.export.glb_avatar import EXTENSION, avatar_extension
 from mien.export.glb_file import INDICES, VERTICES, GlbWriter
@@ -23,6 +23,7 @@ from mien.export.texture import FRONT_VIEWS, Shot, Surface, bake_texture
 from mien.files import check_writable
 from mien.picture_files import encode_picture
 from mien.runtime import Face, Gaussians, MeshBound, PortableAvatar, Rig
+from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
 from mien.runtime.posing import SH_C0, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 
@@ -113,14 +114,10 @@ def morph_targets(avatar: PortableAvatar, rig: Rig, face: Face) -> dict[str, Flo
         moved = rig_points(rig, replace(face, expression=expression)) - rest
         if avatar.expression_bounds[index, 0] < avatar.expression_bounds[index, 1]:
             found[name] = moved
-    eyes = [avatar.joint_names.index(name) for name in ("left_eye", "right_eye") if name in avatar.joint_names]
-    if len(eyes) == 2 and any(name in ARKIT_NAMES for name in avatar.expression_names):
-        for index, name in enumerate(ARKIT_NAMES):
-            if name.startswith("eyeLook") and name not in found:
-                coefficients = np.zeros((1, len(ARKIT_NAMES)), np.float32)
-                coefficients[0, index] = 1
-                joints = face.joints.copy()
-                joints[eyes] += within_lids(gaze_of(coefficients)[0])
+    if any(name in ARKIT_NAMES for name in avatar.expression_names):
+        for name in GAZE_NAMES:
+            if name not in found and is_gaze(name, avatar.joint_names):
+                joints = turned_eyes(face.joints, avatar.joint_names, {name: 1.0})
                 found[name] = rig_points(rig, replace(face, joints=joints)) - rest
     known = [name for name in ARKIT_NAMES if name in found]
     ordered = [*known, *(name for name in found if name not in known)]

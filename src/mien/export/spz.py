@@ -1,6 +1,8 @@
-"""The .spz format (Niantic, version 3): Gaussians with 8 to 24 bits a number, column by column, gzipped.
+"""The .spz format (Niantic, versions 3 and 4): Gaussians with 8 to 24 bits a number, column by column.
 
-Source: the README of github.com/nianticlabs/spz, which describes the header, the order of the columns and their bits.
+Version 3 is one gzip stream. Version 4 has a plain header, a table with the sizes of its columns, and each column as a
+Zstandard stream of its own; columns without a number are left out. Source: the README of github.com/nianticlabs/spz,
+which describes the headers, the order of the columns and their bits.
 """
 
 import gzip
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import zstandard
 
 from mien.bounded import read_bytes
 from mien.errors import UserError
@@ -18,8 +21,16 @@ from mien.export.splats import finite_arrays, unit_quats
 from mien.files import write_atomically
 from mien.gaussians import Gaussians
 
-_MAGIC, _VERSION = 0x5053474E, 3
+VERSIONS = (3, 4)
+"""Versions that are read and written. Version 4 is the current one; some programs read only 3."""
+_MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
+"""Magic number, version, count, degree, bits behind the point, flags, and in version 4 the number of columns."""
+_TABLE_AT, _ENTRY = 32, struct.Struct("<QQ")
+"""Where the table of version 4 lies if there are no extensions, and an entry of it: size packed and unpacked, in
+bytes."""
+_ZSTANDARD_LEVEL = 19
+"""A quarter of a second for 40,000 Gaussians, and 3 % smaller than the default."""
 _MAX_FRACTION = 16
 """Most bits of a position behind the point: steps of 15 micrometres."""
 _FIXED_BITS = 23
@@ -31,15 +42,20 @@ _QUAT_STEPS = 511
 _DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 """Degree of the spherical harmonics by the number of coefficients."""
 _MAX_BYTES, _MAX_GAUSSIANS = 1 << 28, 2_000_000
-_REMEDY = "give a .spz of version 3, as `mien export` writes"
+_REMEDY = "give a .spz of version 3 or 4, as `mien export` writes"
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> None:
+def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> None:
     """Write unbatched Gaussians in world space as .spz: +x right, +y up, +z to the viewer, in metres.
 
     Positions have steps of 2^-16 m (of more if one is beyond 128 m), scales steps of 6 %, colour coefficients steps of
     0.026 (0.0073 in colour), opacities steps of 1/255, higher coefficients steps of 1/128 within -1 to 1, and rotations
     10 bits for each of the three smallest components. The same Gaussians give the same bytes.
+
+    Args:
+        path: The file.
+        gaussians: The Gaussians.
+        version: Version of the format, 3 or 4.
 
     Raises:
         UserError: a value is NaN or infinite, or a position is too far away.
@@ -60,32 +76,30 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
         _packed_quats(unit_quats(quats)),
         _bytes(sh[:, 1:] * _SH_STEPS + _SH_STEPS),
     )
-    header = _HEADER.pack(_MAGIC, _VERSION, len(means), _DEGREES[sh.shape[1]], fraction, 0, 0)
-    data = gzip.compress(header + b"".join(column.tobytes() for column in columns), mtime=0)
+    assert version in VERSIONS, version
+    parts, facts = [column.tobytes() for column in columns], (len(means), _DEGREES[sh.shape[1]], fraction, 0)
+    if version == 3:
+        data = gzip.compress(_HEADER.pack(_MAGIC, version, *facts, 0) + b"".join(parts), mtime=0)
+    else:
+        data = _in_version_4([part for part in parts if part], facts)
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read a .spz file of version 3.
+    """Read a .spz file of version 3 or 4.
 
     Raises:
         UserError: the file is missing, damaged, of another version, or too large.
     """
     try:
         packed = read_bytes(path, _MAX_BYTES)
-        with gzip.GzipFile(fileobj=io.BytesIO(packed)) as file:
-            magic, version, count, degree, fraction, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-            if (magic, version) != (_MAGIC, _VERSION) or degree > 3 or fraction > _FIXED_BITS:
-                raise ValueError("it is of another version")
-            if count > _MAX_GAUSSIANS:
-                raise ValueError(f"it has {count:,} Gaussians, and at most {_MAX_GAUSSIANS:,} are read")
-            rest = (degree + 1) ** 2 - 1
-            shapes = [(count, 3, 3), (count,), (count, 3), (count, 3), (count, 4), (count, rest, 3)]
-            columns = [_column(file, shape) for shape in shapes]
-    except (OSError, EOFError, ValueError, struct.error, zlib.error) as error:
+        read = _read_version_4 if packed[:4] == struct.pack("<I", _MAGIC) else _read_version_3
+        fraction, columns = read(packed)
+    except (OSError, EOFError, ValueError, struct.error, zlib.error, zstandard.ZstdError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path}: cannot be read as .spz ({reason}); {_REMEDY}") from None
     places, opacities, colors, scales, quats, higher = columns
+    count = len(places)
     wide = np.concatenate([np.zeros((count, 3, 1), np.uint8), places], axis=2)
     means = (wide.reshape(count, 12).view("<i4") >> 8) / 2**fraction
     first = (colors.astype(np.float32) / 255 - 0.5) / _COLOR_SCALE
@@ -101,6 +115,63 @@ def read_spz(path: Path) -> Gaussians:
         sh,
     )
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
+
+
+def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
+    """The file of version 4 with these columns."""
+    compressor = zstandard.ZstdCompressor(level=_ZSTANDARD_LEVEL)
+    packed = [compressor.compress(part) for part in parts]
+    header = _HEADER.pack(_MAGIC, 4, *facts, len(parts)) + struct.pack("<I", _TABLE_AT)
+    table = b"".join(_ENTRY.pack(len(small), len(part)) for small, part in zip(packed, parts, strict=True))
+    return b"".join([header.ljust(_TABLE_AT, b"\0"), table, *packed])
+
+
+def _shapes(count: int, degree: int) -> list[tuple[int, ...]]:
+    """The shapes of all columns.
+
+    Raises:
+        ValueError: there are too many Gaussians.
+    """
+    if count > _MAX_GAUSSIANS:
+        raise ValueError(f"it has {count:,} Gaussians, and at most {_MAX_GAUSSIANS:,} are read")
+    return [(count, 3, 3), (count,), (count, 3), (count, 3), (count, 4), (count, (degree + 1) ** 2 - 1, 3)]
+
+
+def _read_version_3(packed: bytes) -> tuple[int, list[np.ndarray]]:
+    """The number of bits behind the point, and all columns, of a file of version 3."""
+    with gzip.GzipFile(fileobj=io.BytesIO(packed)) as file:
+        magic, version, count, degree, fraction, _, _ = _HEADER.unpack(file.read(_HEADER.size))
+        if (magic, version) != (_MAGIC, 3) or degree > 3 or fraction > _FIXED_BITS:
+            raise ValueError("it is of another version")
+        return fraction, [_column(file, shape) for shape in _shapes(count, degree)]
+
+
+def _read_version_4(packed: bytes) -> tuple[int, list[np.ndarray]]:
+    """The number of bits behind the point, and all columns, of a file of version 4."""
+    _, version, count, degree, fraction, _, streams = _HEADER.unpack_from(packed)
+    (table,) = struct.unpack_from("<I", packed, _HEADER.size)
+    if version != 4 or degree > 3 or fraction > _FIXED_BITS:
+        raise ValueError("it is of another version")
+    shapes, columns = _shapes(count, degree), []
+    if streams != sum(bool(np.prod(shape)) for shape in shapes) or table < _TABLE_AT:
+        raise ValueError("its table is damaged")
+    entry, at = table, table + streams * _ENTRY.size
+    for shape in shapes:
+        size = int(np.prod(shape))
+        if not size:
+            columns.append(np.zeros(shape, np.uint8))
+            continue
+        small, large = _ENTRY.unpack_from(packed, entry)
+        part = packed[at : at + small]
+        # The size is known, so a stream that would fill the memory is refused before it is unpacked.
+        if large != size or len(part) < small or zstandard.frame_content_size(part) not in (size, -1):
+            raise ValueError("it is truncated, or a column has another size")
+        data = zstandard.ZstdDecompressor().decompress(part, max_output_size=size)
+        if len(data) != size:
+            raise ValueError("a column has another size")
+        columns.append(np.frombuffer(data, np.uint8).reshape(shape))
+        entry, at = entry + _ENTRY.size, at + small
+    return fraction, columns
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

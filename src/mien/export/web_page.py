@@ -14,6 +14,7 @@ import numpy as np
 
 from mien import runtime
 from mien.export.packed import Motion, pack, unpacked
+from mien.export.page_head import Described, head_part, write_poster
 from mien.export.webcam import POLICY, WebcamFiles, webcam_part
 from mien.files import check_writable, write_atomically
 from mien.runtime import PortableAvatar
@@ -45,6 +46,7 @@ def write_page(
     motion: Motion | None = None,
     webcam: WebcamFiles | None = None,
     webgpu: bool = False,
+    described: Described | None = None,
 ) -> WrittenPage:
     """Write a page with an avatar, and a motion that it can play, as one file.
 
@@ -54,20 +56,30 @@ def write_page(
         motion: What the page can play. None for nothing.
         webcam: Files of the face landmarker, with which a webcam can drive the avatar. None for no webcam.
         webgpu: Whether the page draws with WebGPU where the browser has it on a GPU. WebGL2 is the default.
+        described: What the page says of itself. None for the avatar's name. With an address, a poster for messengers is
+            written beside the page, with its name and the ending .jpg.
 
     Raises:
         UserError: pages cannot draw the avatar's colours, a file cannot be read, or the path cannot be written.
     """
     check_writable(path)
+    described = described or Described(avatar.about.name)
+    poster = path.with_suffix(".jpg") if described.address else None
+    if poster:
+        check_writable(poster)
+    drawn = runtime.Avatar(avatar)
     packed = base64.b64encode(pack(avatar, motion)).decode()
     parts = {
+        "head": head_part(drawn, described, poster),
         "policy": POLICY if webcam else "",
         "webcam": webcam_part(webcam) if webcam else "",
-        "title": html.escape(avatar.about.name),
+        "title": html.escape(described.title),
         "webgpu": f"\n<script>{WEBGPU.read_text(encoding='utf-8').strip()}</script>" if webgpu else "",
         "avatar": packed,
     }
     content = filled(TEMPLATE.read_text(encoding="utf-8"), parts).encode()
+    if poster:
+        write_poster(poster, drawn)
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
     return WrittenPage(len(content), _psnr(avatar))
 

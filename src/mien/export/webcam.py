@@ -1,13 +1,14 @@
 """A webcam in a page: MediaPipe's face landmarker, embedded with its model (docs/web.md).
 
-webcam.html beside this file is built from web/ and committed. The landmarker comes from the npm package
-@mediapipe/tasks-vision, its model from a file of the user; neither comes with mien.
+webcam.html beside this file is built from web/ and committed. The landmarker's model comes with mien, in the folder
+`landmarker` beside this file. Its code is that of the npm package @mediapipe/tasks-vision, which `make setup` puts
+there.
 """
 
 import base64
 import gzip
+import hashlib
 import html
-import json
 import os
 import zipfile
 from dataclasses import dataclass
@@ -22,19 +23,19 @@ NOTICES = Path(__file__).with_name("webcam_notices.txt")
 PACKAGE, VERSION = "@mediapipe/tasks-vision", "0.10.35"
 """The npm package, and the version that pages are tested with. Later versions send statistics to their maker."""
 PACKAGE_VARIABLE, MODEL_VARIABLE = "MIEN_TASKS_VISION", "MIEN_FACE_LANDMARKER"
-"""Environment variables that name the package's folder and the model's file."""
-MODEL_ADDRESS = (
-    "https://storage.googleapis.com/mediapipe-models/face_landmarker/face_landmarker/float16/1/face_landmarker.task"
-)
-"""Where MediaPipe's documentation publishes the model (Apache-2.0)."""
+"""Environment variables that name the package's folder and the model's file, in place of mien's own."""
+OWN = Path(__file__).with_name("landmarker")
+"""Folder of what comes with mien: the model, its licence, and the files of the package, which `make landmarker` puts
+there."""
 POLICY = " blob: 'wasm-unsafe-eval'; worker-src blob:; connect-src 'none'; form-action 'none'; base-uri 'none'"
 """What the page's policy allows in addition: scripts and a worker that are in the page itself. Nothing else, and no
 connection at all."""
 _FILES = {
-    "vision": "vision_bundle.cjs",
-    "loader": "wasm/vision_wasm_internal.js",
-    "wasm": "wasm/vision_wasm_internal.wasm",
+    "vision": ("vision_bundle.cjs", "7fba4f9807297e229371318df577e96fc9f1b3d93e79075e3798ade2fc790c9e"),
+    "loader": ("vision_wasm_internal.js", "e7fd9858e8e8f221d9b96eddc11f8e077f263e0b7bbd79d3cbe882b134274f8c"),
+    "wasm": ("vision_wasm_internal.wasm", "6a5c64584c2ab61c763b6e204afbdbc7ce1caf7f5216187322bca8df94f646bc"),
 }
+"""Files of the package, with their SHA-256. Other files are refused, because later versions send statistics."""
 _MEMBERS = {"face_detector.tflite", "face_landmarks_detector.tflite", "face_blendshapes.tflite"}
 """Networks in a model that finds blend shapes."""
 _MOST_BYTES = 64 << 20
@@ -54,10 +55,10 @@ class WebcamFiles:
 def find_webcam_files(model: Path | None = None) -> WebcamFiles:
     """Return the landmarker's files on this machine.
 
-    The package is in the folder that MIEN_TASKS_VISION names, or else in web/node_modules of the checkout.
+    The package is in the folder that MIEN_TASKS_VISION names, or else in that of mien.
 
     Args:
-        model: The model's file. None for the one that MIEN_FACE_LANDMARKER names.
+        model: The model's file. None for the one that MIEN_FACE_LANDMARKER names, or else for that of mien.
 
     Raises:
         UserError: one of them is missing, is of another version, or is no such model.
@@ -71,7 +72,7 @@ def webcam_part(files: WebcamFiles) -> str:
     Raises:
         UserError: a file cannot be read.
     """
-    paths = {name: files.package / path for name, path in _FILES.items()} | {"model": files.model}
+    paths = {name: _place(files.package, path) for name, (path, _) in _FILES.items()} | {"model": files.model}
     parts = "\n".join(
         f'<script type="application/octet-stream" id="webcam-{name}">{_packed(path)}</script>'
         for name, path in paths.items()
@@ -88,35 +89,35 @@ def _packed(path: Path) -> str:
     return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
 
 
+def _place(folder: Path, name: str) -> Path:
+    """A file of the package, in whose own folder some lie in `wasm`."""
+    return next((path for path in (folder / name, folder / "wasm" / name) if path.is_file()), folder / name)
+
+
 def _package() -> Path:
     named = os.environ.get(PACKAGE_VARIABLE)
-    folder = Path(named) if named else Path(__file__).parents[3] / "web" / "node_modules" / PACKAGE
+    folder = Path(named) if named else OWN
     remedy = (
-        f"run `make web-packages` in mien's checkout, or unpack the result of `npm pack {PACKAGE}@{VERSION}` and set "
+        f"run `make landmarker` in mien's checkout, or unpack the result of `npm pack {PACKAGE}@{VERSION}` and set "
         f"{PACKAGE_VARIABLE} to its folder"
     )
-    try:
-        version = json.loads((folder / "package.json").read_text(encoding="utf-8")).get("version")
-    except (OSError, ValueError, AttributeError):
-        raise UserError(f"{folder}: --webcam needs the npm package {PACKAGE}, which is not there; {remedy}") from None
-    if version != VERSION:
-        raise UserError(f"{folder}: is version {version} of {PACKAGE}, and pages need {VERSION}; {remedy}")
-    missing = [path for path in _FILES.values() if not (folder / path).is_file()]
-    if missing:
-        raise UserError(f"{folder}: lacks {missing[0]}; {remedy}")
+    for name, expected in _FILES.values():
+        path = _place(folder, name)
+        try:
+            content = read_bytes(path, _MOST_BYTES)
+        except (OSError, ValueError):
+            raise UserError(f"{folder}: --webcam needs {name} of the npm package {PACKAGE}; {remedy}") from None
+        if hashlib.sha256(content).hexdigest() != expected:
+            raise UserError(f"{path}: is not that of version {VERSION} of {PACKAGE}, which pages need; {remedy}")
     return folder
 
 
 def _model(given: Path | None) -> Path:
     named = os.environ.get(MODEL_VARIABLE)
-    path = given or (Path(named) if named else None)
-    if path is None or not path.is_file():
-        missing = f"{path}: no such file" if path else "--webcam: no model"
-        raise UserError(
-            f"{missing}; --webcam needs MediaPipe's face_landmarker.task (Apache-2.0, 4 MB), which does not come with "
-            f"mien. Download it from {MODEL_ADDRESS}, and give its place with --webcam-model FILE, or set "
-            f"{MODEL_VARIABLE} to it"
-        )
+    path = given or (Path(named) if named else OWN / "face_landmarker.task")
+    remedy = "give MediaPipe's face landmarker with blend shapes, or leave it out: mien has one"
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; {remedy}")
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError
@@ -125,5 +126,5 @@ def _model(given: Path | None) -> Path:
     except (OSError, ValueError, zipfile.BadZipFile):
         sound = False
     if not sound:
-        raise UserError(f"{path}: is no face_landmarker.task with blend shapes; download it from {MODEL_ADDRESS}")
+        raise UserError(f"{path}: is no face_landmarker.task with blend shapes; {remedy}")
     return path

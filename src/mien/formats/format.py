@@ -67,6 +67,12 @@ class Options:
     """Whether a page draws with WebGPU where the browser has it."""
     webcam: "mien.export.WebcamFiles | None" = None
     """Files of the face landmarker, with which a webcam drives a page."""
+    spz_version: int = 4
+    """Version of a .spz file."""
+    title: str | None = None
+    """Title of a page. None for the avatar's name."""
+    address: str | None = None
+    """Address at which a page will be published."""
 
 
 def _no_check(path: Path) -> None:

@@ -10,8 +10,11 @@ _ITSELF = {"set": "a page sets every expression itself; leave --set out"}
 
 def _write_page(path: Path, content: Content, options: Options) -> str:
     motion = content.motion()
-    page = export.write_page(path, content.portable(confidence=False), motion, options.webcam, options.webgpu)
-    return _told(content, motion, page)
+    avatar = content.portable(confidence=False)
+    described = export.Described(options.title or avatar.about.name, options.address)
+    page = export.write_page(path, avatar, motion, options.webcam, options.webgpu, described)
+    poster = f"\n{path.with_suffix('.jpg')}: the picture that messengers show" if options.address else ""
+    return _told(content, motion, page) + poster
 
 
 def _write_packed(path: Path, content: Content, options: Options) -> str:
@@ -28,6 +31,11 @@ def _told(content: Content, motion: "export.Motion | None", page: "export.Writte
 
 
 PAGE = Format(
-    "html", "avatar", _write_page, (".html",), options=frozenset({"webgpu", "webcam"}), refusals=_ITSELF
-)  # fmt: skip
+    "html",
+    "avatar",
+    _write_page,
+    (".html",),
+    options=frozenset({"webgpu", "webcam", "title", "address"}),
+    refusals=_ITSELF,
+)
 PACKED = Format("packed", "avatar", _write_packed, (".packed",), refusals=_ITSELF)

@@ -22,6 +22,7 @@ from mien.runtime.baked import (
     Static,
 )
 from mien.runtime.file import read_portable, write_portable
+from mien.runtime.named import presets, presets_for
 from mien.runtime.posing import Face, Gaussians, pose
 
 __all__ = [
@@ -42,6 +43,8 @@ __all__ = [
     "Static",
     "load",
     "pose",
+    "presets",
+    "presets_for",
     "read_portable",
     "render",
     "write_portable",

@@ -10,6 +10,7 @@ from jaxtyping import Float32
 from mien import _native
 from mien.runtime.baked import Camera, PortableAvatar
 from mien.runtime.file import read_portable
+from mien.runtime.named import Part, is_gaze, parts_of, presets_for, turned_eyes
 from mien.runtime.posing import Face, Gaussians, pose
 from mien.runtime.rotation import compose_rigid
 from mien.threads import asked_threads
@@ -48,10 +49,13 @@ class Avatar:
         head_translation: Vector | None = None,
     ) -> Face:
         """Face parameters of the person at rest, with the given ones replaced (see `pose`)."""
-        rest = self.portable.neutral
+        rest, looking = self.portable.neutral, self.portable.neutral.joints
+        if isinstance(expression, Mapping):
+            expression, look = self._coefficients(expression)
+            looking = turned_eyes(looking, self.joint_names, look)
         return Face(
             _with_named(rest.expression, expression, self.expression_names, "expression"),
-            _with_named(rest.joints, joints, self.joint_names, "joint"),
+            _with_named(looking, joints, self.joint_names, "joint"),
             _vector(rest.head_rotation, head_rotation, "head_rotation"),
             _vector(rest.head_translation, head_translation, "head_translation"),
         )
@@ -67,6 +71,8 @@ class Avatar:
 
         Args:
             expression: Coefficients by name (others stay at rest), or all of them in the order of `expression_names`.
+                ARKit's names of gaze, such as eyeLookUpLeft, turn the eyes by up to 30 degrees from where they look at
+                rest. Names of preset faces, such as smile, stand for several expressions, within their bounds.
             joints: Axis-angle vectors in radians by name, or all of them [j, 3] in the order of `joint_names`.
             head_rotation: Axis-angle vector of the head in world space, in radians.
             head_translation: Position of the head's origin in world space, in metres.
@@ -75,6 +81,23 @@ class Avatar:
             ValueError: a name is unknown, a shape is wrong, or a number is not finite.
         """
         return pose(self.portable.baked, self.face(expression, joints, head_rotation, head_translation))
+
+    def _coefficients(self, named: Mapping[str, float | int]) -> tuple[dict[str, float], dict[str, float]]:
+        """Coefficients of expressions, and those of the gaze, that names of expressions, gaze and presets stand for."""
+        names, bounds, rest = list(self.expression_names), self.portable.expression_bounds, self.portable.neutral
+        shown = presets_for(names, self.joint_names)
+        values: dict[str, float] = {}
+        look: dict[str, float] = {}
+        for name, value in named.items():
+            for part in parts_of(name, float(value)) if name in shown else [Part(name, float(value), False)]:
+                if is_gaze(part.name, self.joint_names):
+                    look[part.name] = part.value
+                elif part.is_added:
+                    at = names.index(part.name)
+                    values[part.name] = float(np.clip(rest.expression[at] + part.value, *bounds[at]))
+                else:
+                    values[part.name] = part.value
+        return values, look
 
     def render(
         self,

@@ -213,6 +213,13 @@ class Camera:
         scale = np.array([[width / self.width], [height / self.height], [1.0]], np.float32)
         return Camera(self.K * scale, self.viewmat, width, height)
 
+    def square(self, side: int) -> "Camera":
+        """The same view in a square picture, which holds the whole picture of this camera in its middle."""
+        scale = side / max(self.width, self.height)
+        K = self.K * np.array([[scale], [scale], [1.0]], np.float32)
+        K[:2, 2] += (side - scale * np.array([self.width, self.height], np.float32)) / 2
+        return Camera(K, self.viewmat, side, side)
+
 
 @dataclass(frozen=True, eq=False)
 class Neutral:

@@ -1,7 +1,7 @@
-"""Expressions for people: groups with readable names, a search, presets, and random faces."""
+"""Expressions for people: groups with readable names, a search, and random faces."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32
@@ -15,38 +15,6 @@ GROUPS = (
 )
 """Titles of groups, and how the names of their expressions begin. Other expressions are in the group `OTHER`."""
 OTHER = "Other"
-PRESETS: Mapping[str, Mapping[str, float]] = {
-    "smile": {
-        "mouthSmileLeft": 0.7, "mouthSmileRight": 0.7, "cheekSquintLeft": 0.4, "cheekSquintRight": 0.4,
-        "eyeSquintLeft": 0.2, "eyeSquintRight": 0.2,
-    },
-    "laugh": {
-        "mouthSmileLeft": 0.8, "mouthSmileRight": 0.8, "jawOpen": 0.35, "mouthUpperUpLeft": 0.3,
-        "mouthUpperUpRight": 0.3, "cheekSquintLeft": 0.6, "cheekSquintRight": 0.6, "eyeSquintLeft": 0.4,
-        "eyeSquintRight": 0.4,
-    },
-    "surprise": {
-        "jawOpen": 0.4, "browInnerUp": 0.8, "browOuterUpLeft": 0.7, "browOuterUpRight": 0.7, "eyeWideLeft": 0.7,
-        "eyeWideRight": 0.7,
-    },
-    "anger": {
-        "browDownLeft": 0.8, "browDownRight": 0.8, "noseSneerLeft": 0.5, "noseSneerRight": 0.5, "mouthPressLeft": 0.4,
-        "mouthPressRight": 0.4, "eyeSquintLeft": 0.3, "eyeSquintRight": 0.3,
-    },
-    "sadness": {
-        "browInnerUp": 0.7, "mouthFrownLeft": 0.6, "mouthFrownRight": 0.6, "mouthShrugLower": 0.4,
-        "eyeLookDownLeft": 0.2, "eyeLookDownRight": 0.2,
-    },
-    "disgust": {
-        "noseSneerLeft": 0.8, "noseSneerRight": 0.8, "mouthUpperUpLeft": 0.5, "mouthUpperUpRight": 0.5,
-        "browDownLeft": 0.4, "browDownRight": 0.4,
-    },
-    "kiss": {"mouthPucker": 0.8, "mouthFunnel": 0.2},
-    "closed eyes": {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
-    "wink": {"eyeBlinkLeft": 1.0, "mouthSmileLeft": 0.4, "cheekSquintLeft": 0.4},
-    "open mouth": {"jawOpen": 0.7},
-}  # fmt: skip
-"""Faces by name, as coefficients of ARKit's expressions that are added to the person at rest."""
 RANDOM_EXPRESSIONS = 6
 """Number of expressions in a random face. Those of a left and a right side count once."""
 _MOST = 0.7
@@ -78,24 +46,6 @@ def matches(text: str, name: str) -> bool:
     """Whether every word of a search is in an expression's name, readable name or group. No word matches everything."""
     where = f"{name} {readable(name)} {group_of(name)}".lower()
     return all(word in where for word in text.lower().split())
-
-
-def presets_for(names: Sequence[str]) -> list[str]:
-    """The presets of which a face model has all expressions."""
-    return [preset for preset, values in PRESETS.items() if values.keys() <= set(names)]
-
-
-def preset_expression(
-    preset: str,
-    names: Sequence[str],
-    rest: Float32[np.ndarray, " e"],
-    bounds: Float32[np.ndarray, "e 2"],
-) -> Float32[np.ndarray, " e"]:
-    """The coefficients of a preset, added to the person at rest, within the bounds of the face model."""
-    expression = rest.copy()
-    for name, value in PRESETS[preset].items():
-        expression[list(names).index(name)] += value
-    return np.clip(expression, bounds[:, 0], bounds[:, 1])
 
 
 def random_expression(

@@ -8,10 +8,11 @@ from typing import Any, get_args
 import numpy as np
 import viser
 
+from mien import runtime
 from mien.errors import UserError
 from mien.terminal import printable
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
-from mien.viewer.faces import grouped, matches, presets_for, readable
+from mien.viewer.faces import grouped, matches, readable
 from mien.viewer.files import Stopped, screenshot, video
 from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Session, center_of
@@ -60,6 +61,9 @@ class Panel:
         self._time: viser.GuiSliderHandle[int] | None = None
         self._report: viser.GuiMarkdownHandle | None = None
         self._followed_at, self._stopping = 0.0, False
+        self._play: viser.GuiButtonHandle | None = None
+        self._play_asked = False
+        """Whether Play was pressed before a motion was there."""
         self._stills = Worker("mien-stills", failed, _MOST_STILLS)
         self._videos = Worker("mien-videos", failed, most=0)
         self._motions, self._switching = Worker("mien-motions", failed), Worker("mien-camera", failed)
@@ -90,6 +94,7 @@ class Panel:
         if moves and now - self._followed_at < _FOLLOW_SECONDS:
             return
         self._followed_at = now
+        self._name_play()
         if self._report is not None and self._camera is not None:
             self._report.content = _plain_lines(self._camera.report())
         if self._time is not None:
@@ -105,6 +110,13 @@ class Panel:
             slider.value = _rounded(values[name], slider.min, slider.max)
         if self._time is not None:
             self._time.value = self._session.timestep
+        self._name_play()
+
+    def _name_play(self) -> None:
+        """Let the button say what it does: play or pause."""
+        label = "Pause" if self._session.playing else "Play"
+        if self._play is not None and self._play.label != label:
+            self._play.label = label
 
     def _add_camera(self, camera: CameraSwitch) -> None:
         gui, session = self._server.gui, self._session
@@ -142,6 +154,7 @@ class Panel:
             play = gui.add_button("Play")
             timeline = self._time = gui.add_slider("Frame", 0, 1, 1, 0)
             filmed = gui.add_checkbox("Filmed frame beside it", False)
+        self._play = play
         before = [_NOTHING]
 
         def choose(name: str, client: viser.ClientHandle | None) -> None:
@@ -150,11 +163,15 @@ class Panel:
             try:
                 session.choose(None if name == _NOTHING else name)
             except UserError as error:
+                self._play_asked = False
                 self._complain(client, str(error))
                 if chosen.value == name:
                     chosen.value = before[0]
                 return
             before[0] = name
+            if self._play_asked and session.clip is not None:
+                session.play(True, time.monotonic())
+            self._play_asked = False
             timeline.max = max(1, len(session.clip.motion) - 1) if session.clip else 1
             self.move_sliders()
 
@@ -165,6 +182,14 @@ class Panel:
 
         @play.on_click
         async def _(event: Any) -> None:
+            if session.clip is None:
+                # It plays once it is loaded: the motion that was chosen just now, or else the first one.
+                self._play_asked = True
+                if chosen.value == _NOTHING:
+                    chosen.value = session.clip_names[0]
+                name = chosen.value
+                self._motions.ask("motion", lambda: choose(name, event.client))
+                return
             session.play(not session.playing, time.monotonic())
             self.move_sliders()
 
@@ -181,7 +206,8 @@ class Panel:
         with gui.add_folder("Face"):
             rest = gui.add_button("At rest")
             anyone = gui.add_button("Random face")
-            names = presets_for(session.avatar.expression_names)
+            avatar = session.avatar
+            names = {readable(name): name for name in runtime.presets_for(avatar.expression_names, avatar.joint_names)}
             preset = gui.add_dropdown("Preset", (_NOTHING, *names), initial_value=_NOTHING) if names else None
 
         @rest.on_click
@@ -201,7 +227,7 @@ class Panel:
                 if preset.value == _NOTHING:
                     session.rest()
                 else:
-                    session.take_preset(preset.value)
+                    session.take_preset(names[preset.value])
                 self.move_sliders()
 
     def _add_expressions(self) -> None:

@@ -29,7 +29,7 @@ from mien.viewer.drawing import (
     in_corner,
     words_about_view,
 )
-from mien.viewer.faces import preset_expression, random_expression
+from mien.viewer.faces import random_expression
 
 DEFAULT_HEIGHT = 512
 """Largest height of a picture in pixels, at first."""
@@ -154,11 +154,8 @@ class Session:
         self._take(self.avatar.face())
 
     def take_preset(self, preset: str) -> None:
-        """Show a preset of `mien.viewer.faces`, of which the avatar has all expressions."""
-        portable = self.avatar.portable
-        rest, bounds = portable.neutral.expression, portable.expression_bounds
-        expression = preset_expression(preset, portable.expression_names, rest, bounds)
-        self._take(self.avatar.face(expression))
+        """Show a preset face that the avatar has (`mien.runtime.presets_for`)."""
+        self._take(self.avatar.face({preset: 1.0}))
 
     def take_random(self, random: np.random.Generator) -> None:
         """Show a random face, softly within what was filmed if that is known."""

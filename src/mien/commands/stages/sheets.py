@@ -11,12 +11,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.driving import ARKIT_NAMES, Motion, face_of_motion
-from mien.driving.motion import gaze_of
+from mien.driving import ARKIT_NAMES
 from mien.face import FaceModel, FaceParams
 from mien.pictures import WHITE, picture_grid
 from mien.render.camera_paths import orbit
 from mien.runtime.baked import Filmed
+from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
 
 TURNTABLE_TILES = 9
 """Number of angles on a sheet of a turntable."""
@@ -47,10 +47,11 @@ def expression_tiles(model: FaceModel, face: FaceParams, camera: Camera, strengt
     tiles, joints = [Tile("as it is", face, camera)], face.joints
     named = [name for name in ARKIT_NAMES if name in model.expression_names]
     for name in named or model.expression_names:
-        if name.startswith("eyeLook"):
-            turned = _gaze(model, name, strength)
-            if not torch.equal(turned, torch.zeros_like(turned)):
-                tiles.append(Tile(f"{name} {strength:.2f}", replace(face, joints=joints + turned.to(joints)), camera))
+        if name in GAZE_NAMES:
+            if is_gaze(name, model.free_joint_names):
+                turned = turned_eyes(joints.detach().cpu().numpy(), model.free_joint_names, {name: strength})
+                looking = replace(face, joints=torch.from_numpy(turned).to(joints))
+                tiles.append(Tile(f"{name} {strength:.2f}", looking, camera))
             continue
         lower, upper = model.expression_bounds[model.expression_names.index(name)].tolist()
         value = min(max(strength, lower), upper)
@@ -105,11 +106,3 @@ def _with(face: FaceParams, model: FaceModel, name: str, value: float) -> FacePa
     expression = face.expression.clone()
     expression[:, model.expression_names.index(name)] = value
     return replace(face, expression=expression)
-
-
-def _gaze(model: FaceModel, name: str, strength: float) -> Float[Tensor, "1 j 3"]:
-    """The turn of the eyes for one of ARKit's eyeLook expressions."""
-    coefficients, still = np.zeros((1, len(ARKIT_NAMES)), np.float32), np.zeros((1, 3), np.float32)
-    coefficients[0, ARKIT_NAMES.index(name)] = strength
-    face, _ = face_of_motion(Motion(30.0, coefficients, gaze_of(coefficients), still, still, 0), model)
-    return face.joints

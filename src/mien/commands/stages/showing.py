@@ -1,0 +1,66 @@
+"""What `mien create` ends with: a page and a film of the avatar, and what to do next."""
+
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from mien.avatar import load_avatar
+from mien.commands.stages.exporting import RunContent, Series
+from mien.errors import UserError
+from mien.evaluation.living import FILM, living, write_film
+from mien.export import Motion, write_page
+from mien.files import write_atomically
+from mien.progress import say
+from mien.training import read_run_config, run_camera
+from mien.workspace import Workspace
+
+PAGE, MOVIE = "me.html", "me.mp4"
+"""Names of the page and the film in the workspace."""
+_SECONDS = 8.0
+"""Length of the filmed motion that the page plays, in seconds."""
+
+
+def show_avatar(workspace: Workspace, run: str) -> None:
+    """Write DIR/me.html and DIR/me.mp4 of a run, and name what to do next.
+
+    An avatar that may not be passed on, or that pages cannot draw, gets no page, with a message.
+    """
+    root, run_dir = workspace.root, workspace.run_dir(run)
+    which = ["--run", run] if len(workspace.run_names()) > 1 else []
+    try:
+        film = run_dir / FILM
+        if not film.is_file():
+            alive = living(load_avatar(run_dir), run_camera(run_dir), root.resolve().name)
+            if alive is not None:
+                write_film(film, alive)
+        if film.is_file():
+            write_atomically(root / MOVIE, lambda aside: _copy(film, aside))
+            say(f"{root / MOVIE}: five seconds of the avatar")
+    except UserError as error:
+        say(f"no film: {error}")
+    try:
+        content = RunContent(workspace, run, (), Series(read_run_config(run_dir)["data"][0]["sequence"]))
+        page = write_page(root / PAGE, content.portable(confidence=False), _first_seconds(content.motion()))
+        say(f"{root / PAGE}: the living avatar, {page.size / 1e6:.1f} MB; open it in a browser, or send it")
+    except UserError as error:
+        say(f"no page: {error}")
+    for command, does in (
+        (["view", str(root), *which], "turn it, and move its face"),
+        (["drive", str(root), *which, "--by", "camera"], "your own face drives it"),
+        (["export", str(root), *which, "--webcam", "--out", "be_me.html"], "a page that the viewer's face drives"),
+        (["export", str(root), *which, "--out", "me.glb"], "for Blender and engines"),
+    ):
+        say(f"Next: {shlex.join(['mien', *command])}   # {does}")
+
+
+def _copy(film: Path, aside: Path) -> None:
+    shutil.copyfile(film, aside)
+
+
+def _first_seconds(motion: Motion | None) -> Motion | None:
+    if motion is None:
+        return None
+    count = max(1, round(_SECONDS * motion.fps))
+    names = ("expression", "joints", "head_rotation", "head_translation")
+    return replace(motion, **{name: getattr(motion, name)[:count] for name in names})

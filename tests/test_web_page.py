@@ -1,0 +1,189 @@
+"""The page as people meet it: it opens alive, its faces are buttons, and everybody can use it."""
+
+import gzip
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mien import runtime
+from mien.cli import main
+from mien.errors import UserError
+from mien.export import Described, Motion, write_page
+from mien.export.page_head import POSTER, check_address
+from mien.export.web_page import TEMPLATE
+from web_case import WEB, browse, chromium, drawn_head, faces_of, node
+
+MOST_BYTES = 22_000
+
+
+def test_the_page_without_an_avatar_is_small() -> None:
+    assert len(gzip.compress(TEMPLATE.read_bytes(), 9)) <= MOST_BYTES
+
+
+@pytest.fixture(scope="module")
+def portable() -> runtime.PortableAvatar:
+    return drawn_head(300, rank=2)
+
+
+@pytest.fixture(scope="module")
+def page(portable: runtime.PortableAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    chromium()
+    faces = faces_of(portable, 3)
+    motion = Motion(*(np.stack([getattr(face, name) for face in faces]) for name in vars(faces[0])), fps=5.0)
+    path = tmp_path_factory.mktemp("page") / "a.html"
+    write_page(path, portable, motion)
+    return path
+
+
+ALIVE = """(async () => {
+  const viewer = await mien, blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft"), seen = new Set();
+  const eye = 3 * viewer.avatar.joint_names.indexOf("left_eye"), box = viewer.canvas.getBoundingClientRect();
+  const first = viewer.yaw, until = async (ready) => {
+    for (const began = performance.now(); !ready() && performance.now() - began < 40000; ) {
+      if (viewer.playing) seen.add(viewer.timestep);
+      await new Promise((done) => setTimeout(done, 5));
+    }
+  };
+  const played = viewer.playing;
+  await until(() => !viewer.playing);
+  let closed = 0;
+  await until(() => (closed = Math.max(closed, viewer.shown.expression[blink])) > 0.3 && viewer.yaw === 0);
+  const middle = { clientX: box.right, clientY: box.top + box.height / 2 };
+  const look = () => dispatchEvent(new PointerEvent("pointermove", middle));
+  await until(() => (look(), viewer.shown.joints[eye + 1] > 0.25));
+  return [first, viewer.yaw, played, seen.size, viewer.playing, closed, viewer.shown.joints[eye + 1]];
+})()"""
+
+
+@pytest.mark.slow
+def test_a_page_opens_alive(page: Path) -> None:
+    """The camera turns to the front, the filmed motion plays once, then the head blinks and looks at the pointer."""
+    told = browse(page, [ALIVE], size=(300, 200), device=["lively"])
+    first, last, played, timesteps, playing, closed, gaze = told["results"][0]
+    assert (told["requests"], told["messages"]) == ([], [])
+    assert first > 0.2
+    assert last == 0
+    assert (played, playing) == (True, False)
+    assert timesteps >= 2
+    assert closed > 0.3
+    assert gaze > 0.25
+
+
+STILL = "(async () => { const v = await mien; return [v.yaw, v.playing, document.getElementById('idle').checked]; })()"
+PRESS = """(async () => {
+  const viewer = await mien, [smile] = [...document.querySelectorAll("#faces [aria-pressed]")];
+  const told = [[...document.querySelectorAll("#faces [aria-pressed]")].map((button) => button.textContent)];
+  const state = () => [smile.getAttribute("aria-pressed"), Array.from(viewer.face.expression)];
+  smile.click();
+  told.push(state());
+  smile.click();
+  told.push(state());
+  const press = (key) => document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  press("1");
+  told.push(state());
+  const yaw = viewer.yaw;
+  press("ArrowLeft");
+  press(" ");
+  told.push([viewer.yaw - yaw, viewer.playing]);
+  viewer.play(false);
+  document.getElementById("reset").click();
+  return told;
+})()"""
+GAZE = """(async () => {
+  const viewer = await mien, pixels = () => {
+    viewer.draw();
+    const { width, height } = viewer.canvas, copy = new OffscreenCanvas(width, height).getContext("2d");
+    copy.drawImage(viewer.canvas, 0, 0);
+    return copy.getImageData(0, 0, width, height).data;
+  };
+  const before = pixels(), slider = document.getElementById("eyeLookUpLeft");
+  slider.value = "1";
+  slider.dispatchEvent(new Event("input", { bubbles: true }));
+  const after = pixels(), eye = 3 * viewer.avatar.joint_names.indexOf("left_eye");
+  return [after.filter((value, k) => Math.abs(value - before[k]) > 8).length, viewer.face.joints[eye],
+    viewer.setExpression("smirk", 1), viewer.setExpression("eyeLookInRight", 0.5)];
+})()"""
+MARKS = """(async () => {
+  await mien;
+  const { style } = document.getElementById("jawOpen");
+  return [style.getPropertyValue("--a"), style.getPropertyValue("--b"), document.getElementById("filmed").hidden];
+})()"""
+
+
+@pytest.mark.slow
+def test_faces_are_buttons_and_keys_work_without_a_click(page: Path, portable: runtime.PortableAvatar) -> None:
+    """Who asks for reduced motion gets a page that stands still, and faces that come at once."""
+    told = browse(page, [STILL, PRESS, GAZE, MARKS], size=(300, 200))
+    assert (told["requests"], told["messages"]) == ([], [])
+    still, (labels, pressed, released, by_key, (turned, playing)), moves, marks = told["results"]
+    assert still == [0, False, False]
+    assert labels[:4] == ["Smile", "Laugh", "Surprise", "Wink"]
+    smile, rest = runtime.Avatar(portable).face({"smile": 1.0}).expression, portable.neutral.expression
+    for (state, expression), expected, on in (
+        (pressed, smile, "true"),
+        (released, rest, "false"),
+        (by_key, smile, "true"),
+    ):
+        assert state == on
+        np.testing.assert_allclose(expression, expected, atol=1e-3)
+    assert turned == pytest.approx(0.1)
+    assert playing is True
+    moved, pitch, *works = moves
+    assert moved > 20
+    assert pitch < -0.2
+    assert works == [False, True]
+    # What was filmed goes from 0 to 1 in `drawn_head`.
+    assert marks == ["0%", "100%", False]
+
+
+AXE = """(async () => {
+  await mien;
+  document.getElementById("%s")?.click();
+  document.querySelectorAll("details").forEach((each) => (each.open = true));
+  const { violations } = await axe.run();
+  return violations.map(({ id, nodes }) => [id, nodes[0].html]);
+})()"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", [[], ["dark", "touch"]])
+def test_everybody_can_use_the_page(page: Path, device: list[str]) -> None:
+    node()
+    axe = (WEB / "node_modules" / "axe-core" / "axe.min.js").read_text()
+    told = browse(page, [axe + ";0", AXE % "none", AXE % "more"], size=(390, 700), device=device)
+    assert told["results"][1:] == [[], []]
+
+
+def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.PortableAvatar) -> None:
+    described = Described('Ada & "Bo"', "https://example.org/heads/a.html")
+    write_page(tmp_path / "a.html", portable, described=described)
+    text = (tmp_path / "a.html").read_text()
+    assert "<title>Ada &amp; &quot;Bo&quot;</title>" in text
+    assert '<meta property="og:image" content="https://example.org/heads/a.jpg">' in text
+    assert '<meta property="og:title" content="Ada &amp; &quot;Bo&quot;">' in text
+    poster = cv2.imread(str(tmp_path / "a.jpg"))
+    assert poster is not None
+    assert poster.shape == (POSTER[1], POSTER[0], 3)
+    middle, edge = poster[200:430, 500:700].astype(float), poster[:, :60].astype(float)
+    assert middle.std() > 20
+    assert edge.std() < 12
+    write_page(tmp_path / "b.html", portable)
+    assert "og:" not in (tmp_path / "b.html").read_text()
+    assert not (tmp_path / "b.jpg").exists()
+
+
+def test_an_address_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for address in ("me.html", "javascript:alert(1)", "https://"):
+        with pytest.raises(UserError, match="is no address; give one such as"):
+            check_address(address)
+    runtime.write_portable(tmp_path / "me.mien", replace(drawn_head(10), filmed=None))
+    for option, value in (("--title", "Ada"), ("--address", "https://example.org/a.html")):
+        assert main(["export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "a.packed"), option, value]) == 2
+        assert "only an .html page has" in capsys.readouterr().err
+    given = ["--title", "Ada", "--address", "https://example.org/a.html"]
+    assert main(["export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "a.html"), *given]) == 0
+    assert (tmp_path / "a.jpg").is_file()
+    assert "<title>Ada</title>" in (tmp_path / "a.html").read_text()
