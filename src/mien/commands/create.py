@@ -80,8 +80,8 @@ class Command:
         from mien.commands.stages.capturing import check_camera_ids
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
-        from mien.commands.stages.tracking import check_masks
         from mien.commands.stages.showing import show_avatar
+        from mien.commands.stages.tracking import check_masks
         from mien.progress import say, whole_command
         from mien.training import check_run, check_untouched
 
