@@ -65,6 +65,7 @@ def test_nerface(scene: Scene, tmp_path: Path) -> None:
     assert isinstance(train, FilmedSequence)
     assert (train.capture.name, test.capture.name) == ("train", "test")
     assert train.foreign["expression"][:, 0].tolist() == [0, 1, 2, 3], "the order of time"
+    assert train.capture.calibration is not None
     camera = train.capture.calibration[0]
     for sequence, timesteps in ((train, range(4)), (test, [5])):
         for index, timestep in enumerate(timesteps):
@@ -72,6 +73,8 @@ def test_nerface(scene: Scene, tmp_path: Path) -> None:
             image, _ = draw(scene, vertices, UNEQUAL, *head_view(timestep))
             assert np.array_equal(sequence.capture.images[index, 0], image)
             check_poses(sequence.foreign["head_to_camera"][index], vertices, timestep, camera.K.numpy(), 0.6)
+    assert train.own_split is not None
+    assert test.own_split is not None
     assert not train.own_split.timesteps
     assert test.own_split.whole(1)
 

@@ -161,7 +161,7 @@ def test_a_tracking_that_does_not_fit_its_pictures_is_refused(scene: Scene, tmp_
     folder = write_insta(tmp_path / "me", scene)
     for number in range(7):
         frame = tracker_frame(scene, min(number, 5), OFF_CENTRE)
-        frame["opencv"]["t"] += np.float32([0.15, 0, 0])
+        frame["opencv"]["t"] += np.array([0.15, 0, 0], np.float32)
         write_frame(folder / f"checkpoint/{number:05d}.frame", frame)
     with pytest.raises(UserError, match="of the tracked head lies on the person in me"):
         list(find_dataset("insta").read(folder, scene.model))  # type: ignore[arg-type]

@@ -110,7 +110,7 @@ def filmed_sequence(
     _check_cameras(path, cameras)
     _check_fps(path, fps)
     landmarks = detected_landmarks(images) if landmarks is None else landmarks
-    valid = np.isfinite(landmarks).all((2, 3))
+    valid = np.asarray(np.isfinite(landmarks).all((2, 3)))
     if not valid.any():
         raise UserError(f"{path}: no face is found in the pictures of {name}; {REMEDY}")
     views = tuple(cameras.values())
