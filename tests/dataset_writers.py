@@ -45,7 +45,8 @@ def tracker_frame(scene: Scene, timestep: int, K: np.ndarray) -> dict[str, Any]:
     return {
         "flame": {
             "exp": float32(scene.expr[timestep][None]), "shape": float32(scene.shape[None]),
-            "jaw": float32(six(scene.pose[timestep, 2])), "eyes": float32(eyes), "eyelids": float32(np.array([[0.1, 0.4]])),
+            "jaw": float32(six(scene.pose[timestep, 2])), "eyes": float32(eyes),
+            "eyelids": float32(np.array([[0.1, 0.4]])),
         },
         "opencv": {"R": float32(rotation[None]), "t": float32(translation[None]), "K": float32(K[None])},
         "img_size": np.array([SIDE, SIDE]), "frame_id": f"{timestep:05d}", "global_step": 7,
