@@ -126,8 +126,8 @@ def test_each_protocol_has_a_video_and_a_place_in_the_report(
     for name, frames in (("self_reenactment", 20), ("self_reenactment_sequence", 40), ("novel_view", 40)):
         assert probe_video(run_dir / "videos" / f"{name}.mp4").frames == frames
     page = (run_dir / "report.html").read_text()
-    assert page.count("<video") == 3
-    assert page.count('src="data:video/mp4;base64,') == 3
+    assert page.count("<video") == 4, "the film of the avatar comes first"
+    assert page.count('src="data:video/mp4;base64,') == 4
     assert 'href="videos/novel_view.mp4"' in page
     assert "40 of 100 frames" in page
     _, first = next(read_video_frames(run_dir / "videos" / "novel_view.mp4"))
