@@ -305,7 +305,7 @@ def test_the_program_that_reads_spz_4_sees_the_same_picture(tmp_path: Path) -> N
         rasterize(each, camera, torch.ones(3)).image
         for each in (in_world(replace(found, T_world_local=HALF_TURN)), read_spz(tmp_path / "a.spz"), written)
     ]
-    theirs, ours, exact = pictures
+    theirs, ours, exact = (picture.detach() for picture in pictures)
     assert float(exact.std()) > 0.05
     assert -10 * math.log10(float((theirs - ours).square().mean()) + 1e-12) >= 40
 

@@ -179,7 +179,6 @@ class Command:
         return UserError(f"{self.out}: cannot write {ending}; use {use}{folder}")
 
     def _check_options(self, kind: Format) -> None:
-        from mien.export.page_head import check_address
         from mien.export.webcam import find_webcam_files
 
         given = {"webgpu": self.webgpu, "sh": self.sh is not None, "webcam": self.webcam}
@@ -189,6 +188,8 @@ class Command:
             if is_given and option not in kind.options:
                 raise UserError(f"{self.out}: {_REFUSED[option]}")
         if self.address is not None:
+            from mien.export.page_head import check_address
+
             check_address(self.address)
         if self.webcam_model is not None and not self.webcam:
             raise UserError(f"--webcam-model {self.webcam_model}: give it together with --webcam")
