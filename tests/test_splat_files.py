@@ -297,7 +297,7 @@ def test_the_program_that_reads_spz_4_sees_the_same_picture(tmp_path: Path) -> N
     written = some(1000, 4)
     write_spz(tmp_path / "a.spz", written)
     found = opened_elsewhere(tmp_path / "a.spz", tmp_path / "a.ply")
-    camera = Camera(torch.tensor([[60.0, 0, 64], [0, 60, 64], [0, 0, 1]]), torch.eye(4), 128, 128)
+    camera = Camera(torch.tensor([[600.0, 0, 64], [0, 600, 64], [0, 0, 1]]), torch.eye(4), 128, 128)
     turned = torch.eye(4)
     turned[2, 3] = 4
     camera = replace(camera, viewmat=turned)
