@@ -1,4 +1,4 @@
-"""Settings of tracking: the fit to landmarks, the fit to pixels, the paper's descent, and the scoring mask."""
+"""Settings of tracking: the fit to landmarks, the fit to pixels, and the paper's descent."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -103,17 +103,16 @@ class PaperSettings:
     """Tracking by gradient descent as in the supplement of GaussianAvatars (section A), from a better start."""
 
     start: Literal["fast", "landmarks"] = "fast"
-    """Start of the fit. fast: each frame starts from its result of the schedule `fast`, which is better. landmarks: as
-    in the supplement, the first frame is fitted to convergence, and each next frame starts from the one before it.
-    Either way, the global epochs come last."""
+    """Start of the fit. fast: the global epochs start from the result of the schedule `fast`, which is better and
+    quicker. landmarks: as in the supplement, the first frame is fitted to convergence, then each next frame from the
+    one before it, then the epochs run."""
     first_steps: Annotated[int, COUNT_OR_NONE] = 500
-    """Optimiser steps of a turn at the first frame, half of those of the first turn for texture and light alone. Turns
-    follow until the cost no longer falls by a hundredth. Only with start `landmarks`."""
+    """Optimiser steps at the first frame, half of them for texture and light alone. Only with start `landmarks`."""
     steps: Annotated[int, COUNT_OR_NONE] = 50
-    """Optimiser steps for each frame in the pass before the epochs."""
+    """Optimiser steps for each next frame, which starts from the frame before it. Only with start `landmarks`."""
     epochs: Annotated[int, COUNT_OR_NONE] = 30
     """Passes over all frames in random order that refine everything."""
-    texture_size: Annotated[int, _TEXELS] = 1024
+    texture_size: Annotated[int, _TEXELS] = 512
     """Texels along each side of the texture."""
     texture_steps: Annotated[int, COUNT_OR_NONE] = 8
     """Optimiser steps for texels that a frame shows better than earlier frames. Only with start `landmarks`."""
@@ -198,8 +197,7 @@ class TrackingSettings:
 
     def in_effect(self) -> "TrackingSettings":
         """The settings that a tracking depends on: those that its schedule does not use are at their defaults."""
-        # With 512, an earlier default, so that trackings of other schedules stay current.
-        paper = self.paper if self.schedule == "paper" else PaperSettings(texture_size=512)
+        paper = self.paper if self.schedule == "paper" else PaperSettings()
         by_pixels = self.schedule == "fast" or (self.schedule == "paper" and paper.start == "fast")
         return replace(self, paper=paper, photometric=self.photometric if by_pixels else PhotometricSettings())
 

@@ -28,9 +28,8 @@ def fit_by_descent(
 ) -> PhotometricFit:
     """Refine a fit as in the supplement of GaussianAvatars, section A.
 
-    The pass along the frames runs first, then the global epochs. If the fit was already fitted to pixels, each frame of
-    the pass starts from its own parameters instead of the frame before it. A frame whose landmarks get lost in that
-    pass keeps its fit so far and is not `improved`.
+    If the fit was already fitted to pixels, only the global epochs run. Otherwise the pass along the frames runs first.
+    A frame whose landmarks get lost in that pass keeps its fit to landmarks and is not `improved`.
 
     Args:
         model: The face model reduced to its landmarks.
@@ -47,8 +46,7 @@ def fit_by_descent(
     scene = paper_scene(model, shots, lenses, fit, settings, refined)
     descent = Descent(scene, first_state(scene, fit, lenses, refined))
     descent.resume(cache)
-    is_new = descent.done == 0
-    if refined is not None and settings.paper.steps == 0:
+    if refined is not None:
         descent.done = max(descent.done, descent.frames)
     total = descent.frames * (1 + settings.paper.epochs)
 
@@ -58,13 +56,10 @@ def fit_by_descent(
     with torch.enable_grad(), progress_bar("Refining by descent", total, min(descent.done, total)) as bar:
         course = Course("pixels", total, bar, watch, min(descent.done, total))
         advance = partial(course.advance, current=outcome)
-        if refined is not None and is_new:
-            measure_visibility(descent)  # The weights of the pass need it.
-        for sequence in range(len(shots)):
-            fit_sequence(descent, sequence, advance, cache, each_from_its_own=refined is not None)
+        for sequence in range(len(shots) if refined is None else 0):
+            fit_sequence(descent, sequence, advance, cache)
         if descent.done == descent.frames:
-            if refined is None:
-                recenter(descent)
+            measure_visibility(descent) if refined is not None else recenter(descent)
             fit_appearance(descent)
         for epoch in range(settings.paper.epochs):
             descent.fit_epoch(epoch, advance, cache)
@@ -82,7 +77,7 @@ def follow_by_descent(
 ) -> PhotometricFit:
     """Run the schedule for the motion of sequences alone. Subject, cameras, texture and light stay as they are.
 
-    In the pass along the frames, each frame starts from its own parameters.
+    The pass along the frames runs if the settings start from landmarks, each frame from its own.
 
     Args:
         model: The face model reduced to its landmarks.
@@ -106,7 +101,7 @@ def follow_by_descent(
         state.offsets = person.vertex_offsets.clone()
     descent = Descent(scene, state)
     descent.resume(cache)
-    if settings.paper.steps == 0:
+    if settings.paper.start != "landmarks":
         descent.done = max(descent.done, descent.frames)
     total = descent.frames * (1 + settings.paper.epochs)
 
@@ -118,7 +113,7 @@ def follow_by_descent(
     with torch.enable_grad(), progress_bar(title, total, min(descent.done, total)) as bar:
         advance = partial(Course("pixels", total, bar, watch, min(descent.done, total)).advance, current=outcome)
         for sequence in range(len(shots)):
-            fit_sequence(descent, sequence, advance, cache, each_from_its_own=True)
+            fit_sequence(descent, sequence, advance, cache, known_person=True)
         for epoch in range(settings.paper.epochs):
             descent.fit_epoch(epoch, advance, cache)
     return outcome()
