@@ -184,6 +184,9 @@ class WholeHeadConstants:
     """Distance in metres from what pictures show up to which unseen triangles are trained. Hair above them is on the
     outline. Measured (1,600 steps): without a band, the heads of d3, d9 and wojtek have 0.9, 0.3 and 0.1 dB less; 50 mm
     instead of 25 have 0.1 dB more on d3, and no fills at all as much as 25 (log, 11-26)."""
+    height_frames: int = 48
+    """Largest number of frames in which the mesh is drawn as high as its hair, to find what they show of hair. Not
+    varied."""
     mouth_frames: int = 240
     """Number of frames in which the inside of the mouth is looked for. Not varied."""
     mouth_shown_share: float = 0.02
