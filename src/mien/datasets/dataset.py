@@ -30,7 +30,7 @@ class TrackedSequence:
     face_model: "mien.face.FaceModel"
     """The face model that the tracking's parameters belong to."""
     own_split: "mien.training.OwnSplit | None" = None
-    """What the dataset's authors hold out. None if they name no split."""
+    """Timesteps and cameras that the dataset's authors hold out. None if they name no split."""
     foreign: "Mapping[str, numpy.ndarray]" = field(default_factory=dict)
     """Arrays for which mien has no place, such as coefficients of a model that nobody can ship. They are kept beside
     the capture, in foreign.safetensors."""
@@ -77,7 +77,7 @@ class TrainedAvatar:
 
 @dataclass(frozen=True)
 class Clip:
-    """What is known of a sequence before its pictures are read."""
+    """Facts about a sequence that are known before its pictures are read."""
 
     name: str
     frames: int | None
@@ -87,7 +87,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a dataset holds, as the command line tells it before anything is written."""
+    """The content of a dataset, as the command line tells it before anything is written."""
 
     clips: tuple[Clip, ...]
     face_model: str | None = None
@@ -95,7 +95,7 @@ class Findings:
     split: str | None = None
     """The split of its authors, in words."""
     missing: tuple[str, ...] = ()
-    """What is not there or not used, each in words."""
+    """Parts that are missing or not used, each in words."""
 
 
 @dataclass(frozen=True)

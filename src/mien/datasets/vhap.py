@@ -106,7 +106,7 @@ def _group(path: Path, name: str, frames: dict[tuple[int, str], _Frame]) -> _Gro
 
 
 def _own_split(group: _Group) -> "OwnSplit | None":
-    """What transforms_train.json does not list: whole timesteps, and cameras."""
+    """Whole timesteps and cameras that transforms_train.json does not list."""
     from mien.training import OwnSplit, ranges_of
 
     trained = {key for key, frame in group.frames.items() if frame.trained}

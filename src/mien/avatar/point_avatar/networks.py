@@ -18,7 +18,7 @@ _SPHERE = 0.5
 
 
 class Surface(NamedTuple):
-    """What the network says about points."""
+    """Outputs of the surface network for n points."""
 
     distance: Float[Tensor, " n"]
     """Signed distance to the surface, positive outside."""

@@ -1,4 +1,4 @@
-"""What a dataset holds, in lines for people."""
+"""Lines that tell people what a dataset holds."""
 
 from mien.datasets import Clip, Findings
 from mien.terminal import counted

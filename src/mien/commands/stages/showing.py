@@ -1,4 +1,4 @@
-"""What `mien create` ends with: a page and a film of the avatar, and what to do next."""
+"""The end of `mien create`: a page and a film of the avatar, and the next commands."""
 
 import shlex
 import shutil
