@@ -32,41 +32,48 @@ def portable() -> runtime.PortableAvatar:
 def page(portable: runtime.PortableAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
     chromium()
     faces = faces_of(portable, 3)
-    motion = Motion(*(np.stack([getattr(face, name) for face in faces]) for name in vars(faces[0])), fps=5.0)
+    motion = Motion(*(np.stack([getattr(face, name) for face in faces]) for name in vars(faces[0])), fps=1.0)
     path = tmp_path_factory.mktemp("page") / "a.html"
     write_page(path, portable, motion)
     return path
 
 
+# The first turn and the motion are soon over, so what the page shows is noted from its beginning.
+NOTES = """window.turns = [], window.timesteps = new Set();
+const note = setInterval(() => {
+  if (!window.mien) return;
+  clearInterval(note);
+  mien.then((viewer) => setInterval(() => {
+    turns.push(viewer.yaw);
+    if (viewer.playing) timesteps.add(viewer.timestep);
+  }, 5));
+}, 1)"""
 ALIVE = """(async () => {
-  const viewer = await mien, blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft"), seen = new Set();
+  const viewer = await mien, blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft");
   const eye = 3 * viewer.avatar.joint_names.indexOf("left_eye"), box = viewer.canvas.getBoundingClientRect();
-  const first = viewer.yaw, until = async (ready) => {
-    for (const began = performance.now(); !ready() && performance.now() - began < 40000; ) {
-      if (viewer.playing) seen.add(viewer.timestep);
+  const until = async (ready) => {
+    for (const began = performance.now(); !ready() && performance.now() - began < 40000; )
       await new Promise((done) => setTimeout(done, 5));
-    }
   };
-  const played = viewer.playing;
   await until(() => !viewer.playing);
   let closed = 0;
   await until(() => (closed = Math.max(closed, viewer.shown.expression[blink])) > 0.3 && viewer.yaw === 0);
   const middle = { clientX: box.right, clientY: box.top + box.height / 2 };
   const look = () => dispatchEvent(new PointerEvent("pointermove", middle));
   await until(() => (look(), viewer.shown.joints[eye + 1] > 0.25));
-  return [first, viewer.yaw, played, seen.size, viewer.playing, closed, viewer.shown.joints[eye + 1]];
+  return [Math.max(...turns), viewer.yaw, timesteps.size, viewer.playing, closed, viewer.shown.joints[eye + 1]];
 })()"""
 
 
 @pytest.mark.slow
 def test_a_page_opens_alive(page: Path) -> None:
     """The camera turns to the front, the filmed motion plays once, then the head blinks and looks at the pointer."""
-    told = browse(page, [ALIVE], size=(300, 200), device=["lively"])
-    first, last, played, timesteps, playing, closed, gaze = told["results"][0]
+    told = browse(page, [ALIVE], size=(300, 200), device=["lively"], opening=NOTES)
+    first, last, timesteps, playing, closed, gaze = told["results"][0]
     assert (told["requests"], told["messages"]) == ([], [])
     assert first > 0.2
     assert last == 0
-    assert (played, playing) == (True, False)
+    assert playing is False
     assert timesteps >= 2
     assert closed > 0.3
     assert gaze > 0.25
@@ -136,7 +143,8 @@ def test_faces_are_buttons_and_keys_work_without_a_click(page: Path, portable: r
     assert pitch < -0.2
     assert works == [False, True]
     # What was filmed goes from 0 to 1 in `drawn_head`.
-    assert marks == ["0%", "100%", False]
+    most = portable.expression_bounds[portable.expression_names.index("jawOpen"), 1]
+    assert marks == ["0%", f"{round(100 / most)}%", False]
 
 
 AXE = """(async () => {

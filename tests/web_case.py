@@ -68,6 +68,7 @@ def browse(
     webgpu: bool = False,
     flags: Sequence[str] = (),
     device: Sequence[str] = (),
+    opening: str = "",
 ) -> dict[str, Any]:
     """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
 
@@ -82,9 +83,10 @@ def browse(
         flags: Further options of Chromium.
         device: What the browser is: `lively` (it does not ask for reduced motion), `dark` (it asks for dark colours),
             `touch` (it has a touch screen).
+        opening: JavaScript that runs before the page's own.
     """
     given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or []}
-    given |= {"webgpu": webgpu, "flags": list(flags), **dict.fromkeys(device, True)}
+    given |= {"webgpu": webgpu, "flags": list(flags), "opening": opening, **dict.fromkeys(device, True)}
     told = json.dumps(given | ({"downloads": str(downloads)} if downloads else {}))
     address = f"{page}#{fragment}" if fragment else str(page)
     command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), address]

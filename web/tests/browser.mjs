@@ -1,13 +1,13 @@
 // Opens a page in headless Chromium with software WebGL, runs scripts in it one after the other, and prints their
 // results and all requests as json. tests/test_web.py and tests/test_study.py call it:
-//   node browser.mjs CHROMIUM PAGE (a file, or an address on this machine) < {"width", "height", "scripts": [..], "screenshots": [path or null, ..], "downloads": folder, "webgpu": true for WebGPU in software, "lively": true for a page that may move by itself, "dark", "touch", "flags": [..]}
+//   node browser.mjs CHROMIUM PAGE (a file, or an address on this machine) < {"width", "height", "scripts": [..], "screenshots": [path or null, ..], "downloads": folder, "webgpu": true for WebGPU in software, "lively": true for a page that may move by itself, "dark", "touch", "flags": [..], "opening": a script that runs before those of the page}
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";
 import { chromium } from "playwright-core";
 
 const [executablePath, page] = process.argv.slice(2);
-const { width, height, scripts, screenshots = [], downloads, webgpu, flags = [], lively, dark, touch } = JSON.parse(readFileSync(0, "utf8"));
+const { width, height, scripts, screenshots = [], downloads, webgpu, flags = [], lively, dark, touch, opening } = JSON.parse(readFileSync(0, "utf8"));
 const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
   "--disable-background-networking", "--disable-component-update", "--disable-sync", ...flags];
 if (webgpu) args.push("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader");
@@ -21,6 +21,7 @@ try {
   tab.on("request", (request) => requests.push(request.url()));
   tab.on("console", (message) => messages.push(message.text()));
   tab.on("pageerror", (error) => messages.push(`${error}`));
+  if (opening) await tab.addInitScript(opening);
   const [place, hash] = page.split("#");
   const address = place.startsWith("http://") ? place : pathToFileURL(place).href;
   await tab.goto(hash ? `${address}#${hash}` : address);
