@@ -23,6 +23,7 @@ _REFUSED = {
     "webcam": "only an .html page has a webcam; leave --webcam out, or write a .html file",
     "title": "only an .html page has a title; leave --title out",
     "address": "only an .html page has an address; leave --address out",
+    "soft_cut": "only .html and .packed files have a soft cut; leave --sharp-cut out",
 }
 """Messages for options that the format does not take."""
 
@@ -100,6 +101,8 @@ class Command:
     address: str | None = None
     """For .html: the address at which you will publish the page, such as https://example.org/me.html. Messengers then
     show a picture of the avatar, which is written beside the page."""
+    sharp_cut: bool = False
+    """For .html and .packed: the head ends sharply at the neck, as in training (default: it fades over 3 cm)."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -184,6 +187,7 @@ class Command:
         given = {"webgpu": self.webgpu, "sh": self.sh is not None, "webcam": self.webcam}
         given |= {"spz_version": self.spz_version is not None}
         given |= {"title": self.title is not None, "address": self.address is not None}
+        given |= {"soft_cut": self.sharp_cut}
         for option, is_given in given.items():
             if is_given and option not in kind.options:
                 raise UserError(f"{self.out}: {_REFUSED[option]}")
@@ -202,7 +206,8 @@ class Command:
         from mien.formats import Options
 
         webcam = find_webcam_files(self.webcam_model) if self.webcam else None
-        return Options(self.sh, self.webgpu, webcam, self.spz_version or 4, self.title, self.address)
+        version = self.spz_version or 4
+        return Options(self.sh, self.webgpu, webcam, version, self.title, self.address, not self.sharp_cut)
 
     def _check_file(self, kind: Format) -> None:
         from mien.files import check_writable

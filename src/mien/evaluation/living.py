@@ -13,6 +13,7 @@ from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.progress import track_progress
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.training.whole_head import with_soft_cut
 
 FILM = "film.mp4"
 """Name of the film in a run's folder."""
@@ -31,9 +32,12 @@ _STRIP = 6
 
 
 def living(avatar: Avatar, camera: Camera, name: str) -> runtime.Avatar | None:
-    """Return the avatar as films and strips draw it. None if its method has no record without torch."""
+    """Return the avatar as films and strips draw it, with a soft cut at the neck.
+
+    None if its method has no record without torch.
+    """
     try:
-        return runtime.Avatar(make_portable(avatar, camera, name, to_share=False))
+        return runtime.Avatar(with_soft_cut(make_portable(avatar, camera, name, to_share=False), avatar))
     except UserError:
         return None
 

@@ -29,8 +29,12 @@ class Content(Protocol):
         """Number of Gaussians."""
         ...
 
-    def portable(self, confidence: bool = True) -> "mien.runtime.PortableAvatar":
-        """Return the whole avatar. `confidence` asks for what was filmed of each triangle, if that is known."""
+    def portable(self, confidence: bool = True, soft_cut: bool = False) -> "mien.runtime.PortableAvatar":
+        """Return the whole avatar.
+
+        `confidence` asks for what was filmed of each triangle, if that is known, and `soft_cut` for a head that fades
+        towards its neck cut.
+        """
         ...
 
     def mesh(self) -> "mien.export.MeshModel":
@@ -73,6 +77,8 @@ class Options:
     """Title of a page. None for the avatar's name."""
     address: str | None = None
     """Address at which a page will be published."""
+    soft_cut: bool = True
+    """Whether a head fades towards its neck cut."""
 
 
 def _no_check(path: Path) -> None:

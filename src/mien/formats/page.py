@@ -10,7 +10,7 @@ _ITSELF = {"set": "a page sets every expression itself; leave --set out"}
 
 def _write_page(path: Path, content: Content, options: Options) -> str:
     motion = content.motion()
-    avatar = content.portable(confidence=False)
+    avatar = content.portable(confidence=False, soft_cut=options.soft_cut)
     described = export.Described(options.title or avatar.about.name, options.address)
     page = export.write_page(path, avatar, motion, options.webcam, options.webgpu, described)
     poster = f"\n{path.with_suffix('.jpg')}: the picture that messengers show" if options.address else ""
@@ -19,7 +19,8 @@ def _write_page(path: Path, content: Content, options: Options) -> str:
 
 def _write_packed(path: Path, content: Content, options: Options) -> str:
     motion = content.motion()
-    return _told(content, motion, export.write_packed(path, content.portable(confidence=False), motion))
+    avatar = content.portable(confidence=False, soft_cut=options.soft_cut)
+    return _told(content, motion, export.write_packed(path, avatar, motion))
 
 
 def _told(content: Content, motion: "export.Motion | None", page: "export.WrittenPage") -> str:
@@ -35,7 +36,7 @@ PAGE = Format(
     "avatar",
     _write_page,
     (".html",),
-    options=frozenset({"webgpu", "webcam", "title", "address"}),
+    options=frozenset({"webgpu", "webcam", "title", "address", "soft_cut"}),
     refusals=_ITSELF,
 )
-PACKED = Format("packed", "avatar", _write_packed, (".packed",), refusals=_ITSELF)
+PACKED = Format("packed", "avatar", _write_packed, (".packed",), options=frozenset({"soft_cut"}), refusals=_ITSELF)

@@ -20,6 +20,7 @@ from mien.gaussians import Gaussians
 from mien.progress import say, track_progress
 from mien.runtime import PortableAvatar
 from mien.training import read_coverage, read_face_track, run_camera
+from mien.training.whole_head import with_soft_cut
 from mien.workspace import Workspace
 
 
@@ -66,10 +67,12 @@ class RunContent:
         """Number of Gaussians."""
         return len(self._avatar.gaussian_store())
 
-    def portable(self, confidence: bool = True) -> PortableAvatar:
+    def portable(self, confidence: bool = True, soft_cut: bool = False) -> PortableAvatar:
         """Return the whole avatar, with everything that the run knows of it."""
         name = self._workspace.root.resolve().name
         portable = make_portable(self._avatar, run_camera(self._run_dir), name)
+        if soft_cut:
+            portable = with_soft_cut(portable, self._avatar)
         covered = read_coverage(self._run_dir, self._avatar.face_model) if confidence else None
         return portable if covered is None else replace(portable, confidence=as_array(covered.seen))
 
@@ -148,7 +151,7 @@ class FileContent:
         """Number of Gaussians."""
         return len(self.pose())
 
-    def portable(self, confidence: bool = True) -> PortableAvatar:
+    def portable(self, confidence: bool = True, soft_cut: bool = False) -> PortableAvatar:
         """Return the avatar as it was read."""
         return self._avatar
 

@@ -41,7 +41,9 @@ def show_avatar(workspace: Workspace, run: str) -> None:
         say(f"no film: {error}")
     try:
         content = RunContent(workspace, run, (), Series(read_run_config(run_dir)["data"][0]["sequence"]))
-        page = write_page(root / PAGE, content.portable(confidence=False), _first_seconds(content.motion()))
+        page = write_page(
+            root / PAGE, content.portable(confidence=False, soft_cut=True), _first_seconds(content.motion())
+        )
         say(f"{root / PAGE}: the living avatar, {page.size / 1e6:.1f} MB; open it in a browser, or send it")
     except UserError as error:
         say(f"no page: {error}")

@@ -28,6 +28,7 @@ from mien.runtime import MeshBound, PortableAvatar, read_portable
 from mien.stops import Terminated
 from mien.training import read_coverage, run_camera
 from mien.training.run import filmed_range
+from mien.training.whole_head import with_soft_cut
 from mien.viewer import CameraSwitch, Clip, Door, Mesh, Session, is_loopback, serve
 from mien.workspace import open_workspace
 
@@ -174,7 +175,7 @@ def _of_workspace(root: Path, run: str | None) -> Viewed:
     avatar = load_avatar(run_dir)
     model = avatar.face_model
     portable = make_portable(avatar, run_camera(run_dir), root.resolve().name, to_share=False)
-    portable = replace(portable, filmed=filmed_range(run_dir, avatar))
+    portable = replace(with_soft_cut(portable, avatar), filmed=filmed_range(run_dir, avatar))
     mesh = _mesh_of(portable) or Mesh(bake_rig(model, avatar.subject), as_array(model.faces))
     coverage = read_coverage(run_dir, model)
     if coverage is not None and len(coverage.seen) == len(mesh.faces):

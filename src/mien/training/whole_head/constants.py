@@ -184,6 +184,14 @@ class WholeHeadConstants:
     """Distance in metres from what pictures show up to which unseen triangles are trained. Hair above them is on the
     outline. Measured (1,600 steps): without a band, the heads of d3, d9 and wojtek have 0.7, 0.3 and 0.1 dB less; 50 mm
     instead of 25 have 0.1 dB more on d3, and no fills at all as well (log, 11-26)."""
+    soft_cut_width: float = 0.03
+    """Distance from the neck cut over which opacity fades where a head is shown, in metres. 2 to 4 cm were looked at on
+    four clips; with 2 cm, the end of a bare neck is tufted."""
+    soft_cut_head: tuple[float, float] = (0.008, 0.02)
+    """Distances from the vertices of the head without its neck up to which nothing is cut off, and from which on the
+    cut counts alone, in metres. A chin may reach below the cut. Set by eye."""
+    soft_cut_least: float = 1e-4
+    """Least opacity after the soft cut. Not varied."""
     mouth_frames: int = 240
     """Number of frames in which the inside of the mouth is looked for. Not varied."""
     mouth_shown_share: float = 0.02

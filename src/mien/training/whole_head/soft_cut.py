@@ -1,0 +1,65 @@
+"""A soft cut: opacity fades towards the neck cut, so that a head that is shown ends softly and not in frayed ends."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.avatar import Avatar
+from mien.gaussians import world_means
+from mien.runtime import PortableAvatar
+from mien.tracking import NeckCut, NeckParts, fit_neck_cut
+from mien.training.whole_head.constants import WHOLE_HEAD
+
+_PART = 4096
+"""Gaussians whose distances are computed at once."""
+
+
+@torch.no_grad()
+def with_soft_cut(portable: PortableAvatar, avatar: Avatar) -> PortableAvatar:
+    """The record of an avatar whose opacity fades towards the neck cut.
+
+    Training and scoring cut heads off sharply, because their truth is cut off sharply. What is shown need not be.
+
+    Args:
+        portable: The record of `avatar`.
+        avatar: The avatar. Its neck at rest places the cut.
+
+    Returns:
+        The record with other raw opacities. It is `portable` if its Gaussians have none of their own.
+    """
+    attributes = getattr(portable.baked, "attributes", None)
+    if attributes is None:
+        return portable
+    model, rest = avatar.face_model, avatar.subject
+    vertices, gaussians = model(rest)[0], avatar.pose(rest).gaussians.timestep(0)
+    cut = fit_neck_cut(NeckParts.of(model), vertices, rest.T_world_head[0, :3, 1])
+    head = vertices[model.faces[~model.region_mask("neck")].unique()]
+    shares = opacity_shares(world_means(gaussians), cut, head).double().cpu().numpy()
+    opacities = shares / (1 + np.exp(-attributes.opacity_logits.astype(np.float64)))
+    opacities = opacities.clip(WHOLE_HEAD.soft_cut_least, 1 - WHOLE_HEAD.soft_cut_least)
+    logits = np.log(opacities / (1 - opacities)).astype(np.float32)
+    kept = np.where(shares < 1, logits, attributes.opacity_logits)
+    return replace(portable, baked=replace(portable.baked, attributes=replace(attributes, opacity_logits=kept)))
+
+
+def opacity_shares(centers: Float[Tensor, "n 3"], cut: NeckCut, head: Float[Tensor, "m 3"]) -> Float[Tensor, " n"]:
+    """The share of each opacity that is left: 0 at the cut, 1 far from it and on the head.
+
+    Args:
+        centers: Centres of the Gaussians at rest, in the world, in metres.
+        cut: The neck cut at rest.
+        head: Vertices of the head without its neck, in the world. What is close to them is not cut off.
+    """
+    nearest = torch.cat([torch.cdist(part, head).amin(1) for part in centers.split(_PART)])
+    first, last = WHOLE_HEAD.soft_cut_head
+    on_head = _smoothstep((last - nearest) / (last - first))
+    return torch.maximum(_smoothstep(cut.margins(centers) / WHOLE_HEAD.soft_cut_width), on_head)
+
+
+def _smoothstep(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """0 below 0, 1 above 1, and between them without a corner."""
+    x = x.clamp(0, 1)
+    return x * x * (3 - 2 * x)
