@@ -30,7 +30,7 @@ from mien.training.footage.coverage import Coverage, drawn_share, measure_covera
 from mien.training.footage.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.whole_head.constants import WHOLE_HEAD
-from mien.training.whole_head.unseen import Unseen, spare_fills, unseen_of
+from mien.training.whole_head.unseen import Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
 from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_face, toy_sequence
@@ -160,6 +160,8 @@ def test_what_is_beside_shown_triangles_is_trained(
     middles, found = model.head_vertices(avatar.subject)[0][model.faces].mean(1), covered(toy)
     apart = torch.cdist(middles, middles[found.seen > WHOLE_HEAD.unseen_confidence]).amin(1)
     filled = {}
+    drawn = torch.zeros(len(model.faces), dtype=torch.bool)
+    monkeypatch.setattr("mien.training.whole_head.unseen.drawn_at_height", lambda *given: drawn)
     for band in (0.0, 0.03):
         monkeypatch.setattr("mien.training.whole_head.unseen.WHOLE_HEAD", replace(WHOLE_HEAD, outline_band=band))
         prior = known(toy, avatar).prior
@@ -168,6 +170,26 @@ def test_what_is_beside_shown_triangles_is_trained(
     assert filled[0.03].equal(filled[0.0] & (apart > 0.03))
     assert filled[0.03].any()
     assert (filled[0.0] & ~filled[0.03]).any()
+    drawn |= filled[0.03] & (torch.arange(len(drawn)) == filled[0.03].nonzero()[0])
+    further = known(toy, avatar).prior.filled_in
+    assert further is not None
+    assert not further[drawn].any(), "hair that the mesh shows at its height is trained, and so is a band around it"
+    assert (further & ~head_parts(model).interior & ~filled[0.03]).logical_not().all()
+
+
+def test_high_hair_is_drawn_where_the_mesh_is_not(toy: tuple[FaceModel, Sequence]) -> None:
+    """High hair on the back of a head stands out beside the face. Nothing is drawn outside of the head's mask."""
+    model, sequence = toy
+    behind = facing(model) < -0.2
+
+    def drawn(height: float, given: Sequence) -> torch.Tensor:
+        above = torch.where(behind, height, 0.0)
+        return drawn_at_height(model, above, [given], [given.tracking.face], training_frames([given], SETTINGS))
+
+    assert drawn(0.0, sequence)[facing(model) > 0.7].all()
+    assert not drawn(0.0, sequence)[behind].any()
+    assert drawn(0.05, sequence)[behind].any()
+    assert not drawn(0.05, replace(sequence, scoring=np.zeros_like(sequence.scoring))).any()
 
 
 def test_fills_keep_their_opacity_at_resets(toy: tuple[FaceModel, Sequence]) -> None:

@@ -86,7 +86,7 @@ def test_transparent_sides_cost(anny):
 
 
 def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
-    """By 8 times the method's own penalty, whatever the weight of the picture."""
+    """By 8 times the method's own penalty, whatever the weight of the picture. Hair is free."""
     face = _face(anny)
     avatar = GaussianAvatars(plain_gaussian_avatars(expression_rank=2, expression_weight=3.0), anny, face)
     avatar.store.assign("offset_basis", torch.ones_like(avatar.store["offset_basis"]))
@@ -97,6 +97,11 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     assert float(turned) == 0
     # The random numbers raise coefficients until the activations, 2 alike, have the length that they approach.
     assert 0 < float(raised) <= 8 * 3 * 2 * 1.1**2
+    hair = ~views.compared[avatar.surface().triangles()]
+    assert 0.1 < float(hair.float().mean()) < 0.9
+    kept = torch.where(hair[:, None, None], 0.0, avatar.store["offset_basis"])
+    avatar.store.assign("offset_basis", kept)
+    assert float(views.loss(avatar, face, _camera(), _PROGRESS, 4, _random()).detach()) == pytest.approx(float(raised))
 
 
 def test_gradients_reach_gaussians_and_not_the_face(anny):

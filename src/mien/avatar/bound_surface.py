@@ -91,10 +91,15 @@ class BoundSurface(ABC):
         """Move Gaussians along the normals of their triangles, by metres."""
 
     @abstractmethod
-    def change_penalty(self, changes: Mapping[str, Tensor]) -> Float[Tensor, ""] | None:
+    def change_penalty(self, changes: Mapping[str, Tensor], held: Bool[Tensor, " f"]) -> Float[Tensor, ""] | None:
         """The method's own penalty of changes with the expression that the mesh does not make (`Posed.aux`).
 
-        None if there are none.
+        It is the mean over all Gaussians, to which those on triangles that are not `held` add 0. None if there are no
+        changes.
+
+        Args:
+            changes: The changes of one timestep.
+            held: The triangles whose changes cost something.
         """
 
     @abstractmethod

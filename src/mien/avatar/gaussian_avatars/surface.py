@@ -137,9 +137,11 @@ class GaussianSurface(BoundSurface):
         bound = self._store["face_index"]
         self._store["means"].detach()[:, 1] += (shift / self.sizes)[bound]
 
-    def change_penalty(self, changes: Mapping[str, Tensor]) -> Float[Tensor, ""] | None:
+    def change_penalty(self, changes: Mapping[str, Tensor], held: Bool[Tensor, " f"]) -> Float[Tensor, ""] | None:
         """The sum of `change_penalties`."""
-        penalties = change_penalties(self._config, changes)
+        counts = held[self.triangles()]
+        own = {name: values * counts.view(-1, *[1] * (values.ndim - 1)) for name, values in changes.items()}
+        penalties = change_penalties(self._config, own)
         return torch.stack(list(penalties.values())).sum() if penalties else None
 
     @property

@@ -182,8 +182,11 @@ class WholeHeadConstants:
     90 degrees; 0.02 was chosen between them (11-23)."""
     outline_band: float = 0.025
     """Distance in metres from what pictures show up to which unseen triangles are trained. Hair above them is on the
-    outline. Measured (1,600 steps): without a band, the heads of d3, d9 and wojtek have 0.7, 0.3 and 0.1 dB less; 50 mm
-    instead of 25 have 0.1 dB more on d3, and no fills at all as well (log, 11-26)."""
+    outline. Measured (1,600 steps): without a band, the heads of d3, d9 and wojtek have 0.7, 0.3 and 0.1 dB less; with
+    50 mm, or with no fills at all, d3 has 0.1 dB more (log, 11-26)."""
+    height_frames: int = 48
+    """Largest number of frames in which the mesh is drawn as high as its hair, to find what they show of hair. Not
+    varied."""
     soft_cut_width: float = 0.03
     """Distance from the neck cut over which opacity fades where a head is shown, in metres. 2 to 4 cm were looked at on
     four clips; with 2 cm, the end of a bare neck is tufted."""

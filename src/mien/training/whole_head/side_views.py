@@ -80,7 +80,7 @@ class SideViews:
         difference = (seen.image - picture.to(like)).abs()
         if raised:
             difference = (difference - WHOLE_HEAD.raised_free_difference).clamp_min(0) * compared.to(like)[..., None]
-            return self.weight * difference.mean() + _held_back(avatar, posed)
+            return self.weight * difference.mean() + _held_back(avatar, posed, self.compared)
         outline = WHOLE_HEAD.side_views_outline_weight * (seen.alpha - alpha.to(like)).abs().mean()
         return self.weight * (difference.mean() + outline)
 
@@ -140,14 +140,17 @@ def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideV
     return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
 
 
-def _held_back(avatar: Avatar, posed: Posed) -> Float[Tensor, ""] | float:
+def _held_back(avatar: Avatar, posed: Posed, compared: Bool[Tensor, " f"]) -> Float[Tensor, ""] | float:
     """Return the cost of changes that the mesh does not make, in an expression that nobody filmed.
+
+    Only skin, lips and the inside of the mouth are held back. Hair moves with the head and the shoulders, which the
+    activations of the face tell, too.
 
     The mesh is a better guess there. Filmed expressions come together, so without this cost, raising one of them alone
     also brings the shadows of the others.
     """
     surface = avatar.surface()
-    penalty = None if surface is None else surface.change_penalty(posed.aux)
+    penalty = None if surface is None else surface.change_penalty(posed.aux, compared.to(surface.triangles().device))
     return 0.0 if penalty is None else WHOLE_HEAD.raised_change_weight * penalty
 
 

@@ -9,6 +9,7 @@ because the hair above them is on the outline.
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -17,6 +18,7 @@ from mien.avatar import Avatar, DensityControl, GaussianStore, Photometric, Surf
 from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
 from mien.parallel import stream_in_threads
+from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.render.rendering import Rendering
 from mien.training.footage import (
     Coverage,
@@ -30,7 +32,7 @@ from mien.training.footage import (
 )
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.back_hair import back_hair
-from mien.training.whole_head.completion import complete_colors
+from mien.training.whole_head.completion import complete_colors, vertex_means
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
 from mien.training.whole_head.spreading import Surface
@@ -131,10 +133,11 @@ def unseen_of(
         return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
     filled_in = (shown < WHOLE_HEAD.unseen_confidence) & (found.above > 0.5)
     outside = (found.above > 0.5) & ~parts.interior
-    filled_in &= ~(outside & beside_shown(model, neutral, outside & ~filled_in))
+    behind_head = back_hair(model, neutral, hair, hanging)
+    drawn = drawn_at_height(model, torch.maximum(hair, behind_head), sequences, faces, frames)
+    filled_in &= ~(outside & beside_shown(model, neutral, outside & (drawn | ~filled_in)))
     filled_in |= hidden_inside(model, parts.interior, sequences, faces, frames)
     widening = wider_where_faces_move(model, neutral, parts.interior)
-    behind_head = back_hair(model, neutral, hair, hanging)
     behind = filled_in & (behind_head > hair)
     colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
     hair, hanging = torch.where(behind, behind_head, hair), torch.maximum(hanging, behind_head)
@@ -142,6 +145,39 @@ def unseen_of(
     return Unseen(
         found, SurfacePrior(hair, hanging, colors, doubt, filled_in, filled_in | parts.interior, strands, widening)
     )
+
+
+def drawn_at_height(
+    face_model: FaceModel,
+    height: Float[Tensor, " f"],
+    sequences: Items[Sequence],
+    faces: Items[FaceParams],
+    frames: Items[Frame],
+) -> Bool[Tensor, " f"]:
+    """Which triangles are in front somewhere in the head of some picture if the mesh is as high as the hair.
+
+    Args:
+        face_model: The face model.
+        height: Height of hair above each triangle, in metres.
+        sequences: The sequences that the frames count in.
+        faces: Face parameters of each sequence.
+        frames: The frames to look at. Some of them are used, evenly spread.
+    """
+    over = vertex_means(face_model, height[:, None].expand(-1, 3))[:, 0]
+
+    def drawn_in(frame: Frame) -> Bool[Tensor, " f"]:
+        sequence, vertices = sequences[frame.sequence], face_model(faces[frame.sequence][frame.timestep])[0]
+        raised = vertices + over[:, None] * vertex_normals(vertices, face_model.faces)
+        index = rasterize_mesh(raised, face_model.faces, sequence.tracking.cameras[frame.camera]).face_index
+        head = torch.from_numpy(np.array(sequence.scoring[frame[1:]])) > 127
+        drawn = torch.zeros(len(face_model.faces), dtype=torch.bool)
+        drawn[index[head & (index >= 0)].long()] = True
+        return drawn
+
+    result = torch.zeros(len(face_model.faces), dtype=torch.bool)
+    for drawn in stream_in_threads(drawn_in, spread_frames(frames, WHOLE_HEAD.height_frames)):
+        result |= drawn
+    return result
 
 
 def beside_shown(
