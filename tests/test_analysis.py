@@ -230,6 +230,17 @@ def test_a_run_without_teeth_says_so(tmp_path: Path) -> None:
     assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
 
 
+def test_the_method_is_that_of_the_run_unless_it_is_named(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["analyze", str(workspace), "--parts", "growth"]) == 0
+    assert [*record(workspace)["parts"]] == ["growth"]
+    capsys.readouterr()
+    assert "gaussian-avatars" in complaint(capsys, "analyze", "headgaz", str(workspace))
+    assert complaint(capsys, "analyze", "gaussian-avatars").startswith("mien: gaussian-avatars: no such folder")
+    assert "takes a workspace" in complaint(capsys, "analyze", "headgas", str(workspace), "more")
+    edit_json(workspace / "runs/toy/config.json", lambda content: content["method"].update(kind="point_avatar"))
+    assert "has no analysis" in complaint(capsys, "analyze", str(workspace))
+
+
 def test_sequences_that_are_gone_cost_only_their_parts(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.rmtree(workspace / "sequences")
     assert analyze(workspace, "--seconds", "0.01") == 0

@@ -3,17 +3,18 @@
 from dataclasses import dataclass
 from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts
+from mien.commands.help_text import Described
+from mien.errors import UserError
+from mien.lab.analysis import ANALYSES, Analysis, AnalysisOptions, chosen_parts
 from mien.workspace import Workspace, open_workspace
 
-if TYPE_CHECKING:
-    AnalysisName = str
-else:
-    AnalysisName = Literal[tuple(ANALYSES)]
+
+def _about_target() -> str:
+    return f"Workspace folder. The method of its run ({', '.join(ANALYSES)}) may stand before it."
 
 
 @dataclass(frozen=True)
@@ -24,10 +25,7 @@ class Command:
     where it was, and what is measured is not measured again.
     """
 
-    method: Annotated[AnalysisName, tyro.conf.Positional]
-    """Method of the run."""
-    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Workspace folder."""
+    target: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), Described(_about_target)]
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     parts: tuple[str, ...] = ()
@@ -49,8 +47,8 @@ class Command:
         from mien.inside import check_subtrees
 
         AnalysisOptions(self.steps, self.seconds).check()
-        chosen_parts(ANALYSES[self.method], self.parts, self.train)
-        workspace = open_workspace(self.workspace)
+        workspace = self._workspace()
+        chosen_parts(self._analysis(workspace), self.parts, self.train)
         check_subtrees(workspace.root, "analysis")
         check_writable(self._folder(workspace, workspace.pick_run(self.run_name)), folder=True)
 
@@ -63,10 +61,10 @@ class Command:
         from mien.progress import say
         from mien.terminal import show
 
-        workspace = open_workspace(self.workspace)
+        workspace = self._workspace()
         run = workspace.pick_run(self.run_name)
         run_dir, folder = workspace.run_dir(run), self._folder(workspace, run)
-        analysis = ANALYSES[self.method]
+        analysis = self._analysis(workspace)
         parts = chosen_parts(analysis, self.parts, self.train)
         options = AnalysisOptions(self.steps, self.seconds)
         content = run_analysis(analysis, parts, run_dir, run_sequences(workspace, run_dir), folder, options)
@@ -76,6 +74,25 @@ class Command:
         say(f"Look at {folder / 'analysis.html'}")
         if self.as_json:
             show(json.dumps(content, indent=1))
+
+    def _workspace(self) -> Workspace:
+        if len(self.target) not in (1, 2):
+            raise UserError(f"analyze takes a workspace, and before it the method of its run, not {len(self.target)}")
+        if len(self.target) == 2 and self.target[0] not in ANALYSES:
+            raise UserError(f"{self.target[0]}: has no analysis; choose one of {', '.join(ANALYSES)}, or leave it out")
+        return open_workspace(Path(self.target[-1]))
+
+    def _analysis(self, workspace: Workspace) -> Analysis:
+        """The analysis of the method that is named, or of the run's method."""
+        if len(self.target) == 2:
+            return ANALYSES[self.target[0]]
+        from mien.training.run import read_run_config
+
+        run = workspace.pick_run(self.run_name)
+        method = read_run_config(workspace.run_dir(run))["method"]["kind"].replace("_", "-")
+        if method not in ANALYSES:
+            raise UserError(f"{run}: its method, {method}, has no analysis; there are {', '.join(ANALYSES)}")
+        return ANALYSES[method]
 
     def _folder(self, workspace: Workspace, run: str) -> Path:
         return self.out or workspace.root / "analysis" / run
