@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from mien.face import FaceModel, FaceParams, load_face_model
 from mien.progress import say
 from mien.runtime import MeshBound, PortableAvatar, read_portable
 from mien.stops import Terminated
+from mien.system import end_this_process
 from mien.training import read_coverage, run_camera
 from mien.training.run import filmed_range
 from mien.viewer import CameraSwitch, Clip, Door, Mesh, Session, is_loopback, serve
@@ -127,7 +127,7 @@ def _follow(session: Session, path: Path) -> None:
     while True:
         time.sleep(_FOLLOW_SECONDS)
         if parent is not None and str(os.getppid()) != parent:
-            os.kill(os.getpid(), signal.SIGTERM)
+            end_this_process()
             return
         now = _changed_at(path)
         if now in (None, seen):
