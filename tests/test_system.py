@@ -14,7 +14,20 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / "mien"
 MODULES = frozenset({"fcntl", "resource", "termios", "pwd", "grp", "pty", "tty", "syslog", "msvcrt", "winreg"})
 """Modules of Python that one of the systems lacks."""
 OS_NAMES = frozenset(
-    {"pread", "pwrite", "kill", "killpg", "fork", "setsid", "getuid", "geteuid", "getloadavg", "uname", "mkfifo"}
+    {
+        "pread",
+        "pwrite",
+        "kill",
+        "killpg",
+        "fork",
+        "setsid",
+        "getuid",
+        "geteuid",
+        "getloadavg",
+        "uname",
+        "mkfifo",
+        "setpriority",
+    }
     | {"O_NOFOLLOW", "O_NONBLOCK", "O_DIRECTORY", "O_CLOEXEC", "O_BINARY", "sched_getaffinity", "statvfs", "fchmod"}
 )
 SIGNAL_NAMES = frozenset({"SIGHUP", "SIGKILL", "SIGUSR1", "SIGALRM", "SIGBREAK", "pthread_kill", "alarm"})

@@ -106,6 +106,12 @@ def peak_memory_mb() -> float:
     return most / _MIB if sys.platform == "darwin" else most / 1024
 
 
+def lower_priority(pid: int, steps: int) -> None:
+    """Let a process wait for others, by that many steps of nice(1). Windows, which has other steps, is left as it is."""
+    if sys.platform != "win32":
+        os.setpriority(os.PRIO_PROCESS, pid, steps)
+
+
 def load_average() -> float:
     """Number of processes that were running or waiting in the last minute, on average; 0 on Windows, which has none."""
     return os.getloadavg()[0] if sys.platform != "win32" else 0.0
