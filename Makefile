@@ -9,6 +9,7 @@ NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UNLESS_STRICT := test -z "$$MIEN_STRICT"
 UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
+ZIGLANG := ziglang==0.17.1
 
 .PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs bench gpu lock clean
 setup: $(VENV)/.built landmarker
@@ -142,10 +143,10 @@ docs: setup
 
 # Re-resolve the locked requirements (both Pythons, every platform) after a change in pyproject.toml or overrides.txt.
 lock: $(VENV)/.packages
-	$(BIN)/uv pip compile pyproject.toml --group dev --overrides requirements/overrides.txt --universal \
+	$(BIN)/uv pip compile pyproject.toml --group dev --extra create --overrides requirements/overrides.txt --universal \
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
 	  -o requirements/lock.txt
-	for package in $(UV) $(GSPLAT); do echo "$$package" | $(BIN)/uv pip compile - --no-deps --universal --python-version 3.11 \
+	for package in $(UV) $(GSPLAT) $(ZIGLANG); do echo "$$package" | $(BIN)/uv pip compile - --no-deps --universal --python-version 3.11 \
 	  --generate-hashes --no-emit-index-url --no-annotate --custom-compile-command "make lock" \
 	  -o "requirements/$${package%%==*}.txt" || exit 1; done
 

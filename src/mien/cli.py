@@ -45,6 +45,8 @@ COMMANDS = {
     "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
     "face-models": "list the face models and bake them ahead of time",
     "bench": "speed of this machine; quality on reference captures with known truth",
+    "licenses": "what is installed, under which terms, and what that means",
+    "plugins": "what other packages add: methods, formats and datasets, and what is wrong with them",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
 """Name -> summary. `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.

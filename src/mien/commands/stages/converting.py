@@ -1,4 +1,4 @@
-"""The content that `mien export` writes of an avatar that comes from a file. Whole avatars are written without torch."""
+"""The content that `mien export` writes of an avatar in a file. Whole avatars are written without torch."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
