@@ -16,13 +16,15 @@ from mien.licences.spdx import requirements_of
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 WITHOUT = """
-import sys
+import importlib.util, sys
 
 class Missing:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in {missing}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *more: None if name in {missing} else find(name, *more)
 sys.meta_path.insert(0, Missing())
 from mien.cli import main
 sys.exit(main(sys.argv[1:]))

@@ -86,7 +86,9 @@ def _expression(declared: str, package: Distribution) -> str:
     if package.metadata.get("License-Expression"):
         return declared
     parts = []
-    for part in declared.removeprefix(f"{_APPROVED}; ").split("; ") if "\n" not in declared else [declared.splitlines()[0]]:
+    for part in (
+        declared.removeprefix(f"{_APPROVED}; ").split("; ") if "\n" not in declared else [declared.splitlines()[0]]
+    ):
         word = part.strip()
         parts.append(word if kind_of(word) != "unknown" else WORDS.get(word.lower(), word))
     return " AND ".join(dict.fromkeys(parts))

@@ -47,8 +47,8 @@ class CameraSwitch:
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._camera: "mien.capture.live_camera.LiveCamera | None" = None
-        self._follower: "mien.driving.live.Follower | None" = None
+        self._camera: mien.capture.live_camera.LiveCamera | None = None
+        self._follower: mien.driving.live.Follower | None = None
         self.meters = Meters(STAGES)
         self.watch: Callable[[Seen], None] | None = None
         """Is called after each frame that was followed."""
