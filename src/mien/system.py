@@ -107,7 +107,7 @@ def peak_memory_mb() -> float:
 
 
 def lower_priority(pid: int, steps: int) -> None:
-    """Let a process wait for others, by that many steps of nice(1). Windows has other steps, and nothing changes there."""
+    """Let a process wait for others, by that many steps of nice(1). On Windows, nothing changes."""
     if sys.platform != "win32":
         os.setpriority(os.PRIO_PROCESS, pid, steps)
 
