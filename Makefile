@@ -150,7 +150,7 @@ lock: $(VENV)/.packages
 	  --generate-hashes --no-emit-index-url --no-annotate --custom-compile-command "make lock" \
 	  -o "requirements/$${package%%==*}.txt" || exit 1; done
 
-# Everything of a release into dist/, the same bytes for the same commit (release/make.py).
+# Everything of a release into dist/, with the times of its commit (release/make.py).
 release: setup
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python release/make.py --out dist
 

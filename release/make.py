@@ -1,7 +1,7 @@
 """Makes a release in one command: sdist, wheels, npm package, documentation, checksums and the release page.
 
-`make release` calls it. The same commit gives the same bytes, on any checkout and at any time: every file gets the time
-of the commit. A wheel that others can install comes from cibuildwheel, which needs Docker or Podman; without them, the
+`make release` calls it. Every file gets the time of the commit, so that the same commit gives the same bytes. For wheels
+and the site, two builds have not been compared yet. A wheel that others can install comes from cibuildwheel, which needs Docker or Podman; without them, the
 wheels are those of this machine's Pythons, and the page says so.
 """
 
