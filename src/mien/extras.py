@@ -18,6 +18,7 @@ EXTRA_OF = {
     "PIL": "create",
     "jinja2": "create",
     "scipy": "create",
+    "zstandard": "create",
     "viser": "viewer",
     "pxr": "usd",
     "gsplat": "cuda",

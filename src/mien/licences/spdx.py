@@ -25,6 +25,7 @@ _LICENCES = {
     "jinja2": "BSD-3-Clause",
     "gsplat": "Apache-2.0",
     "viser": "MIT",
+    "zstandard": "BSD-3-Clause",
 }
 """Licences of what mien asks for, beside those of `PACKAGES`."""
 
