@@ -1,4 +1,4 @@
-# make setup | web-packages | chromium | web | demo | test | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | web-packages | chromium | web | demo | test | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | release | elsewhere | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
@@ -9,8 +9,9 @@ NATIVE := $(wildcard native/*.*) CMakeLists.txt
 UNLESS_STRICT := test -z "$$MIEN_STRICT"
 UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
+ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs bench gpu lock clean
+.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs release elsewhere bench gpu lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -121,8 +122,8 @@ mutate: setup web-packages
 
 # pyright's wrapper asks the package index for a newer version unless it is told not to.
 lint: setup
-	$(BIN)/ruff check src tests examples benchmarks docs/site docs/pictures
-	$(BIN)/ruff format --check src tests examples benchmarks docs/site docs/pictures
+	$(BIN)/ruff check src tests examples benchmarks release docs/site docs/pictures
+	$(BIN)/ruff format --check src tests examples benchmarks release docs/site docs/pictures
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/python tests/sizes.py
 	$(BIN)/python tests/seams.py
@@ -131,8 +132,8 @@ lint: setup
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python
 
 format: setup
-	$(BIN)/ruff check --fix src tests examples benchmarks docs/site docs/pictures
-	$(BIN)/ruff format src tests examples benchmarks docs/site docs/pictures
+	$(BIN)/ruff check --fix src tests examples benchmarks release docs/site docs/pictures
+	$(BIN)/ruff format src tests examples benchmarks release docs/site docs/pictures
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 
 # The site of the documentation, with the reference of the public API: build/docs/index.html. A broken link is an error.
@@ -142,12 +143,23 @@ docs: setup
 
 # Re-resolve the locked requirements (both Pythons, every platform) after a change in pyproject.toml or overrides.txt.
 lock: $(VENV)/.packages
-	$(BIN)/uv pip compile pyproject.toml --group dev --overrides requirements/overrides.txt --universal \
+	$(BIN)/uv pip compile pyproject.toml --group dev --extra create --overrides requirements/overrides.txt --universal \
 	  --python-version 3.11 --generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
 	  -o requirements/lock.txt
-	for package in $(UV) $(GSPLAT); do echo "$$package" | $(BIN)/uv pip compile - --no-deps --universal --python-version 3.11 \
+	for package in $(UV) $(GSPLAT) $(ZIGLANG); do echo "$$package" | $(BIN)/uv pip compile - --no-deps --universal --python-version 3.11 \
 	  --generate-hashes --no-emit-index-url --no-annotate --custom-compile-command "make lock" \
 	  -o "requirements/$${package%%==*}.txt" || exit 1; done
+
+# Everything of a release into dist/, with the times of its commit (release/make.py).
+release: setup
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python release/make.py --out dist
+
+# The native core for other systems: built by zig, run under qemu-user (aarch64) and Wine (Windows), linked for macOS.
+elsewhere: setup
+	@for program in qemu-aarch64-static wine64; do command -v $$program >/dev/null || { \
+	  echo "No $$program: run 'apt-get install qemu-user-static wine64'."; exit 1; }; done
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --require-hashes --no-deps -r requirements/ziglang.txt
+	$(MAKE) -C native/checks elsewhere ZIG="$(abspath $(BIN))/python -m ziglang"
 
 bench: setup
 	$(BIN)/mien bench render
@@ -162,4 +174,4 @@ gpu: setup
 	$(BIN)/mien bench train-step --device cuda --json > out/gpu/train_step.json
 
 clean:
-	rm -rf build out .venv .venv312
+	rm -rf build dist out .venv .venv312

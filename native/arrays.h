@@ -127,7 +127,7 @@ struct Group {
  private:
   template <typename Field>
   void read_field(size_t index, Field& field) const {
-    const nb::handle item = PyTuple_GET_ITEM(items.ptr(), static_cast<Py_ssize_t>(index));
+    const nb::handle item = items[index].ptr();
     if (nb::try_cast<Field>(item, field, std::is_arithmetic_v<Field>)) return;
     throw nb::type_error((std::string(T::kName) + "." + T::kFields[index] + " has the wrong type or shape").c_str());
   }

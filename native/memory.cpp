@@ -1,6 +1,5 @@
 #include "memory.h"
 
-#include <cstdlib>
 #include <deque>
 #include <mutex>
 
@@ -39,7 +38,7 @@ void* take_memory(size_t bytes) {
       return memory;
     }
   }
-  return std::aligned_alloc(64, bytes < 64 ? 64 : (bytes + 63) / 64 * 64);
+  return allocate_aligned(bytes < 64 ? 64 : (bytes + 63) / 64 * 64);
 }
 
 void give_memory(void* memory, size_t bytes) noexcept {
@@ -48,12 +47,12 @@ void give_memory(void* memory, size_t bytes) noexcept {
   try {
     kept.blocks.push_back({memory, bytes});
   } catch (const std::bad_alloc&) {
-    std::free(memory);
+    free_aligned(memory);
     return;
   }
   kept.bytes += bytes;
   while (kept.bytes > kMostBytes) {
-    std::free(kept.blocks.front().memory);
+    free_aligned(kept.blocks.front().memory);
     kept.bytes -= kept.blocks.front().bytes;
     kept.blocks.pop_front();
   }

@@ -8,6 +8,11 @@
 
 namespace mien {
 
+// Memory aligned to a cache line, from the operator new of C++, since Windows has no std::aligned_alloc. Null if there
+// is none. `free_aligned` frees it.
+inline void* allocate_aligned(size_t bytes) { return ::operator new(bytes, std::align_val_t{64}, std::nothrow); }
+inline void free_aligned(void* memory) noexcept { ::operator delete(memory, std::align_val_t{64}); }
+
 // At least `bytes` of undefined values, aligned to a cache line; null if there is no memory.
 void* take_memory(size_t bytes);
 // Keeps memory for the next `take_memory` of the same size, or frees it. `bytes` is the number it was taken with.

@@ -1,6 +1,8 @@
 #include "pool.h"
 
+#if !defined(_WIN32)
 #include <pthread.h>
+#endif
 
 #include <algorithm>
 #include <atomic>
@@ -185,6 +187,9 @@ std::mutex* g_creation = new std::mutex;
 // Pools that were replaced. They stay, since another thread may be about to run a loop on one.
 std::vector<Pool*>* g_retired = new std::vector<Pool*>;
 
+#if defined(_WIN32)
+void forget_in_children() {}  // Windows has no fork
+#else
 void forget_pool() {
   g_pool = nullptr;
   g_creation = new std::mutex;
@@ -194,6 +199,7 @@ void forget_in_children() {
   static const int registered = pthread_atfork(nullptr, nullptr, forget_pool);
   static_cast<void>(registered);
 }
+#endif
 
 int checked_threads(const char* what, long long count) {
   if (count < 0 || count > kMostThreads) {

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "pool.h"
+#include "processor.h"
 #include "rasterize_frame.h"
 
 namespace mien {
@@ -33,8 +34,8 @@ struct Isa {
 const std::vector<Isa>& isas() {
 #if defined(__x86_64__) && !defined(MIEN_PORTABLE)
   static const std::vector<Isa> all = {
-      {"avx512", &kernels_avx512, __builtin_cpu_supports("x86-64-v4") != 0},
-      {"avx2", &kernels_avx2, __builtin_cpu_supports("x86-64-v3") != 0},
+      {"avx512", &kernels_avx512, has_x86_64_v4()},
+      {"avx2", &kernels_avx2, has_x86_64_v3()},
       {"sse4", &kernels_sse4, true},
   };
 #else

@@ -2,12 +2,12 @@
 #pragma once
 
 #include <algorithm>
-#include <cstdlib>
 #include <deque>
 #include <mutex>
 #include <new>
 #include <utility>
 
+#include "memory.h"
 #include "rasterize_kernels.h"
 
 namespace mien {
@@ -19,15 +19,15 @@ class Buffer {
   Buffer() = default;
   Buffer(const Buffer&) = delete;
   Buffer& operator=(const Buffer&) = delete;
-  ~Buffer() { std::free(data_); }
+  ~Buffer() { free_aligned(data_); }
 
   // At least `count` elements, never null. Their values may be lost.
   T* reserve(int64_t count) {
     if (count > capacity_ || !data_) {
-      std::free(data_);
+      free_aligned(data_);
       capacity_ = count + count / 4 + 64;
       const size_t bytes = (sizeof(T) * static_cast<size_t>(capacity_) + 63) / 64 * 64;
-      data_ = static_cast<T*>(std::aligned_alloc(64, bytes));
+      data_ = static_cast<T*>(allocate_aligned(bytes));
       if (!data_) {
         capacity_ = 0;
         throw std::bad_alloc();

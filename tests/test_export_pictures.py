@@ -15,7 +15,8 @@ from mien.commands.picture import PictureOptions
 from mien.commands.stages.pictures import draw
 from mien.errors import UserError
 from mien.export.output import plan_output
-from mien.export.pictures import to_rgb, to_rgba, write_pictures
+from mien.export.pictures import write_pictures
+from mien.export.pixels import to_rgb, to_rgba
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.camera_paths import read_cameras, sway, write_cameras
 from mien.storage import write_json

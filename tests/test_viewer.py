@@ -13,7 +13,7 @@ from mien.capture.video import count_frames
 from mien.cli import main
 from mien.errors import UserError
 from mien.export import Motion
-from mien.export.pictures import to_rgb
+from mien.export.pixels import to_rgb
 from mien.face import load_face_model
 from mien.runtime.posing import rig_points
 from mien.viewer.drawing import Look, Mesh, View, beside, draw, words_about_view

@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, cast
 
+from mien.system import BINARY, NO_LINK, NO_WAIT
+
 MAX_SIDE = 8192
 """Largest width or height of a picture in pixels, of those that are read and of those that are rendered."""
 _WHOLE_NUMBERS = range(-(1 << 63), 1 << 64)
@@ -157,12 +159,13 @@ def open_handle(path: Path, flags: int, *, follow_link: bool) -> int:
         OSError: it is missing or cannot be opened.
     """
     try:
-        handle = os.open(path, flags | os.O_NONBLOCK | (0 if follow_link else os.O_NOFOLLOW), 0o644)
+        handle = os.open(path, flags | NO_WAIT | BINARY | (0 if follow_link else NO_LINK), 0o644)
     except OSError as error:
         if error.errno in _NOT_ORDINARY or (error.errno == errno.ELOOP and not follow_link):
             raise NotOrdinaryError("it is not an ordinary file") from None
         raise
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
+    linked = not follow_link and not NO_LINK and path.is_symlink()
+    if linked or not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
         raise NotOrdinaryError("it is not an ordinary file")
     return handle

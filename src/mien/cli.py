@@ -4,6 +4,7 @@ import contextlib
 import difflib
 import errno
 import importlib
+import importlib.util
 import inspect
 import io
 import os
@@ -18,6 +19,7 @@ from pathlib import Path
 import mien
 from mien.bounded import MAX_SIDE
 from mien.errors import UserError
+from mien.extras import missing_package
 from mien.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
 from mien.threads import asked_threads
@@ -43,6 +45,8 @@ COMMANDS = {
     "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
     "face-models": "list the face models and bake them ahead of time",
     "bench": "speed of this machine; quality on reference captures with known truth",
+    "licenses": "what is installed, under which terms, and what that means",
+    "plugins": "what other packages add: methods, formats and datasets, and what is wrong with them",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
 """Name -> summary. `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.
@@ -117,6 +121,9 @@ def _main(arguments: list[str]) -> int:
         if error.errno not in _USERS_ERRNOS:
             return _crash()
         return _complain(f"{error.filename or 'a file'}: {error.strerror}; correct that and run the same command again")
+    except ImportError as error:
+        words = missing_package(error)
+        return _crash() if words is None else _complain(words)
     except Exception:
         return _crash()
 
@@ -250,10 +257,14 @@ def _check_instruction_set() -> None:
 
 
 def _use_one_torch_thread() -> None:
-    """Limit torch to one thread and leave the cores to native code. Their two thread pools stall each other."""
-    import torch
+    """Limit torch to one thread and leave the cores to native code. Their two thread pools stall each other.
 
-    torch.set_num_threads(1)
+    Without torch, commands that need it say so themselves.
+    """
+    if importlib.util.find_spec("torch") is not None:
+        import torch
+
+        torch.set_num_threads(1)
 
 
 def _overview() -> str:

@@ -127,7 +127,7 @@ def _exchange(one: Path, other: Path) -> bool:
     """Exchange two paths (Linux); False if the system or the file system cannot."""
     try:
         rename = ctypes.CDLL(None).renameat2
-    except (OSError, AttributeError):
+    except (OSError, AttributeError, TypeError):  # TypeError: Windows
         return False
     return rename(_AT_CURRENT_FOLDER, os.fsencode(one), _AT_CURRENT_FOLDER, os.fsencode(other), _EXCHANGE) == 0
 

@@ -15,6 +15,7 @@ from typing import IO
 
 from mien.bounded import NotOrdinaryError, open_handle
 from mien.errors import UserError
+from mien.system import BINARY, NO_LINK
 
 _MAX_NAME_BYTES = 255
 _NOT_IN_NAMES = frozenset({"Cc", "Cs", "Zl", "Zp"})
@@ -105,7 +106,7 @@ def open_new(path: Path) -> IO[bytes]:
         OSError: it cannot be written.
     """
     path.unlink(missing_ok=True)
-    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644), "w+b")
+    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK | BINARY, 0o644), "w+b")
 
 
 def remove_tree(path: Path) -> None:

@@ -1,23 +1,22 @@
 """Two commands on one workspace: writers hold a lock, and readers never wait.
 
 `hold` takes the lock of a place (a folder or a file, which may be missing). The lock is the hidden file `.NAME.lock`
-beside the place, locked by the library filelock with flock(2). The system releases it when the process ends, however it
-ends, so no lock is ever left over. If another process holds a place, `hold` raises `BeingWrittenError` at once and
-quotes what that process wrote about itself into the file.
+beside the place, locked by the library filelock, with flock(2) or Windows' LockFileEx. The system releases it when the
+process ends, however it ends, so no lock is ever left over. If another process holds a place, `hold` raises
+`BeingWrittenError` at once and quotes what that process wrote about itself into the file.
 
 The file is removed with the lock. That is safe, because it is removed only while it is locked, and because a process
 that gets the lock of a removed file starts again. After a kill the file stays, unlocked, and the next process uses it.
 
 The file may come from a stranger together with the workspace: no link is followed, and its content is not trusted.
 
-Readers look at a lock with flock(2) itself, because they must not create the file, and because two of them that look at
-the same time must not take each other for writers. filelock has no such look.
+Readers look at a lock by `mien.system.is_locked`, because they must not create the file, and because two of them that
+look at the same time must not take each other for writers. filelock has no such look.
 
 docs/conventions.md, "Two commands at once", lists which command holds which locks. Readers use `read_beside_writers`.
 """
 
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -33,12 +32,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from filelock import Timeout, UnixFileLock, lock_descriptor
+from filelock import FileLock, Timeout, lock_descriptor
 
 from mien.bounded import open_handle, parse_json
 from mien.errors import CannotWriteError, UserError
 from mien.files import cannot_write
 from mien.progress import say
+from mien.system import IS_WINDOWS, SIGNATURE_AT, is_locked, may_live, read_at, write_at
 
 Result = TypeVar("Result")
 
@@ -195,14 +195,14 @@ def _lock(file: Path) -> Callable[[], None]:
         _check_plain(file, file.lstat())
     with ExitStack() as held:
         begin = partial(_begin, file, held)
-        lock = UnixFileLock(file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=begin)
+        lock = FileLock(file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=begin)
         held.callback(lock.release)
         try:
             lock.acquire()
         except PermissionError:
             if not file.is_file():
                 raise
-            # Another user's file, which a kill has left. Reading is enough to lock it, but UnixFileLock also writes.
+            # Another user's file, which a kill has left. Reading is enough to lock it, but filelock also writes.
             handle = open_handle(file, os.O_RDONLY, follow_link=False)
             held.callback(os.close, handle)
             if not lock_descriptor(handle, blocking=False):
@@ -216,7 +216,8 @@ def _begin(file: Path, held: ExitStack, handle: int) -> None:
     opened = os.fstat(handle)
     _check_plain(file, opened)
     # Over NFS, a removed file that is open still has a name, so filelock does not notice that it was removed.
-    if _identity(opened) != _identity(file.lstat()):
+    # On Windows, a file that is open cannot be removed.
+    if not IS_WINDOWS and _identity(opened) != _identity(file.lstat()):
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(file))
     _sign(handle, file)
     _ours[_identity(opened)] = os.getpid()
@@ -248,14 +249,11 @@ def _holder(file: Path, *, ours: bool = True) -> str | None:
     try:
         if not ours and _ours.get(_identity(os.fstat(handle))) == os.getpid():
             return None
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return _wait_for_name(handle)
+        return _wait_for_name(handle) if is_locked(handle) else None
     except OSError:
         return None
     finally:
         os.close(handle)
-    return None
 
 
 def _wait_for_name(handle: int) -> str:
@@ -297,7 +295,7 @@ def _sign(handle: int, file: Path) -> None:
     Raises:
         UserError: the file is not a lock file of mien. It stays as it is.
     """
-    found = os.pread(handle, len(_BEGINNING), 0)
+    found = read_at(handle, len(_BEGINNING), SIGNATURE_AT)
     if found != _BEGINNING[: len(found)]:
         raise UserError(f"{file}: has the name of a lock file, but mien did not write it; move it away")
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]) if sys.argv else "python"
@@ -311,7 +309,7 @@ def _sign(handle: int, file: Path) -> None:
     text = json.dumps(about).encode()
     with suppress(OSError):  # a full disk, or another user's file: the lock holds even without a signature
         os.ftruncate(handle, 0)
-        os.pwrite(handle, text, 0)
+        write_at(handle, text, SIGNATURE_AT)
 
 
 def read_holder(handle: int) -> str | None:
@@ -319,7 +317,7 @@ def read_holder(handle: int) -> str | None:
 
     The result is None if the file names no process, or one that has ended: the holder has not signed yet.
     """
-    about = _parsed(os.pread(handle, _MAX_SIGNATURE_BYTES, 0))
+    about = _parsed(read_at(handle, _MAX_SIGNATURE_BYTES, SIGNATURE_AT))
     if about is None or not _may_live(about):
         return None
     words = {name: _shown(about.get(name), longest) for name, longest in _MAX_SHOWN.items()}
@@ -339,13 +337,7 @@ def _may_live(about: dict[str, Any]) -> bool:
     """False if the holder is a process of this machine that has ended."""
     if about.get("host") != socket.gethostname()[: _MAX_SHOWN["host"]]:
         return True
-    try:
-        os.kill(about["pid"], 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # the process belongs to another user
-        return True
-    return True
+    return may_live(about["pid"])
 
 
 def _shown(text: object, longest: int) -> str:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien import system
 from mien.errors import UserError
 from mien.files import cannot_write, write_atomically
 from mien.inside import open_to_read
@@ -188,5 +189,5 @@ def write_at(file: int, picture: UInt8[np.ndarray, "..."], offset: int) -> None:
     """
     data = np.ascontiguousarray(picture).data.cast("B")
     while data:
-        written = os.pwrite(file, data, offset)
+        written = system.write_at(file, data, offset)
         data, offset = data[written:], offset + written

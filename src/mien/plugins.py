@@ -6,6 +6,7 @@ A faulty addition stops only what asks for it by name. Lists leave it out, with 
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -51,6 +52,32 @@ def plugins(group: str, kind: type[_T]) -> dict[str, _T]:
         if isinstance(loaded, UserError):
             warn(str(loaded))
     return {name: loaded for name, loaded in found.items() if isinstance(loaded, kind)}
+
+
+@dataclass(frozen=True)
+class Added:
+    """Something that an installed package adds to a registry."""
+
+    group: str
+    name: str
+    package: str
+    version: str
+    place: str
+    """MODULE:NAME of the object."""
+    fault: str | None
+    """Why mien leaves it out; None if it can be used."""
+
+
+def added(group: str, kind: type[_T]) -> list[Added]:
+    """Return all that installed packages add to a registry, sorted by name, with what is wrong with each."""
+    found = []
+    for name, points in _points(group).items():
+        loaded = _loaded(group, name, kind)
+        fault = str(loaded) if isinstance(loaded, UserError) else None
+        for point in points:
+            version = point.dist.version if point.dist else "unknown"
+            found.append(Added(group, name, _package(point), version, point.value, fault))
+    return found
 
 
 def with_plugins(group: str, kind: type[_T], own: Sequence[_T], words: Callable[[_T], Iterable[str]]) -> list[_T]:

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from mien.system import HANGUPS, repeat_signal
+
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 EXIT_HUNG_UP = 129
@@ -31,7 +33,7 @@ class HungUp(Terminated):
 _KINDS: dict[int, type[BaseException]] = {
     signal.SIGINT: KeyboardInterrupt,
     signal.SIGTERM: Terminated,
-    signal.SIGHUP: HungUp,
+    **dict.fromkeys(HANGUPS, HungUp),
 }
 _REPEAT_SECONDS = 0.05
 """Time after which a stop that a library has dropped is repeated."""
@@ -92,7 +94,7 @@ def orderly_stops() -> Iterator[None]:
             hook(dropped)
             return
         asked.clear()
-        again = threading.Timer(_REPEAT_SECONDS, signal.pthread_kill, [threading.get_ident(), number])
+        again = threading.Timer(_REPEAT_SECONDS, repeat_signal, [threading.get_ident(), number])
         again.daemon = True
         again.start()
 

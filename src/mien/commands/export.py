@@ -134,12 +134,14 @@ class Command:
 
     def run(self) -> None:
         """Pose the avatar and write the files."""
-        from mien.commands.stages.exporting import RunContent, Series, convert, export
-
         kind = self._kind()
         if self._is_file():
+            from mien.commands.stages.converting import convert
+
             convert(self.workspace, self.out, kind, self._options())
             return
+        from mien.commands.stages.exporting import RunContent, Series, export
+
         workspace = open_workspace(self.workspace)
         series = None if self.series is None else Series(self.series, self.neutral, self.every)
         content = RunContent(workspace, workspace.pick_run(self.run_name), self.set, series)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from mien.commands.options import check_avatar
 from mien.commands.picture import PictureOptions
 from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import mien.camera
     import mien.export.output
     import mien.face
+    import mien.runtime
 
 
 _MAX_STRENGTH = 3.0
@@ -30,7 +32,7 @@ class Command:
     """Render an avatar: a still, or a video along a camera path, at any expression or with a sequence's motion."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Workspace folder."""
+    """Workspace folder, or a .mien file, which is drawn without torch."""
     out: Path
     """Output: .png for a still, a folder or NAME_%06d.png for numbered pictures, .mp4 or .webm for a video."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
@@ -80,6 +82,9 @@ class Command:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         check_device(self.device)
+        if self._is_file():
+            self._check_file()
+            return
         workspace = open_workspace(self.workspace)
         workspace.pick_run(self.run_name)
         if self.sequence is not None or (self.path == "captured" and self.cameras is None):
@@ -94,6 +99,9 @@ class Command:
 
     def run(self) -> None:
         """Pose and render frame by frame, after a check of everything that depends on files."""
+        if self._is_file():
+            self._draw_file()
+            return
         from mien.avatar import load_avatar, move_avatar
         from mien.commands.expression import tell_of_unfilmed, with_expression
         from mien.commands.stages.pictures import draw, warn_of_white
@@ -148,6 +156,50 @@ class Command:
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
         if covered is not None:
             say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
+
+    def _is_file(self) -> bool:
+        """Whether the avatar comes from a file."""
+        return self.workspace.suffix.lower() == ".mien" and not self.workspace.is_dir()
+
+    def _check_file(self) -> None:
+        """Refuse what only a run has."""
+        check_avatar(self.workspace, self.run_name)
+        runs_own = {
+            "--sequence": self.sequence is not None,
+            "--own-motion": self.own_motion,
+            "--timestep": self.timestep is not None,
+            "--sheet": self.sheet != "none",
+            "--cameras": self.cameras is not None,
+            "--path captured": self.path == "captured",
+            "--device": self.device != "cpu",
+        }
+        for option, given in runs_own.items():
+            if given:
+                raise UserError(
+                    f"{option}: is for runs, and {self.workspace} is a file; leave it out, or give a workspace"
+                )
+        self._check_numbers()
+        self.picture.plan(self.out, self._frames(None))
+
+    def _draw_file(self) -> None:
+        """Draw the avatar of a file, without torch."""
+        from mien.commands.stages.file_pictures import View, render_file
+
+        frames = self._frames(None)
+        view = View(self.yaw, self.pitch, self.zoom, lambda camera, center: self._file_path(camera, center, frames))
+        render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
+
+    def _file_path(
+        self, camera: "mien.runtime.Camera", center: "numpy.ndarray", frames: int
+    ) -> "list[mien.runtime.Camera]":
+        from mien.runtime.camera_paths import sway, turntable
+
+        span, tilt = math.radians(self.span), math.radians(self.tilt)
+        if self.path == "still" or self._is_still():
+            return [camera] * frames
+        if self.path == "turntable":
+            return turntable(camera, center, frames, span)
+        return sway(camera, center, frames, span, tilt, crossing=self.path == "sway")
 
     def _camera(self, run_dir: Path, subject: "mien.face.FaceParams") -> "mien.camera.Camera":
         """The run's first camera, moved by --yaw, --pitch and --zoom."""

@@ -13,7 +13,7 @@ import av
 import cv2
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 
 from mien.capture.video import write_video
 from mien.capture.video_file import create_video
@@ -22,8 +22,6 @@ from mien.export.output import Output
 from mien.picture_files import write_png
 from mien.storage import cannot_write, write_atomically
 
-_ROWS = 512
-"""Number of rows converted at a time. An 8192x8192 picture would otherwise be in memory four times."""
 _FRINGE = 8
 """Distance in pixels over which colours are spread beyond the opaque part: video halves the resolution of colour."""
 _WEBM_QUALITY = 24
@@ -53,26 +51,6 @@ def write_pictures(
                 write_png(output.path if output.kind == "still" else output.numbered(index), picture)
     except OSError as error:
         raise cannot_write(output.path, error) from None
-
-
-def to_rgb(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture in 0..1 as bytes, clamped and rounded. It is converted in bands of rows."""
-    picture = np.empty(image.shape, np.uint8)
-    for top in range(0, len(image), _ROWS):
-        picture[top : top + _ROWS] = np.clip(image[top : top + _ROWS], 0, 1) * 255 + 0.5
-    return picture
-
-
-def to_rgba(over_black: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
-    """A picture rendered over black, as straight colours and alpha. Colours are 0 where alpha is 0."""
-    picture = np.empty((*alpha.shape, 4), np.uint8)
-    for top in range(0, len(alpha), _ROWS):
-        band = slice(top, top + _ROWS)
-        opacity = alpha[band, :, None]
-        colors = np.divide(over_black[band], opacity, out=np.zeros_like(over_black[band]), where=opacity > 1e-6)
-        picture[band, :, :3] = np.clip(colors, 0, 1) * 255 + 0.5
-        picture[band, :, 3] = np.clip(alpha[band], 0, 1) * 255 + 0.5
-    return picture
 
 
 def _write_webm(output: Output, pictures: Iterable[np.ndarray], fps: int | float) -> None:

@@ -1,6 +1,5 @@
 """Checkpoints: everything that the rest of a run depends on. Each is one file, written atomically."""
 
-import resource
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from mien.avatar.files import overwrite
 from mien.errors import UserError
 from mien.progress import say
 from mien.storage import expect_whole, read_tensors, write_tensors
+from mien.system import peak_memory_mb
 from mien.training.adam import Adam
 from mien.training.density_control import DensityStrategy
 from mien.training.face_track import FaceTrack
@@ -46,8 +46,7 @@ class TrainingState:
 
     def measure_memory(self) -> None:
         """Bring `peak_memory_mb` up to date."""
-        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        self.peak_memory_mb = max(self.peak_memory_mb, own)
+        self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb())
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:

@@ -1,20 +1,22 @@
-"""Pictures for the viewer: Gaussians, mesh and wireframe from the view of a browser, beside the filmed frame."""
+"""Pictures for the viewer: Gaussians, mesh and wireframe from the view of a browser, beside the filmed frame.
+
+Gaussians are drawn without torch; the mesh, and what a camera films, need the packages of `mien[create]`.
+"""
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, Float32, Int32, UInt8
 
 from mien import runtime
-from mien.camera import Camera
-from mien.export.pictures import to_rgb
-from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
+from mien.export.pixels import to_rgb
 from mien.runtime.filmed import head_angles
 from mien.runtime.posing import rig_points
+
+if TYPE_CHECKING:
+    import torch
 
 Surface = Literal["avatar", "mesh", "confidence"]
 """What is drawn: the Gaussians, the grey mesh of the face model, or the mesh in the colours of its confidence."""
@@ -89,6 +91,11 @@ def draw(
     background = BACKGROUNDS[look.background]
     if mesh is None or (look.surface == "avatar" and not look.wireframe):
         return to_rgb(runtime.render(gaussians, camera, background)[0])
+    import torch
+
+    from mien.camera import Camera
+    from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
+
     vertices = torch.from_numpy(rig_points(mesh.rig, face, in_world=True))
     faces = torch.from_numpy(mesh.faces.astype(np.int64))
     seen_by = Camera(torch.from_numpy(camera.K), torch.from_numpy(camera.viewmat), camera.width, camera.height)
@@ -104,8 +111,10 @@ def draw(
     return picture
 
 
-def _confidence_colors(mesh: Mesh) -> torch.Tensor:
+def _confidence_colors(mesh: Mesh) -> "torch.Tensor":
     """Colours of the triangles' corners, [f, 3, 3]."""
+    import torch
+
     assert mesh.seen is not None
     seen = torch.from_numpy(mesh.seen)[:, None]
     mixed = torch.lerp(torch.tensor(_FILLED_IN), torch.tensor(_SEEN), seen)
@@ -126,6 +135,8 @@ def beside(
     filmed: UInt8[np.ndarray, "_ _ 3"], shown: UInt8[np.ndarray, "h w 3"], background: str
 ) -> UInt8[np.ndarray, "h _ 3"]:
     """A filmed frame in the left half, as large as fits, and the avatar in the right half."""
+    import cv2
+
     height, width = shown.shape[:2]
     scale = min(width / filmed.shape[1], height / filmed.shape[0])
     size = (max(1, round(filmed.shape[1] * scale)), max(1, round(filmed.shape[0] * scale)))
@@ -139,6 +150,8 @@ def beside(
 
 def in_corner(seen: UInt8[np.ndarray, "_ _ 3"], shown: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with what the camera saw in its lower left corner."""
+    import cv2
+
     height, width = shown.shape[:2]
     scale = min(_CORNER * height / seen.shape[0], _CORNER * width / seen.shape[1])
     wide, high = (max(1, round(scale * side)) for side in (seen.shape[1], seen.shape[0]))

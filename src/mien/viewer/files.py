@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mien.export.output import Output
-from mien.export.pictures import write_pictures
-from mien.picture_files import encode_picture
+from mien.export.pixels import png_bytes
 from mien.runtime.rotation import matrix_from_axis_angle
 from mien.viewer.drawing import MAX_SIDE, View
 from mien.viewer.session import Session
@@ -36,7 +35,7 @@ def screenshot(session: Session, view: View) -> bytes:
     """
     scale = max(1.0, SCREENSHOT_HEIGHT / max(1, view.height))
     larger = replace(view, width=round(scale * view.width), height=round(scale * view.height))
-    return encode_picture(session.picture(larger, height=MAX_SIDE))
+    return png_bytes(session.picture(larger, height=MAX_SIDE))
 
 
 def video(
@@ -53,6 +52,8 @@ def video(
     Raises:
         Stopped: `go_on` returned False.
     """
+    from mien.export.pictures import write_pictures
+
     clip = session.clip
 
     def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:

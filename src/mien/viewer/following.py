@@ -3,15 +3,18 @@
 import threading
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from mien.capture.faces import LandmarkDetector
-from mien.capture.live_camera import LiveCamera, LiveFrame
-from mien.driving.live import Follower
 from mien.viewer.meters import Meters
 from mien.viewer.session import Seen, Session
+
+if TYPE_CHECKING:
+    import mien.capture.faces
+    import mien.capture.live_camera
+    import mien.driving.live
 
 STAGES = ("camera", "tracking", "drawing")
 _PATIENCE_SECONDS = 0.04
@@ -27,7 +30,12 @@ _WORDS = {
 class CameraSwitch:
     """Follows a camera while it is on. Methods may be called from any thread."""
 
-    def __init__(self, session: Session, open_camera: Callable[[], LiveCamera], make: Callable[[], Follower]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        open_camera: Callable[[], "mien.capture.live_camera.LiveCamera"],
+        make: Callable[[], "mien.driving.live.Follower"],
+    ) -> None:
         """Prepare to follow; nothing is opened before `start`.
 
         Args:
@@ -39,8 +47,8 @@ class CameraSwitch:
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._camera: LiveCamera | None = None
-        self._follower: Follower | None = None
+        self._camera: mien.capture.live_camera.LiveCamera | None = None
+        self._follower: mien.driving.live.Follower | None = None
         self.meters = Meters(STAGES)
         self.watch: Callable[[Seen], None] | None = None
         """Is called after each frame that was followed."""
@@ -105,7 +113,9 @@ class CameraSwitch:
             return ["The camera is away. mien waits for it."]
         return [_WORDS[follower.state], *self.meters.words(time.monotonic())]
 
-    def _run(self, camera: LiveCamera, follower: Follower) -> None:
+    def _run(self, camera: "mien.capture.live_camera.LiveCamera", follower: "mien.driving.live.Follower") -> None:
+        from mien.capture.faces import LandmarkDetector
+
         try:
             with LandmarkDetector(several_faces=False) as detector:
                 camera.start()  # Only now, because the detector takes seconds to load.
@@ -115,7 +125,12 @@ class CameraSwitch:
             self.error = error
         self.ended = self.error is not None or camera.ended
 
-    def _follow(self, camera: LiveCamera, follower: Follower, detector: LandmarkDetector) -> None:
+    def _follow(
+        self,
+        camera: "mien.capture.live_camera.LiveCamera",
+        follower: "mien.driving.live.Follower",
+        detector: "mien.capture.faces.LandmarkDetector",
+    ) -> None:
         number, frames, last = -1, 0, None
         while not self._stopping.is_set():
             frame = camera.newest(number, _PATIENCE_SECONDS)
@@ -134,7 +149,11 @@ class CameraSwitch:
             self.meters.count("tracking", time.monotonic())
 
     def _show(
-        self, follower: Follower, landmarks: Float[np.ndarray, "l 2"] | None, frame: LiveFrame, seconds: float
+        self,
+        follower: "mien.driving.live.Follower",
+        landmarks: Float[np.ndarray, "l 2"] | None,
+        frame: "mien.capture.live_camera.LiveFrame",
+        seconds: float,
     ) -> None:
         height, width = frame.picture.shape[:2]
         face = follower(landmarks, width, height, seconds)

@@ -1,4 +1,4 @@
-"""The content that `mien export` writes: the avatar of a run, or one that comes from a file."""
+"""The content that `mien export` writes of a run: its avatar, poses and motions. Avatars of files: `converting`."""
 
 from collections.abc import Iterator
 from copy import copy
@@ -7,15 +7,13 @@ from pathlib import Path
 
 import torch
 
-from mien import runtime
 from mien.avatar import Avatar, as_array, bake_rig, load_avatar, make_portable
 from mien.commands.expression import with_expression
 from mien.commands.stages.driving import open_driver
 from mien.driving import drive, facing, rest_of
-from mien.errors import UserError
 from mien.export import MeshModel, Motion, in_world
 from mien.face import FaceParams
-from mien.formats import Format, Options, format_of, numbered
+from mien.formats import Format, Options, numbered
 from mien.gaussians import Gaussians
 from mien.progress import say, track_progress
 from mien.runtime import PortableAvatar
@@ -124,71 +122,6 @@ class RunContent:
         origin = torch.zeros_like(face.head_rotation)
         posed = self._avatar.pose(replace(face, head_rotation=origin, head_translation=origin))
         return in_world(posed.gaussians.detach().timestep(0))
-
-
-class FileContent:
-    """An avatar that comes from a file, as `mien.formats.Content`. It has no run and no mesh with a texture."""
-
-    def __init__(self, source: Path):
-        """Read the file.
-
-        Raises:
-            UserError: it is missing, damaged or foreign.
-        """
-        kind = format_of(source)
-        avatar = None if kind is None or kind.read is None else kind.read(source)
-        if not isinstance(avatar, PortableAvatar):
-            raise UserError(f"{source}: files of this format do not hold a whole avatar; give a .mien or a .glb file")
-        self._source, self._avatar = source, avatar
-
-    @property
-    def name(self) -> str:
-        """The avatar's name."""
-        return self._avatar.about.name
-
-    @property
-    def count(self) -> int:
-        """Number of Gaussians."""
-        return len(self.pose())
-
-    def portable(self, confidence: bool = True, soft_cut: bool = False) -> PortableAvatar:
-        """Return the avatar as it was read."""
-        return self._avatar
-
-    def mesh(self) -> MeshModel:
-        """Refuse: the texture coordinates are only in a run."""
-        raise self._only_in_a_run()
-
-    def pose(self) -> Gaussians:
-        """Return the Gaussians at rest."""
-        posed = runtime.Avatar(self._avatar).pose(head_rotation=(0, 0, 0), head_translation=(0, 0, 0))
-        arrays = (posed.means, posed.quats, posed.scales, posed.opacities, posed.sh)
-        pose = None if posed.T_world_local is None else torch.from_numpy(posed.T_world_local.copy())
-        return in_world(Gaussians(*(torch.from_numpy(array.copy()) for array in arrays), T_world_local=pose))
-
-    def poses(self) -> None:
-        """Return None: a file is exported at rest."""
-
-    def motion(self) -> None:
-        """Return None: a file is exported at rest."""
-
-    def trained(self) -> tuple[Avatar, FaceParams]:
-        """Refuse: what was trained is only in a run."""
-        raise self._only_in_a_run()
-
-    def _only_in_a_run(self) -> UserError:
-        return UserError(f"{self._source}: does not have all that this format needs; export it from its workspace")
-
-
-def convert(source: Path, out: Path, kind: Format, options: Options) -> None:
-    """Write the avatar in a file in another format, at rest with the head at the origin, and report it.
-
-    Raises:
-        UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
-    """
-    content = FileContent(source)
-    kind.write(out, content, options)
-    say(f"{out}: {content.name!r} of {source}, {out.stat().st_size / 1e6:.1f} MB")
 
 
 def export(content: RunContent, out: Path, kind: Format, options: Options) -> None:

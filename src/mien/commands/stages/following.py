@@ -19,10 +19,11 @@ from mien.camera import Camera
 from mien.capture.camera_names import CameraName
 from mien.capture.video import write_video
 from mien.commands.picture import PictureOptions
-from mien.commands.stages.viewing import Place, Viewed, open_viewed, switch_of
+from mien.commands.stages.viewing import Place, Viewed, open_viewed
+from mien.commands.stages.viewing_motions import switch_of
 from mien.driving.live import FollowOptions
 from mien.errors import UserError
-from mien.export.pictures import to_rgb
+from mien.export.pixels import to_rgb
 from mien.pictures import side_by_side
 from mien.progress import say
 from mien.storage import cannot_write

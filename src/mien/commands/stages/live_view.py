@@ -11,12 +11,12 @@ from pathlib import Path
 
 from mien.avatar import Avatar, make_portable
 from mien.camera import Camera
+from mien.commands.stages.viewing import PARENT
 from mien.errors import UserError
 from mien.progress import say
 from mien.runtime import write_portable
+from mien.system import lower_priority
 
-PARENT = "MIEN_VIEWER_OF"
-"""Environment variable with the process whose end also ends the viewer."""
 _LEAST_SECONDS = 2.0
 """Least time between two pictures of the state."""
 _SHARE = 1 / 40
@@ -75,5 +75,5 @@ def _start(file: Path) -> "subprocess.Popen[bytes]":
     environment = {**os.environ, PARENT: str(os.getpid()), "MIEN_THREADS": "1"}
     command = [sys.executable, "-m", "mien.cli", "view", str(file), "--follow"]
     viewer = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL)
-    os.setpriority(os.PRIO_PROCESS, viewer.pid, _NICE)
+    lower_priority(viewer.pid, _NICE)
     return viewer

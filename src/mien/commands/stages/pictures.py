@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from mien.avatar import Avatar
 from mien.camera import Camera
 from mien.commands.picture import PictureOptions
-from mien.export.pictures import to_rgb, to_rgba
+from mien.export.pixels import to_rgb, to_rgba
 from mien.gaussians import Gaussians
 from mien.progress import say
 from mien.render import close_holes, rasterize

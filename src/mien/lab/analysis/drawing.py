@@ -1,6 +1,5 @@
 """Time and memory of drawing an avatar at a size."""
 
-import resource
 import time
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from mien.avatar import Avatar
 from mien.camera import Camera
 from mien.face import FaceParams
 from mien.render import rasterize
+from mien.system import peak_memory_mb
 from mien.threads import one_torch_thread
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -105,7 +105,7 @@ def _peak_mb() -> float:
     try:
         return _status_mb("VmHWM")
     except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        return peak_memory_mb()
 
 
 def _status_mb(name: str) -> float:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mien import _native
+from mien.system import load_average
 from mien.threads import one_torch_thread
 
 
@@ -51,7 +52,7 @@ class Machine:
     gflops: float
     """Measured float32 operations of one thread in 1e9 per second: a 512x512 matrix product in torch."""
     load: float
-    """Load average of the minute before the benchmark. Above 0, other work was running."""
+    """Load average of the minute before the benchmark. Above 0, other work was running. Always 0 on Windows."""
     gpu: str = ""
     """Name of the GPU, torch's CUDA version and gsplat's version, if the GPU is measured."""
 
@@ -88,7 +89,7 @@ def device_row(name: str, gaussians: int, size: tuple[int, int], timing: Timing,
 
 def measure_machine(gpu: bool = False) -> Machine:
     """Describe this machine. This takes a fifth of a second."""
-    load = os.getloadavg()[0]
+    load = load_average()
     matrix = torch.randn(512, 512)
     with one_torch_thread():
         timing = time_function(lambda: matrix @ matrix, seconds=0.2)

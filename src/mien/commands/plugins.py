@@ -1,0 +1,53 @@
+"""`mien plugins`: what mien has, and what other packages add to it."""
+
+import json
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+from mien.terminal import show
+
+if TYPE_CHECKING:
+    from mien.plugins import Added
+
+
+@dataclass(frozen=True)
+class Command:
+    """List methods, formats and datasets: mien's own, and those of other packages, with what is wrong with them."""
+
+    json: bool = False
+    """Print an object for programs instead of a list."""
+
+    def check(self) -> None:
+        """Check nothing: there is nothing to check."""
+
+    def run(self) -> None:
+        """Print the list."""
+        from mien.avatar import METHODS, Method
+        from mien.datasets import Dataset, datasets
+        from mien.formats import Format, formats
+        from mien.plugins import added
+
+        found = {
+            "methods": (list(METHODS), added("mien.methods", Method)),
+            "formats": ([each.name for each in formats()], added("mien.formats", Format)),
+            "datasets": ([each.name for each in datasets()], added("mien.datasets", Dataset)),
+        }
+        rows = {
+            group: {"own": _without(names, others), "added": list(map(asdict, others))}
+            for group, (names, others) in found.items()
+        }
+        if self.json:
+            show(json.dumps(rows, indent=1))
+            return
+        for group, (names, others) in found.items():
+            show(f"{group}: {', '.join(_without(names, others))}")
+            for each in others:
+                state = f"left out: {each.fault}" if each.fault else each.place
+                show(f"  {each.name}, added by {each.package} {each.version} ({state})")
+        show('Packages add to these by entry points of the groups "mien.methods", "mien.formats" and "mien.datasets".')
+
+
+def _without(names: list[str], others: "list[Added]") -> list[str]:
+    """Mien's own names."""
+    taken = {each.name for each in others}
+    return [name for name in names if name not in taken]

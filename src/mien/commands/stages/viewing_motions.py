@@ -1,0 +1,109 @@
+"""What of a viewer needs torch: avatars of workspaces, motions, and following a camera."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mien import runtime
+from mien.avatar import as_array, bake_rig, load_avatar, make_portable
+from mien.capture.camera_names import CameraName, camera_named
+from mien.capture.live_camera import LiveCamera
+from mien.commands.stages.driving import open_driver
+from mien.commands.stages.viewing import Viewed, mesh_of
+from mien.driving import drive, facing, keep_to_filmed, rest_of
+from mien.driving.live import Follower, FollowOptions
+from mien.errors import UserError
+from mien.export import Motion
+from mien.face import FaceModel, FaceParams, load_face_model
+from mien.progress import say
+from mien.runtime import PortableAvatar
+from mien.training import read_coverage, run_camera
+from mien.training.run import filmed_range
+from mien.training.whole_head import with_soft_cut
+from mien.viewer import CameraSwitch, Clip, Mesh, Session
+from mien.workspace import open_workspace
+
+
+def of_workspace(root: Path, run: str | None) -> Viewed:
+    """Open a run of a workspace."""
+    workspace = open_workspace(root)
+    run_dir = workspace.run_dir(workspace.pick_run(run))
+    avatar = load_avatar(run_dir)
+    model = avatar.face_model
+    portable = make_portable(avatar, run_camera(run_dir), root.resolve().name, to_share=False)
+    portable = replace(with_soft_cut(portable, avatar), filmed=filmed_range(run_dir, avatar))
+    mesh = mesh_of(portable) or Mesh(bake_rig(model, avatar.subject), as_array(model.faces))
+    coverage = read_coverage(run_dir, model)
+    if coverage is not None and len(coverage.seen) == len(mesh.faces):
+        mesh = replace(mesh, seen=as_array(coverage.seen))
+    sequences = dict.fromkeys(workspace.tracked_names(), root)
+    return Viewed(portable, mesh, sequences, lambda: (model, avatar.subject))
+
+
+def person_of(path: Path, portable: PortableAvatar) -> tuple[FaceModel, FaceParams]:
+    """The face model of an avatar that comes from a file, and the person at rest.
+
+    Raises:
+        UserError: the face model has changed since the file was written.
+    """
+    about, rest = portable.about, portable.neutral
+    model = load_face_model(about.face_model)
+    if model.content_hash != about.face_model_hash:
+        raise UserError(
+            f"{path}: was made with another version of the face model {about.face_model!r}, so no motion can be "
+            "played; export it again from its workspace"
+        )
+    fields = ("expression", "joints", "head_rotation", "head_translation")
+    given = {name: torch.from_numpy(getattr(rest, name).copy())[None] for name in fields}
+    return model, replace(model.neutral(), **given)
+
+
+def clip_of(viewed: Viewed, by: Path, sequence: str | None, neutral: str | None = None) -> Callable[[], Clip]:
+    """Return a function that loads a motion, made for the avatar and softly within what was filmed."""
+
+    def load() -> Clip:
+        model, subject = viewed.person()
+        driver, portable = open_driver(by, sequence, model, neutral=neutral), viewed.portable
+        person = rest_of(subject, model, facing(torch.from_numpy(portable.camera.viewmat))).face
+        face = drive(driver.face, driver.at_rest, person, model.expression_bounds, True, str(by))
+        if portable.filmed is not None:
+            eye = _position(portable.camera)
+            face, _ = keep_to_filmed(face, portable.filmed, subject, model.expression_bounds, eye)
+        fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
+        return Clip(Motion(*map(as_array, fields), fps=driver.fps), driver.pictures)
+
+    return load
+
+
+def switch_of_first_camera(session: Session, viewed: Viewed) -> CameraSwitch:
+    """What lets the avatar of a session follow the first camera of this machine."""
+    return switch_of(session, viewed, camera_named("camera", None), FollowOptions())
+
+
+def switch_of(
+    session: Session, viewed: Viewed, name: CameraName, follow: FollowOptions, again: bool = True
+) -> CameraSwitch:
+    """What lets the avatar of a session follow a camera.
+
+    Args:
+        session: The session.
+        viewed: Its avatar.
+        name: The camera.
+        follow: How the avatar follows.
+        again: Whether a file starts again at its end.
+    """
+
+    def make() -> Follower:
+        model, person = viewed.person()
+        eye = as_array(_position(viewed.portable.camera))
+        return Follower(model, person, viewed.portable.filmed, eye, follow)
+
+    return CameraSwitch(session, lambda: LiveCamera(name, again, say), make)
+
+
+def _position(camera: runtime.Camera) -> torch.Tensor:
+    """The camera's centre in world space, in metres."""
+    return torch.from_numpy((-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]).astype(np.float32))

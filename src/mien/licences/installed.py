@@ -1,0 +1,121 @@
+"""Packages of this environment with their licences, and which extra of mien brings each."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import Distribution, distributions
+
+from mien.licences.facts import KINDS, PACKAGES, WORDS, Kind
+
+_ORDER: tuple[Kind, ...] = (
+    "public domain", "permissive", "weak copyleft", "strong copyleft", "proprietary", "unknown",
+)  # fmt: skip
+"""From the fewest conditions to the most."""
+_REQUIREMENT = re.compile(r"^\s*([A-Za-z0-9._-]+)\s*(?:\[([^\]]*)\])?")
+_EXTRA = re.compile(r"""extra\s*==\s*['"]([^'"]+)['"]""")
+_APPROVED = "DFSG approved"
+"""A classifier that says who approves of a licence, and not which one it is."""
+_MEANINGS: dict[Kind, str] = {
+    "public domain": "no conditions",
+    "permissive": "keep its notices when you pass it on",
+    "weak copyleft": "changes of its own files stay under its licence",
+    "strong copyleft": "what you pass on together with it must be under its licence",
+    "proprietary": "its maker's own terms; free to use, and not to be changed",
+    "unknown": "read its licence before you use it",
+}
+
+
+@dataclass(frozen=True)
+class Licence:
+    """An installed package."""
+
+    name: str
+    version: str
+    declared: str
+    """What its metadata says, word for word: the SPDX expression, else the classifiers, else the field `License`."""
+    licence: str
+    """SPDX expression, or what is declared if there is none for it."""
+    kind: Kind
+    used_for: str
+    """What brings it: an extra of mien, and the package that asks for it. "another program" if mien does not."""
+    meaning: str
+
+
+def installed_licences() -> list[Licence]:
+    """All packages of this environment, sorted by name, whether mien asks for them or not."""
+    found = {canonical(each.metadata["Name"]): each for each in distributions() if each.metadata["Name"]}
+    reasons = _reasons(found)
+    return [_licence(name, found[name], reasons.get(name, "another program")) for name in sorted(found)]
+
+
+def canonical(name: str) -> str:
+    """The name of a package as registries compare it (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def kind_of(expression: str) -> Kind:
+    """The kind of an SPDX expression: of "OR" the freest choice, of "AND" what asks for most."""
+    parts = [part.strip(" ()") for part in re.split(r"\s+AND\s+", expression)]
+    kinds = []
+    for part in parts:
+        choices = [KINDS.get(choice.strip(" ()"), "unknown") for choice in re.split(r"\s+OR\s+", part)]
+        kinds.append(min(choices, key=_ORDER.index))
+    return max(kinds, key=_ORDER.index)
+
+
+def _licence(name: str, package: Distribution, used_for: str) -> Licence:
+    declared = _declared(package)
+    known, note = PACKAGES.get(name, ("", ""))
+    expression = known or _expression(declared, package)
+    kind = kind_of(expression)
+    meaning = f"{_MEANINGS[kind]}; {note}" if note else _MEANINGS[kind]
+    return Licence(package.metadata["Name"], package.version, declared, expression, kind, used_for, meaning)
+
+
+def _declared(package: Distribution) -> str:
+    about = package.metadata
+    if expression := about.get("License-Expression"):
+        return expression
+    said = [entry.split(" :: ")[-1] for entry in about.get_all("Classifier") or [] if entry.startswith("License ::")]
+    said = sorted(entry for entry in said if entry != "OSI Approved")
+    return "; ".join(said) if said else (about.get("License") or "UNKNOWN")
+
+
+def _expression(declared: str, package: Distribution) -> str:
+    """The SPDX expression of what is declared. Classifiers side by side all apply."""
+    if package.metadata.get("License-Expression"):
+        return declared
+    parts = []
+    for part in (
+        declared.removeprefix(f"{_APPROVED}; ").split("; ") if "\n" not in declared else [declared.splitlines()[0]]
+    ):
+        word = part.strip()
+        parts.append(word if kind_of(word) != "unknown" else WORDS.get(word.lower(), word))
+    return " AND ".join(dict.fromkeys(parts))
+
+
+def _reasons(found: dict[str, Distribution]) -> dict[str, str]:
+    """Why each package is there, for those that mien asks for, directly or through others."""
+    reasons = {"mien": "is mien itself"}
+    direct = [("base" if extra is None else extra, name) for name, extra in _requirements(found.get("mien"))]
+    pending = []
+    for extra, name in sorted(direct, key=lambda each: (each[0] != "base", each)):
+        if name in found and name not in reasons:
+            reasons[name] = f"mien[{extra}]" if extra != "base" else "mien"
+            pending.append((name, reasons[name]))
+    while pending:
+        asker, root = pending.pop(0)
+        for name, extra in _requirements(found[asker]):
+            if extra is None and name in found and name not in reasons:
+                reasons[name] = f"{root}, by {asker}"
+                pending.append((name, root))
+    return reasons
+
+
+def _requirements(package: Distribution | None) -> Iterator[tuple[str, str | None]]:
+    """Name of each package that one asks for, and the extra that asks."""
+    for line in (package.requires or []) if package is not None else []:
+        text, _, marker = line.partition(";")
+        match, extra = _REQUIREMENT.match(text), _EXTRA.search(marker)
+        if match is not None:
+            yield canonical(match.group(1)), extra.group(1) if extra else None

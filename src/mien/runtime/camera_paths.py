@@ -1,0 +1,57 @@
+"""Camera paths around a head in numpy, the counterpart of `mien.render.camera_paths` in torch."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from mien.runtime.baked import Camera
+from mien.runtime.rotation import matrix_from_axis_angle
+
+_UP = (0.0, 1.0, 0.0)
+
+
+def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera:
+    """The same view in a picture of another shape: all of it is visible, centred, and magnified by `zoom`."""
+    scale = min(width / camera.width, height / camera.height) * zoom
+    K = camera.K * np.array([[scale], [scale], [1.0]], np.float32)
+    K[0, 2] += 0.5 * (width - scale * camera.width)
+    K[1, 2] += 0.5 * (height - scale * camera.height)
+    return Camera(K, camera.viewmat, width, height)
+
+
+def orbit(camera: Camera, center: Float[np.ndarray, " 3"], angle: float, up: Sequence[float] = _UP) -> Camera:
+    """`camera` moved around `center` by `angle` radians, counter-clockwise seen from above."""
+    axis = np.asarray(up, np.float64)
+    turn = matrix_from_axis_angle((angle * axis / np.linalg.norm(axis))[None])[0]
+    # p -> turn (p - centre) + centre moves the camera; the world moves the other way.
+    back = np.eye(4)
+    back[:3, :3] = turn.T
+    back[:3, 3] = center - turn.T @ center
+    return replace(camera, viewmat=(camera.viewmat.astype(np.float64) @ back).astype(np.float32))
+
+
+def turned(camera: Camera, center: Float[np.ndarray, " 3"], yaw: float, pitch: float) -> Camera:
+    """`camera` moved around `center`: first up by `pitch`, then to the subject's left by `yaw`, both in radians."""
+    raised = orbit(camera, center, -pitch, camera.viewmat[0, :3].tolist()) if pitch else camera
+    return orbit(raised, center, yaw) if yaw else raised
+
+
+def turntable(camera: Camera, center: Float[np.ndarray, " 3"], frames: int, span: float) -> list[Camera]:
+    """Cameras on a turn around `center`. Below a full turn of 2 pi, they swing to both sides, as a pendulum does."""
+    phases = [2 * math.pi * index / frames for index in range(frames)]
+    full = span >= 2 * math.pi
+    return [orbit(camera, center, phase if full else 0.5 * span * math.sin(phase)) for phase in phases]
+
+
+def sway(
+    camera: Camera, center: Float[np.ndarray, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
+) -> list[Camera]:
+    """Cameras on a horizontal figure eight around the position of `camera`, or on an oval without `crossing`."""
+    views = []
+    for phase in (2 * math.pi * index / frames for index in range(frames)):
+        raised = 0.5 * tilt * (math.sin(2 * phase) if crossing else math.cos(phase))
+        views.append(turned(camera, center, 0.5 * span * math.sin(phase), raised))
+    return views

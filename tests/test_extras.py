@@ -1,0 +1,153 @@
+"""The base install asks for five packages, and what is missing is named with the extra that brings it."""
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mien import extras
+from mien.cli import main
+from mien.export.pixels import png_bytes
+from mien.licences.spdx import requirements_of
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+WITHOUT = """
+import importlib.util, sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {missing}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *more: None if name in {missing} else find(name, *more)
+sys.meta_path.insert(0, Missing())
+from mien.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def mien_without(missing: set[str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command where some packages are missing."""
+    code = WITHOUT.format(missing=sorted(missing))
+    return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from mien import runtime
+    from mien.avatar import make_portable
+    from test_avatar import new_avatar
+    from toy_scene import toy_camera
+
+    path = tmp_path_factory.mktemp("file") / "me.mien"
+    runtime.write_portable(path, make_portable(new_avatar("gaussian_avatars"), toy_camera(32), "toy"))
+    return path
+
+
+def test_the_base_install_asks_for_five_packages():
+    asked = requirements_of(PROJECT)
+    assert {name for name, extra in asked.items() if not extra} == {"numpy", "safetensors", "jaxtyping", "tyro", "rich"}
+
+
+def test_extras_bring_what_error_messages_say():
+    asked = requirements_of(PROJECT)
+    for module, extra in extras.EXTRA_OF.items():
+        package = extras.PACKAGE_OF.get(module, module).lower()
+        if module != "scipy":  # comes with others of the extra
+            assert asked.get(package) == extra, module
+
+
+@pytest.mark.parametrize("arguments", [("--out", "{}/still.png", "--size", "48"), ("--out", "{}/f", "--frames", "3")])
+def test_a_file_is_drawn_without_any_extra(exported: Path, tmp_path: Path, arguments: tuple[str, ...]):
+    words = [word.format(tmp_path) for word in arguments]
+    done = mien_without(set(extras.EXTRA_OF), "render", str(exported), *words)
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.rglob("*.png"))
+
+
+@pytest.mark.parametrize("ending", [".html", ".packed", ".mien"])
+def test_a_file_is_exported_without_any_extra(exported: Path, tmp_path: Path, ending: str):
+    out = tmp_path / f"again{ending}"
+    done = mien_without(set(extras.EXTRA_OF), "export", str(exported), "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    assert out.stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("words", "package", "extra"),
+    [
+        (("export", "{file}", "--out", "{folder}/me.ply"), "torch", "create"),
+        (("render", "{file}", "--out", "{folder}/me.mp4"), "av", "create"),
+        (("view", "{file}"), "viser", "viewer"),
+        (("demo", "--out", "{folder}/demo"), "torch", "create"),
+    ],
+)
+def test_a_missing_package_is_named_with_its_extra(
+    exported: Path, tmp_path: Path, words: tuple[str, ...], package: str, extra: str
+):
+    line = [word.format(file=exported, folder=tmp_path) for word in words]
+    done = mien_without(set(extras.EXTRA_OF), *line)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("\n") == 1
+    assert package in done.stderr
+    assert f"pip install 'mien[{extra}]'" in done.stderr
+
+
+def test_a_missing_library_of_the_system_is_named():
+    words = extras.missing_package(ImportError("libGL.so.1: cannot open shared object file: No such file", name="cv2"))
+    assert words is not None
+    assert "libGL.so.1" in words
+    assert "apt-get install" in words
+
+
+def test_what_no_extra_brings_is_a_bug():
+    assert extras.missing_package(ModuleNotFoundError("No module named 'mien.gone'", name="mien.gone")) is None
+    assert extras.missing_package(ImportError("cannot import name 'gone' from 'torch'", name="torch")) is None
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_png_is_read_as_it_was_written(channels: int):
+    import cv2
+
+    picture = np.random.default_rng(0).integers(0, 256, (33, 47, channels), np.uint8)
+    read = cv2.imdecode(np.frombuffer(png_bytes(picture), np.uint8), cv2.IMREAD_UNCHANGED)
+    order = [2, 1, 0, 3][:channels]
+    assert (read[..., order] == picture).all()
+
+
+def test_paths_around_a_head_are_those_of_the_training_side():
+    import torch
+
+    from mien.render import camera_paths as torchs
+    from mien.runtime import camera_paths
+    from toy_scene import toy_camera
+
+    theirs, center = toy_camera(64), np.array([0.02, 0.05, -0.1])
+    from mien import runtime
+
+    ours = runtime.Camera(theirs.K.numpy(), theirs.viewmat.numpy(), theirs.width, theirs.height)
+    middle = torch.from_numpy(center).float()
+    fitted = camera_paths.fitted(ours, 50, 80, 1.5)
+    np.testing.assert_allclose(fitted.K, theirs.fitted(50, 80, 1.5).K.numpy(), rtol=1e-6)
+    pairs = [
+        (camera_paths.turned(ours, center, 0.4, -0.3), torchs.turned_camera(theirs, middle, 0.4, -0.3)),
+        *zip(camera_paths.turntable(ours, center, 5, 1.0), torchs.turntable(theirs, middle, 5, 1.0), strict=True),
+        *zip(camera_paths.turntable(ours, center, 5, 7.0), torchs.turntable(theirs, middle, 5, 7.0), strict=True),
+        *zip(camera_paths.sway(ours, center, 5, 0.7, 0.2), torchs.sway(theirs, middle, 5, 0.7, 0.2), strict=True),
+    ]
+    for own, other in pairs:
+        np.testing.assert_allclose(own.viewmat, other.viewmat.numpy(), atol=2e-6)
+
+
+def test_a_file_refuses_what_only_a_run_has(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = str(tmp_path / "a.png")
+    for option in (("--timestep", "0"), ("--own-motion",), ("--sheet", "turntable"), ("--run", "x")):
+        assert main(["render", str(exported), "--out", out, *option]) == 2
+        assert "a file" in capsys.readouterr().err
+    assert main(["render", str(exported), "--out", out, "--set", "jawOpn=1"]) == 2
+    assert "did you mean jawOpen?" in capsys.readouterr().err

@@ -1,0 +1,60 @@
+"""The release command: archives whose bytes depend on content alone, checksums, and the page from CHANGELOG."""
+
+import hashlib
+import os
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "release"))
+import make  # noqa: E402  # pyright: ignore[reportMissingImports]
+
+
+def folder_of(path: Path, order: list[str]) -> Path:
+    for index, name in enumerate(order):
+        file = path / "docs" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"content of {name}")
+        os.utime(file, (1_000_000 + index, 2_000_000 + index))
+    return path / "docs"
+
+
+def test_the_same_files_give_the_same_archive(tmp_path: Path) -> None:
+    one, other = folder_of(tmp_path / "a", ["x", "y/z", "b"]), folder_of(tmp_path / "b", ["b", "x", "y/z"])
+    (one / "x").chmod(0o600)
+    for folder, name in ((one, "one.tar.xz"), (other, "other.tar.xz")):
+        make.pack(folder, tmp_path / name, 1_700_000_000)
+    assert (tmp_path / "one.tar.xz").read_bytes() == (tmp_path / "other.tar.xz").read_bytes()
+    with tarfile.open(tmp_path / "one.tar.xz") as tar:
+        assert tar.getnames() == ["b", "x", "y", "y/z"]
+        assert {member.mtime for member in tar} == {1_700_000_000}
+
+
+def test_the_page_has_the_notes_and_sums(tmp_path: Path) -> None:
+    (tmp_path / "mien-9.9.9-cp311-cp311-linux_x86_64.whl").write_bytes(b"wheel")
+    make.write_page(tmp_path, "9.9.9", "### Notes\n\n- new")
+    digest = hashlib.sha256(b"wheel").hexdigest()
+    assert (tmp_path / "SHA256SUMS").read_text() == f"{digest}  mien-9.9.9-cp311-cp311-linux_x86_64.whl\n"
+    page = (tmp_path / "RELEASE.md").read_text()
+    assert page.startswith("# mien 9.9.9\n\n### Notes\n\n- new\n")
+    assert digest in page
+    assert "Only for machines like the one that built them" in page
+
+
+def test_the_changelog_has_the_version_of_the_package(tmp_path: Path) -> None:
+    version = make.tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert "mien create" in make.section(ROOT / "CHANGELOG.md", version)
+    (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## 1.0.0\n\n- a\n\n## 0.9.0 (old)\n\n- b\n")
+    assert make.section(tmp_path / "CHANGELOG.md", "1.0.0") == "- a"
+    assert make.section(tmp_path / "CHANGELOG.md", "0.9.0") == "- b"
+    with pytest.raises(make.ReleaseError, match="no section '## 2.0.0'"):
+        make.section(tmp_path / "CHANGELOG.md", "2.0.0")
+
+
+def test_a_folder_with_files_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "old.whl").write_bytes(b"")
+    assert make.main(["--out", str(tmp_path), "--parts", "sdist"]) == 2
+    assert "is not empty" in capsys.readouterr().err
