@@ -116,6 +116,7 @@ def test_a_png_is_read_as_it_was_written(channels: int):
 
     picture = np.random.default_rng(0).integers(0, 256, (33, 47, channels), np.uint8)
     read = cv2.imdecode(np.frombuffer(png_bytes(picture), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert read is not None
     order = [2, 1, 0, 3][:channels]
     assert (read[..., order] == picture).all()
 
