@@ -150,5 +150,5 @@ def test_a_file_refuses_what_only_a_run_has(exported: Path, tmp_path: Path, caps
     for option in (("--timestep", "0"), ("--own-motion",), ("--sheet", "turntable"), ("--run", "x")):
         assert main(["render", str(exported), "--out", out, *option]) == 2
         assert "a file" in capsys.readouterr().err
-    assert main(["render", str(exported), "--out", out, "--set", "jawOpn=1"]) == 2
-    assert "did you mean jawOpen?" in capsys.readouterr().err
+    assert main(["render", str(exported), "--out", out, "--set", "dorp=1"]) == 2
+    assert "did you mean drop?" in capsys.readouterr().err

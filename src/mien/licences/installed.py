@@ -83,7 +83,10 @@ def _declared(package: Distribution) -> str:
 
 def _field(package: Distribution, name: str) -> str:
     """A field of a package's metadata; empty if it has none."""
-    return package.metadata[name] if name in package.metadata else ""
+    about = package.metadata
+    if name not in about:
+        return ""
+    return about[name]
 
 
 def _expression(declared: str, package: Distribution) -> str:
