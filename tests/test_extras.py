@@ -116,6 +116,7 @@ def test_a_png_is_read_as_it_was_written(channels: int):
 
     picture = np.random.default_rng(0).integers(0, 256, (33, 47, channels), np.uint8)
     read = cv2.imdecode(np.frombuffer(png_bytes(picture), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert read is not None
     order = [2, 1, 0, 3][:channels]
     assert (read[..., order] == picture).all()
 
@@ -149,5 +150,5 @@ def test_a_file_refuses_what_only_a_run_has(exported: Path, tmp_path: Path, caps
     for option in (("--timestep", "0"), ("--own-motion",), ("--sheet", "turntable"), ("--run", "x")):
         assert main(["render", str(exported), "--out", out, *option]) == 2
         assert "a file" in capsys.readouterr().err
-    assert main(["render", str(exported), "--out", out, "--set", "jawOpn=1"]) == 2
-    assert "did you mean jawOpen?" in capsys.readouterr().err
+    assert main(["render", str(exported), "--out", out, "--set", "dorp=1"]) == 2
+    assert "did you mean drop?" in capsys.readouterr().err

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urljoin, urlsplit
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 
 from mien import runtime
 from mien.errors import UserError
+from mien.export.pixels import png_bytes
 from mien.files import write_atomically
-from mien.picture_files import encode_picture
 
 _ICON = 64
 """Side of the icon in pixels."""
@@ -53,7 +52,7 @@ def head_part(avatar: runtime.Avatar, described: Described, poster: Path | None)
         described: What the page says of itself.
         poster: The file with the poster. It lies beside the page.
     """
-    icon = base64.b64encode(encode_picture(_icon(avatar))).decode()
+    icon = base64.b64encode(png_bytes(_icon(avatar))).decode()
     tags = [f'<link rel="icon" href="data:image/png;base64,{icon}">']
     if described.address and poster:
         facts = {
@@ -72,11 +71,15 @@ def head_part(avatar: runtime.Avatar, described: Described, poster: Path | None)
 
 
 def write_poster(path: Path, avatar: runtime.Avatar) -> None:
-    """Write the picture that messengers show: the person at rest before a soft light, 1200x630.
+    """Write the picture that messengers show: the person at rest before a soft light, 1200x630. This needs OpenCV.
 
     Raises:
         UserError: the path cannot be written.
     """
+    import cv2
+
+    from mien.picture_files import encode_picture
+
     wide, high = POSTER
     x, y = np.meshgrid(np.linspace(-1, 1, wide) * wide / high, np.linspace(-0.84, 1.16, high))
     share = np.clip(np.hypot(x, y) / 1.8, 0, 1)[..., None]
@@ -99,12 +102,20 @@ def _icon(avatar: runtime.Avatar) -> UInt8[np.ndarray, "h w 4"]:
         # A square from the top of the head: a neck below it tells little at this size.
         side = max(columns[-1] - columns[0] + 1, 1)
         rgba = rgba[rows[0] : rows[0] + side, columns[0] : columns[-1] + 1]
-    return _to_uint8(cv2.resize(rgba, (_ICON, _ICON), interpolation=cv2.INTER_AREA))
+    down, across = (_means(count, _ICON) for count in rgba.shape[:2])
+    return _to_uint8(np.einsum("iy,yxc,jx->ijc", down, rgba, across, optimize=True))
 
 
 def _drawn(avatar: runtime.Avatar, side: int) -> tuple[np.ndarray, np.ndarray]:
     """The person at rest in a square picture, premultiplied, and its alpha."""
     return avatar.render(camera=avatar.camera.square(side), background=(0, 0, 0))
+
+
+def _means(count: int, parts: int) -> Float64[np.ndarray, "parts count"]:
+    """Weights that average `count` neighbours in `parts` equal spans."""
+    edges = np.linspace(0, count, parts + 1)[:, None]
+    covered = np.clip(edges - np.arange(count), 0, 1)  # share of each neighbour before each edge
+    return np.diff(covered, axis=0) * parts / count
 
 
 def _to_uint8(picture: np.ndarray) -> np.ndarray:

@@ -74,16 +74,24 @@ def _licence(name: str, package: Distribution, used_for: str) -> Licence:
 
 def _declared(package: Distribution) -> str:
     about = package.metadata
-    if expression := about.get("License-Expression"):
+    if expression := _field(package, "License-Expression"):
         return expression
     said = [entry.split(" :: ")[-1] for entry in about.get_all("Classifier") or [] if entry.startswith("License ::")]
     said = sorted(entry for entry in said if entry != "OSI Approved")
-    return "; ".join(said) if said else (about.get("License") or "UNKNOWN")
+    return "; ".join(said) if said else (_field(package, "License") or "UNKNOWN")
+
+
+def _field(package: Distribution, name: str) -> str:
+    """A field of a package's metadata; empty if it has none."""
+    about = package.metadata
+    if name not in about:
+        return ""
+    return about[name]
 
 
 def _expression(declared: str, package: Distribution) -> str:
     """The SPDX expression of what is declared. Classifiers side by side all apply."""
-    if package.metadata.get("License-Expression"):
+    if _field(package, "License-Expression"):
         return declared
     parts = []
     for part in (
