@@ -305,7 +305,7 @@ BAD = [
     ("analyze gaussian-avatars W --run toy --seconds nan", "--seconds nan: give a number from 0.01"),
     ("analyze gaussian-avatars W --run toy --out /proc/a", "/proc/a: cannot be written"),
     ("analyze gaussian-avatars W --run toy --out W/runs/toy/config.json", "is a file, but a folder"),
-    ("analyze nerf W", "instead of 'nerf'"),
+    ("analyze nerf W", "nerf: has no analysis; choose one of gaussian-avatars"),
 ]
 
 

@@ -27,7 +27,7 @@ from mien.threads import asked_threads
 GROUPS = {
     "Make an avatar": ("demo", "create", "capture", "track", "train", "import"),
     "Use it": ("view", "render", "drive", "export"),
-    "Research": ("evaluate", "analyze", "study", "bench", "face-models"),
+    "Research": ("evaluate", "analyze", "study", "bench", "face-models", "licenses", "plugins"),
 }
 """The sub-commands as `mien --help` lists them."""
 COMMANDS = {
