@@ -103,7 +103,7 @@ def _icon(avatar: runtime.Avatar) -> UInt8[np.ndarray, "h w 4"]:
         side = max(columns[-1] - columns[0] + 1, 1)
         rgba = rgba[rows[0] : rows[0] + side, columns[0] : columns[-1] + 1]
     down, across = (_means(count, _ICON) for count in rgba.shape[:2])
-    return _to_uint8(np.einsum("iy,yxc,jx->ijc", down, rgba, across, optimize=True))
+    return _to_uint8(np.einsum("ih,hwc,jw->ijc", down, rgba, across, optimize=True))
 
 
 def _drawn(avatar: runtime.Avatar, side: int) -> tuple[np.ndarray, np.ndarray]:
