@@ -119,7 +119,7 @@ def pack(folder: Path, archive: Path, epoch: int) -> None:
 
 
 def section(changelog: Path, version: str) -> str:
-    """What CHANGELOG says about a version.
+    """Return the section of CHANGELOG about a version.
 
     Raises:
         ReleaseError: it says nothing.
@@ -152,7 +152,7 @@ def run(*words: str) -> None:
 
 
 def told(*words: str) -> str:
-    """What a command prints."""
+    """Return the output of a command."""
     return subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 

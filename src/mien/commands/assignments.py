@@ -1,4 +1,4 @@
-"""What `--set jawOpen=0.6 smile=0.4 left_eye_y=0.2` asks for: expressions, gaze, preset faces and joint angles."""
+"""Values of `--set jawOpen=0.6 smile=0.4 left_eye_y=0.2`: expressions, gaze, preset faces and joint angles."""
 
 import difflib
 import math
@@ -17,7 +17,7 @@ _MAX_ANGLE = 1.0
 
 @dataclass(frozen=True)
 class Settable:
-    """What of a face can be set by name."""
+    """The parts of a face that can be set by name."""
 
     expressions: tuple[str, ...]
     bounds: Sequence[Sequence[float]]
@@ -26,7 +26,7 @@ class Settable:
     """Names of the free joints."""
     face_model: str
     unit: str = "the full expression"
-    """What 1 means for an expression."""
+    """Meaning of the value 1 of an expression."""
 
     @property
     def angles(self) -> tuple[str, ...]:

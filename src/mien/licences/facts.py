@@ -1,4 +1,4 @@
-"""What is known of licences: their kinds, packages whose metadata says too little, and parts that are no package."""
+"""Facts about licences: their kinds, packages whose metadata says too little, and parts that are no package."""
 
 from dataclasses import dataclass
 from typing import Literal

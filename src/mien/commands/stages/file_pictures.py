@@ -45,7 +45,7 @@ def render_file(
 
 
 class View:
-    """Where the camera is: how it is moved first, and the path that it then takes."""
+    """Place of the camera: how it is moved first, and the path that it then takes."""
 
     def __init__(self, yaw: float, pitch: float, zoom: float, path: CameraPath) -> None:
         """Take angles in degrees, the magnification, and the path."""

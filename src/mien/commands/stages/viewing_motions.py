@@ -1,4 +1,4 @@
-"""What of a viewer needs torch: avatars of workspaces, motions, and following a camera."""
+"""The parts of a viewer that need torch: avatars of workspaces, motions, and following a camera."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -79,14 +79,14 @@ def clip_of(viewed: Viewed, by: Path, sequence: str | None, neutral: str | None 
 
 
 def switch_of_first_camera(session: Session, viewed: Viewed) -> CameraSwitch:
-    """What lets the avatar of a session follow the first camera of this machine."""
+    """Return a switch that lets the avatar of a session follow the first camera of this machine."""
     return switch_of(session, viewed, camera_named("camera", None), FollowOptions())
 
 
 def switch_of(
     session: Session, viewed: Viewed, name: CameraName, follow: FollowOptions, again: bool = True
 ) -> CameraSwitch:
-    """What lets the avatar of a session follow a camera.
+    """Return a switch that lets the avatar of a session follow a camera.
 
     Args:
         session: The session.
