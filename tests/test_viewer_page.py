@@ -307,6 +307,7 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
         {"wait": 3000},
         {"screenshot": str(shots[2])},
         {"click": "Save"},
+        {"wait": 1000},
         {"save": ["Screenshot", str(tmp_path / "saved.png")]},
         {"fill": ["Search", "smile left"]},
         {"wait": 3000},

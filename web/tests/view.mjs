@@ -36,9 +36,17 @@ try {
     }
     if (step.save) {
       shapes.push(await tab.locator("canvas").first().evaluate((canvas) => canvas.clientWidth / canvas.clientHeight));
-      const coming = tab.waitForEvent("download");
-      await tab.getByText(step.save[0], { exact: true }).first().click();
-      return (await coming).saveAs(step.save[1]);
+      const coming = tab.waitForEvent("download", { timeout: 170000 });
+      const button = tab.getByText(step.save[0], { exact: true }).first();
+      const pressing = (async () => {
+        // A button in a folder that is still opening moves away from the pointer on a busy machine, so it is pressed again.
+        for (let press = 0; press < 3; press++) {
+          await button.click();
+          if (await Promise.race([coming.then(() => true), tab.waitForTimeout(50000).then(() => false)])) return;
+        }
+      })();
+      const [download] = await Promise.all([coming, pressing]);
+      return download.saveAs(step.save[1]);
     }
     throw new Error(`no such step: ${JSON.stringify(step)}`);
   };
