@@ -15,6 +15,7 @@ using namespace nb::literals;
 namespace {
 
 constexpr int64_t kMostWidth = 1 << 20;  // so that products of widths fit
+constexpr size_t kMostTerms = 1 << 10;
 
 struct NetworkArrays {
   static constexpr char kName[] = "FeatureNetwork";
@@ -147,17 +148,22 @@ void feature_network_backward(const Group<NetworkArrays>& group, const Bases& ba
        out.weight2.data(), out.bias2.data(), out.inputs.shape(0) == 0 ? nullptr : out.inputs.data()});
 }
 
-void factored_update(const Out<-1, -1, -1>& values, const In<-1, -1>& rows, const In<-1>& columns,
-                     const Out<-1, -1>& second, const Out<-1>& weights, float rate) {
+void factored_update(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,
+                     const std::vector<In<-1>>& columns, const Out<-1, -1>& second, const Out<-1>& weights,
+                     float rate) {
   const size_t count = values.shape(0), inputs = values.shape(1), width = values.shape(2);
-  require(has_shape(rows, count, width) && has_shape(columns, inputs) && same_shape(second, rows) &&
-              has_shape(weights, count),
-          "factors and moments must fit the values");
+  require(has_shape(second, count, width) && has_shape(weights, count), "moments must fit the values");
+  require(rows.size() == columns.size() && rows.size() <= kMostTerms, "every term needs rows and columns");
+  std::vector<mien::FactoredTerm> terms;
+  for (size_t i = 0; i < rows.size(); ++i) {
+    require(has_shape(rows[i], count, width) && has_shape(columns[i], inputs), "factors must fit the values");
+    terms.push_back({rows[i].data(), columns[i].data()});
+  }
   const int columns_count = checked_length(inputs, kMostWidth, "inputs");
   const int row_width = checked_length(width, kMostWidth, "numbers in a row");
   const nb::gil_scoped_release release;
-  mien::factored_update({values.data(), static_cast<int64_t>(count), columns_count, row_width, rows.data(),
-                         columns.data(), second.data(), weights.data(), rate});
+  mien::factored_update({values.data(), static_cast<int64_t>(count), columns_count, row_width, terms.data(),
+                         static_cast<int>(terms.size()), second.data(), weights.data(), rate});
 }
 
 }  // namespace
@@ -172,5 +178,5 @@ void bind_feature_network(nb::module_& module) {
   module.def("feature_network_backward", &feature_network_backward, "network"_a, "bases"_a, "kept"_a, "gradients"_a,
              "Fills the gradients of features, layers and inputs.");
   module.def("factored_update", &factored_update, "values"_a.noconvert(), "rows"_a, "columns"_a, "second"_a,
-             "weights"_a, "rate"_a, "Updates values [n, k, f] by a gradient of factors, in place.");
+             "weights"_a, "rate"_a, "Updates values [n, k, f] by a gradient that is a sum of outer products, in place.");
 }

@@ -16,6 +16,7 @@ namespace {
 
 constexpr int64_t kPiece = 16 * kFeatureBlock;  // Gaussians in one piece of the pool's work
 constexpr int kLanes = 16;                      // of the widest vector
+constexpr float kRest = 0.001f;                 // 1 - beta2 of Adam
 
 int64_t padded(int64_t width) { return (width + kLanes - 1) / kLanes * kLanes; }
 
@@ -143,15 +144,24 @@ void feature_network_backward(const FeatureNetwork& network, const FeatureInputs
 }
 
 void factored_update(const FactoredUpdate& task) {
-  float squares = 0;
-  for (int k = 0; k < task.columns_count; ++k) squares += task.columns[k] * task.columns[k];
-  const float mean_square = squares / static_cast<float>(std::max(task.columns_count, 1));
-  if (!(mean_square > 0)) return;
+  const int terms = task.terms_count;
+  std::vector<float> products(static_cast<size_t>(terms) * terms);
+  float most = 0;
+  for (int s = 0; s < terms; ++s) {
+    for (int t = 0; t < terms; ++t) {
+      float product = 0;
+      for (int k = 0; k < task.columns_count; ++k) product += task.terms[s].columns[k] * task.terms[t].columns[k];
+      const float mean = product / static_cast<float>(std::max(task.columns_count, 1));
+      most = std::max(most, mean);
+      products[s * terms + t] = kRest * mean;
+    }
+  }
+  if (!(most > 0)) return;
   const FeatureKernels& kernels = feature_kernels();
   parallel_for((task.count + kPiece - 1) / kPiece, [&](int64_t piece) {
     thread_local std::vector<float> steps;
-    steps.resize(task.width);
-    kernels.update(task, mean_square, steps.data(), piece * kPiece, std::min((piece + 1) * kPiece, task.count));
+    steps.resize(static_cast<size_t>(terms) * task.width);
+    kernels.update(task, products.data(), steps.data(), piece * kPiece, std::min((piece + 1) * kPiece, task.count));
   });
 }
 

@@ -50,19 +50,24 @@ struct FeatureGradients {
 void feature_network_backward(const FeatureNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
                               const FeatureGradients& gradients);
 
-// Adam without a first moment and with one second moment per row of factors, for values [n, k, f] whose gradient is the
-// outer product of `rows` [n, f] and `columns` [k].
+// Adam without a first moment and with one second moment per row of factors, for values [n, k, f] whose gradient is a
+// sum of outer products. Each term has `rows` [n, f] and `columns` [k].
+struct FactoredTerm {
+  const float* rows;
+  const float* columns;
+};
 struct FactoredUpdate {
   float* values;
   int64_t count;
   int columns_count, width;
-  const float* rows;
-  const float* columns;
+  const FactoredTerm* terms;
+  int terms_count;
   float* second;   // [n, f], running mean of the squared gradient, which is itself a mean over the columns
   float* weights;  // [n], running mean of 1, for bias correction: how much of `second` is filled
   float rate;
 };
-// Gaussians whose row of factors is 0 keep their values and moments. Columns that are 0 are neither read nor written.
+// Gaussians whose rows of factors are all 0 keep their values and moments. Columns that are 0 in all terms are neither
+// read nor written.
 // Runs on the pool.
 void factored_update(const FactoredUpdate& task);
 

@@ -187,33 +187,65 @@ void backward(const PaddedNetwork& network, const FeatureInputs& inputs, const F
   if (block.count > 0) backward_block(network, inputs, gradients, sums, zeros, block);
 }
 
-// The step of each factor of one Gaussian, and its moments.
-MIEN_INLINE void factor_steps(const FactoredUpdate& task, float mean_square, int64_t index, float* steps) {
+MIEN_INLINE float not_below_zero(float a) { return a > 0 ? a : 0; }
+MIEN_INLINE F not_below_zero(F a) { return maximum(a, F{}); }
+
+// The squared gradient of some factors of one Gaussian, as a mean over the columns. `at` is the place of the factors.
+// Terms that cancel may leave less than 0 by rounding.
+template <class Vector, class Load>
+MIEN_INLINE Vector mean_square(const FactoredUpdate& task, const float* products, int64_t at, Load load_at) {
+  Vector total{};
+  for (int s = 0; s < task.terms_count; ++s) {
+    const Vector factor = load_at(task.terms[s].rows + at);
+    total = total + factor * factor * products[s * task.terms_count + s];
+    for (int t = 0; t < s; ++t)
+      total = total + factor * load_at(task.terms[t].rows + at) * (2 * products[s * task.terms_count + t]);
+  }
+  return not_below_zero(total);
+}
+
+// The steps of all factors of one Gaussian, a row for each term, and its moments.
+MIEN_INLINE void factor_steps(const FactoredUpdate& task, const float* products, int64_t index, float* steps) {
   const float beta = 0.999f, rest = 0.001f, weight = task.weights[index] * beta + rest;
   task.weights[index] = weight;
-  const float unbiased = 1 / weight, share = rest * mean_square;
-  const float* factors = task.rows + index * task.width;
-  float* second = task.second + index * task.width;
+  const float unbiased = 1 / weight;
+  const int64_t begin = index * task.width;
+  float* second = task.second + begin;
   int i = 0;
   for (; i + W <= task.width; i += W) {
-    const F factor = load(factors + i), mean = load(second + i) * beta + factor * factor * share;
+    const F square = mean_square<F>(task, products, begin + i, [](const float* from) { return load(from); });
+    const F mean = load(second + i) * beta + square;
     store(second + i, mean);
-    store(steps + i, task.rate * factor / (square_root(mean * unbiased) + 1e-15f));
+    const F deviation = square_root(mean * unbiased) + 1e-15f;
+    for (int t = 0; t < task.terms_count; ++t)
+      store(steps + t * task.width + i, task.rate * load(task.terms[t].rows + begin + i) / deviation);
   }
   for (; i < task.width; ++i) {
-    second[i] = second[i] * beta + factors[i] * factors[i] * share;
-    steps[i] = task.rate * factors[i] / (__builtin_sqrtf(second[i] * unbiased) + 1e-15f);
+    second[i] = second[i] * beta +
+                mean_square<float>(task, products, begin + i, [](const float* from) { return *from; });
+    const float deviation = __builtin_sqrtf(second[i] * unbiased) + 1e-15f;
+    for (int t = 0; t < task.terms_count; ++t)
+      steps[t * task.width + i] = task.rate * task.terms[t].rows[begin + i] / deviation;
   }
 }
 
-void update(const FactoredUpdate& task, float mean_square, float* steps, int64_t first, int64_t end) {
+MIEN_INLINE bool untouched(const FactoredUpdate& task, int64_t index) {
+  for (int t = 0; t < task.terms_count; ++t)
+    if (!all_zero(task.terms[t].rows + index * task.width, task.width)) return false;
+  return true;
+}
+
+void update(const FactoredUpdate& task, const float* products, float* steps, int64_t first, int64_t end) {
   [[maybe_unused]] const NoDenormals guard;
   for (int64_t index = first; index < end; ++index) {
-    if (all_zero(task.rows + index * task.width, task.width)) continue;
-    factor_steps(task, mean_square, index, steps);
+    if (untouched(task, index)) continue;
+    factor_steps(task, products, index, steps);
     float* values = task.values + index * task.columns_count * task.width;
     for (int k = 0; k < task.columns_count; ++k, values += task.width) {
-      if (task.columns[k] != 0) add_scaled(steps, -task.columns[k], task.width, values);
+      for (int t = 0; t < task.terms_count; ++t) {
+        const float column = task.terms[t].columns[k];
+        if (column != 0) add_scaled(steps + t * task.width, -column, task.width, values);
+      }
     }
   }
 }

@@ -33,8 +33,8 @@ struct FeatureKernels {
   void (*backward)(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
                    const FeatureGradients& gradients, const FeatureSums& sums, float* scratch, int64_t first,
                    int64_t end);
-  // `steps` has room for a row of factors.
-  void (*update)(const FactoredUpdate& task, float mean_square, float* steps, int64_t first, int64_t end);
+  // `products` [t, t] are the means of the products of two terms' columns. `steps` has room for t rows of factors.
+  void (*update)(const FactoredUpdate& task, const float* products, float* steps, int64_t first, int64_t end);
 };
 
 }  // namespace mien

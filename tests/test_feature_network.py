@@ -131,7 +131,25 @@ def update_of(dtype: torch.dtype = torch.float32, n: int = 2000, k: int = 5, f: 
 
 @pytest.mark.parametrize("f", [1, 16, 19, 32])
 def test_native_update_equals_its_reference(isa: str, f: int) -> None:
+    compare_updates(update_of(f=f), update_of(torch.float64, f=f))
+
+
+@pytest.mark.parametrize("f", [1, 16, 19, 32])
+def test_native_update_of_several_terms_equals_its_reference(isa: str, f: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as that of a filmed frame and a view from the side. Some terms have rows that others lack."""
     native, plain = update_of(f=f), update_of(torch.float64, f=f)
+    more = [(random(2000, f, seed=7), random(5, seed=8)), (random(2000, f, seed=9), torch.zeros(5))]
+    more[0][0][1::3] = 0
+    native = native._replace(terms=[*native.terms, *more])
+    plain = plain._replace(terms=[*plain.terms, *((rows.double(), columns.double()) for rows, columns in more)])
+    with monkeypatch.context() as only_native:
+        only_native.setattr("mien.training.adam.factored_update_reference", None)
+        factored_update(native._replace(rate=0.0))
+        factored_update_reference(plain._replace(rate=0.0))
+    compare_updates(native, plain)
+
+
+def compare_updates(native: FactoredUpdate, plain: FactoredUpdate) -> None:
     for _ in range(3):
         factored_update(native)
         factored_update_reference(plain)
@@ -177,3 +195,11 @@ def test_several_terms_add_up() -> None:
     factored_update(one)
     factored_update(parts._replace(terms=[(0.25 * rows, columns), (rows, 0.75 * columns)]))
     torch.testing.assert_close(one.values, parts.values)
+
+
+def test_terms_that_cancel_leave_everything_finite(isa: str) -> None:
+    update = update_of()
+    ((rows, columns),) = update.terms
+    factored_update(update._replace(terms=[(rows, columns), (-rows * (1 - 1e-7), columns)]))
+    assert update.values.isfinite().all()
+    assert (update.moments.second >= 0).all()

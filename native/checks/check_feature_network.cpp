@@ -84,11 +84,18 @@ void check_update() {
       const int64_t count = 1700, columns_count = 3;
       Floats values = random.normal(count * columns_count * width), second = random.uniform(count * width);
       Floats weights = random.uniform(count), rows = random.normal(count * width),
-             columns = random.normal(columns_count);
+             columns = random.normal(columns_count), other = random.normal(count * width);
       std::fill_n(rows.begin(), 5 * width, 0.0f);
       columns[1] = 0;
-      mien::factored_update({values.data(), count, columns_count, width, rows.data(), columns.data(), second.data(),
-                             weights.data(), 0.01f});
+      // The third term takes the first away, but for rounding.
+      Floats against = rows;
+      for (float& value : against) value = -value;
+      const mien::FactoredTerm terms[] = {
+          {rows.data(), columns.data()}, {other.data(), columns.data()}, {against.data(), columns.data()}};
+      for (const int used : {1, 3}) {
+        mien::factored_update({values.data(), count, columns_count, width, terms, used, second.data(), weights.data(),
+                               0.01f});
+      }
       CHECK(all_finite(values) && all_finite(second));
       results[threads > 1] = values;
     }

@@ -427,9 +427,10 @@ def feature_network_backward(
     network: FeatureNetwork, bases: Sequence[FeatureBases], kept: FeatureKept, gradients: FeatureGradients
 ) -> None: ...
 def factored_update(
-    values: Tensor, rows: Tensor, columns: Tensor, second: Tensor, weights: Tensor, rate: float
+    values: Tensor, rows: list[Tensor], columns: list[Tensor], second: Tensor, weights: Tensor, rate: float
 ) -> None:
-    """Updates `values` [n, k, f], `second` [n, f] and `weights` [n]. The gradient is rows [n, f] times columns [k]."""
+    """Updates `values` [n, k, f], `second` [n, f] and `weights` [n]. The gradient is the sum of rows [n, f] times
+    columns [k] over all terms."""
 
 # native/bind_point_network.cpp; n points, l layers
 class PointLayer(NamedTuple):

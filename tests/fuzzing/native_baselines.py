@@ -96,9 +96,10 @@ def feature_network_backward(native: Any, rng: Rng) -> Arguments:
 
 
 def factored_update(native: Any, rng: Rng) -> Arguments:
-    n, k, f = few(rng), int(rng.integers(0, 5)), int(rng.integers(1, 20))
+    n, k, f, terms = few(rng), int(rng.integers(0, 5)), int(rng.integers(1, 20)), int(rng.integers(0, 4))
     moments = np.abs(normal(rng, n, f)), np.abs(normal(rng, n))
-    return [normal(rng, n, k, f), normal(rng, n, f), normal(rng, k), *moments, 0.01]
+    rows, columns = ([normal(rng, *shape) for _ in range(terms)] for shape in ((n, f), (k,)))
+    return [normal(rng, n, k, f), rows, columns, *moments, 0.01]
 
 
 def point_layers(native: Any, rng: Rng) -> tuple[list[Any], Any, int]:

@@ -127,20 +127,22 @@ def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None
 
 
 def factored_update(update: FactoredUpdate) -> None:
-    """Apply an update in place: natively for one term, if tensors are float32, contiguous and on a CPU.
+    """Apply an update in place: natively if tensors are float32, contiguous and on a CPU.
 
     It is Adam's without the running mean of the gradient, and with one second moment for all k: the running mean of the
     squared gradient's mean over k (the idea of Adafactor, Shazeer and Stern 2018). A row whose gradient is 0 keeps its
     values and its state, and a column that is 0 changes nothing. So the tensor is read and written once, where it
     changes, and its state is smaller by the number of columns.
     """
-    if len(update.terms) == 1:
-        (rows, columns), moments = update.terms[0], update.moments
-        arrays = (update.values.detach(), rows, columns.detach(), moments.second, moments.weights)
-        if all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in arrays):
-            values, rows, columns, second, weights = unpacked(*arrays)
-            _native.factored_update(values, rows, columns, second, weights, update.rate)
-            return
+    moments = update.moments
+    terms = [(rows, columns.detach()) for rows, columns in update.terms]
+    arrays = (update.values.detach(), moments.second, moments.weights)
+    every = (*arrays, *(tensor for term in terms for tensor in term))
+    if all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in every):
+        values, second, weights = unpacked(*arrays)
+        rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
+        _native.factored_update(values, rows, columns, second, weights, update.rate)
+        return
     factored_update_reference(update)
 
 
