@@ -178,5 +178,6 @@ void bind_feature_network(nb::module_& module) {
   module.def("feature_network_backward", &feature_network_backward, "network"_a, "bases"_a, "kept"_a, "gradients"_a,
              "Fills the gradients of features, layers and inputs.");
   module.def("factored_update", &factored_update, "values"_a.noconvert(), "rows"_a, "columns"_a, "second"_a,
-             "weights"_a, "rate"_a, "Updates values [n, k, f] by a gradient that is a sum of outer products, in place.");
+             "weights"_a, "rate"_a,
+             "Updates values [n, k, f] by a gradient that is a sum of outer products, in place.");
 }

@@ -1,15 +1,18 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <array>
 #include <cmath>
+#include <optional>
 #include <tuple>
 #include <vector>
 
 #include "arrays.h"
+#include "surface_limits.h"
 #include "training.h"
 
 namespace nb = nanobind;
@@ -86,6 +89,34 @@ void observe_view(const std::array<float, 2>& scale, const Array<const float, nb
                       pull.data(), seen.data(), radius.data(), opacity.data()});
 }
 
+using Rows = Array<float, nb::shape<-1, 3>>;
+
+void keep_on_surface(const Array<const int64_t, nb::ndim<1>>& triangle,
+                     const Array<const float, nb::shape<-1, 5>>& limits, float ratio, const Rows& means,
+                     const Array<float, nb::shape<-1, 4>>& quats, const Rows& log_scales,
+                     const std::optional<Array<const float, nb::shape<-1, 4>>>& pulls, const Rows& colors) {
+  const size_t n = triangle.shape(0);
+  require(means.shape(0) == n && quats.shape(0) == n && log_scales.shape(0) == n && colors.shape(0) == n,
+          "every array must have one row per Gaussian");
+  require(!pulls || pulls->shape(0) == limits.shape(0), "limits and pulls must have one row per triangle");
+  const nb::gil_scoped_release release;
+  check_indices(triangle, static_cast<int64_t>(limits.shape(0)), "a triangle lies outside the limits");
+  mien::keep_on_surface({static_cast<int64_t>(n), triangle.data(), limits.data(), ratio, means.data(), quats.data(),
+                         log_scales.data(), pulls ? pulls->data() : nullptr, colors.data()});
+}
+
+void clear_rows(const Array<const uint8_t, nb::ndim<1>>& chosen, const std::vector<Array<float>>& arrays) {
+  const size_t n = chosen.shape(0);
+  for (const Array<float>& own : arrays) {
+    require(own.ndim() >= 1 && own.shape(0) == n, "every array must have one row per Gaussian");
+  }
+  const nb::gil_scoped_release release;
+  for (const Array<float>& own : arrays) {
+    const int64_t width = n == 0 ? 0 : static_cast<int64_t>(own.size() / n);
+    mien::clear_rows(chosen.data(), static_cast<int64_t>(n), width, own.data());
+  }
+}
+
 std::tuple<int, int, int, int> box_of_nonzero(const Array<const float, nb::ndim<2>>& values) {
   const nb::gil_scoped_release release;
   const auto [width, height] = picture_size(values);
@@ -110,6 +141,9 @@ void bind_training(nb::module_& module) {
              "Fills the position and the scale penalty, and their gradients.");
   module.def("observe_view", &observe_view, "scale"_a, "grad_means2d"_a, "radii"_a, "opacities"_a, "pull"_a, "seen"_a,
              "radius"_a, "opacity"_a, "Adds a step to the statistics of density control.");
+  module.def("keep_on_surface", &keep_on_surface, "triangle"_a, "limits"_a, "ratio"_a, "means"_a, "quats"_a,
+             "log_scales"_a, "pulls"_a.none(), "colors"_a, "Brings Gaussians back to their limits, in place.");
+  module.def("clear_rows", &clear_rows, "chosen"_a, "arrays"_a, "Sets the chosen rows of all arrays to 0, in place.");
   module.def("mean_squared_difference", &mean_squared_difference, "image"_a.noconvert(), "target"_a.noconvert(),
              "The mean squared difference of a picture and one of bytes, where 255 is 1.");
   module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(),

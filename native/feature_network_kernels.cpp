@@ -221,8 +221,8 @@ MIEN_INLINE void factor_steps(const FactoredUpdate& task, const float* products,
       store(steps + t * task.width + i, task.rate * load(task.terms[t].rows + begin + i) / deviation);
   }
   for (; i < task.width; ++i) {
-    second[i] = second[i] * beta +
-                mean_square<float>(task, products, begin + i, [](const float* from) { return *from; });
+    second[i] =
+        second[i] * beta + mean_square<float>(task, products, begin + i, [](const float* from) { return *from; });
     const float deviation = __builtin_sqrtf(second[i] * unbiased) + 1e-15f;
     for (int t = 0; t < task.terms_count; ++t)
       steps[t * task.width + i] = task.rate * task.terms[t].rows[begin + i] / deviation;

@@ -93,8 +93,8 @@ void check_update() {
       const mien::FactoredTerm terms[] = {
           {rows.data(), columns.data()}, {other.data(), columns.data()}, {against.data(), columns.data()}};
       for (const int used : {1, 3}) {
-        mien::factored_update({values.data(), count, columns_count, width, terms, used, second.data(), weights.data(),
-                               0.01f});
+        mien::factored_update(
+            {values.data(), count, columns_count, width, terms, used, second.data(), weights.data(), 0.01f});
       }
       CHECK(all_finite(values) && all_finite(second));
       results[threads > 1] = values;

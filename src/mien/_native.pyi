@@ -272,6 +272,24 @@ def observe_view(
 ) -> None:
     """Updates the last four. `radii` and `radius` are int32."""
 
+def keep_on_surface(
+    triangle: Tensor,
+    limits: Tensor,
+    ratio: float,
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    pulls: Tensor | None,
+    colors: Tensor,
+) -> None:
+    """Updates `means`, `quats`, `log_scales` and, with `pulls` [f, 4], `colors` [n, 3].
+
+    `triangle` is int64, and `limits` [f, 5].
+    """
+
+def clear_rows(chosen: Tensor, arrays: list[Tensor]) -> None:
+    """Updates all arrays [n, ...]. `chosen` [n] is uint8."""
+
 def mean_squared_difference(image: Tensor, target: Tensor) -> float: ...
 def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...
 
@@ -429,8 +447,10 @@ def feature_network_backward(
 def factored_update(
     values: Tensor, rows: list[Tensor], columns: list[Tensor], second: Tensor, weights: Tensor, rate: float
 ) -> None:
-    """Updates `values` [n, k, f], `second` [n, f] and `weights` [n]. The gradient is the sum of rows [n, f] times
-    columns [k] over all terms."""
+    """Updates `values` [n, k, f], `second` [n, f] and `weights` [n].
+
+    The gradient is the sum of rows [n, f] times columns [k] over all terms.
+    """
 
 # native/bind_point_network.cpp; n points, l layers
 class PointLayer(NamedTuple):

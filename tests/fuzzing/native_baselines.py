@@ -338,6 +338,18 @@ def observe_view(native: Any, rng: Rng) -> Arguments:
     return [(2.0, 3.0), *inputs, empty(n), empty(n), empty(n, dtype=I32), empty(n)]
 
 
+def keep_on_surface(native: Any, rng: Rng) -> Arguments:
+    n, f = few(rng), int(rng.integers(1, 9))
+    pulls = normal(rng, f, 4) if rng.random() < 0.5 else None
+    shapes = normal(rng, n, 3), normal(rng, n, 4), normal(rng, n, 3)
+    return [below(rng, f, n, dtype=np.int64), normal(rng, f, 5), 1.6, *shapes, pulls, normal(rng, n, 3)]
+
+
+def clear_rows(native: Any, rng: Rng) -> Arguments:
+    n = few(rng)
+    return [below(rng, 2, n, dtype=U8), [normal(rng, n), normal(rng, n, 3), normal(rng, n, 2, 4)]]
+
+
 def mean_squared_difference(native: Any, rng: Rng) -> Arguments:
     size = *picture(rng), 3
     return [normal(rng, *size), below(rng, 256, *size, dtype=U8)]
@@ -367,7 +379,8 @@ BASELINES: dict[str, Baseline] = {
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,
         align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
         rasterize_views, rasterize_views_backward, photometric_loss, adam_update,
-        triangle_penalties, observe_view, mean_squared_difference, box_of_nonzero, composite,
+        triangle_penalties, observe_view, keep_on_surface, clear_rows, mean_squared_difference,
+        box_of_nonzero, composite,
     )
 } | {
     "AlignSurface": align_surface,

@@ -13,7 +13,7 @@ from mien.avatar.gaussian_avatars.changes import change_penalties
 from mien.avatar.gaussian_avatars.constants import GAUSSIAN_AVATARS
 from mien.avatar.gaussian_avatars.hair_strands import shell_growth, strand_gaussians
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
-from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface
+from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface, limits_of_triangles, pull_colors
 from mien.avatar.ops.triangle_frames import triangle_ellipses, triangle_frames
 from mien.avatar.store import GaussianStore
 from mien.gaussians import sh_from_rgb
@@ -31,6 +31,7 @@ class GaussianSurface(BoundSurface):
         self._avatar = avatar
         self._config = config
         self._known: Tensor | None = None
+        self._tables: tuple[SurfacePrior, Tensor | None, Tensor | None] | None = None
 
     @property
     def _store(self) -> GaussianStore:
@@ -99,15 +100,26 @@ class GaussianSurface(BoundSurface):
     @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
         """Apply `SurfaceLimits`, and pull the colours of what is rarely seen towards the completed ones."""
-        if self._config.surface.enabled or prior.filled_in is not None:
-            hair = prior.hair if prior.hanging is None else torch.maximum(prior.hair, prior.hanging)
-            keep_on_surface(self._store, self._config.surface, self.sizes, hair, prior.widening)
-        if prior.colors is not None and prior.doubt is not None:
-            bound, own = self._store["face_index"], self._store["sh_constant"].detach()[:, 0]
-            # What is made up has the colours that it was given, strand by strand.
-            doubt = prior.doubt if prior.filled_in is None else prior.doubt.masked_fill(prior.filled_in, 0)
-            pull = GAUSSIAN_AVATARS.color_pull * doubt[bound, None]
-            own += pull * (sh_from_rgb(prior.colors)[bound] - own)
+        limits, pulls = self._tables_of(prior)
+        if limits is not None:
+            keep_on_surface(self._store, limits, self._config.surface.ratio, pulls)
+        elif pulls is not None:
+            pull_colors(self._store, pulls)
+
+    def _tables_of(self, prior: SurfacePrior) -> tuple[Float[Tensor, "f 5"] | None, Float[Tensor, "f 4"] | None]:
+        """What `keep_to` needs of each triangle: limits, and pulls of colours. Kept until the prior changes."""
+        if self._tables is None or self._tables[0] is not prior:
+            limits = pulls = None
+            if self._config.surface.enabled or prior.filled_in is not None:
+                hair = prior.hair if prior.hanging is None else torch.maximum(prior.hair, prior.hanging)
+                limits = limits_of_triangles(self._config.surface, self.sizes, hair, prior.widening)
+            if prior.colors is not None and prior.doubt is not None:
+                # What is made up has the colours that it was given, strand by strand.
+                doubt = prior.doubt if prior.filled_in is None else prior.doubt.masked_fill(prior.filled_in, 0)
+                share = GAUSSIAN_AVATARS.color_pull * doubt[:, None]
+                pulls = torch.cat([sh_from_rgb(prior.colors), share], dim=1).to(self._store["means"])
+            self._tables = (prior, limits, pulls)
+        return self._tables[1:]
 
     @torch.no_grad()
     def restore(self, rows: Int[Tensor, " k"], prior: SurfacePrior, *, close: bool) -> None:

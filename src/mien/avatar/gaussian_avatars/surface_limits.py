@@ -6,47 +6,95 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien import _native
+from mien.arrays import is_native, unpacked
 from mien.avatar.gaussian_avatars.settings import SurfaceLimits
 from mien.avatar.store import GaussianStore
 
+_COLORS = "sh_constant"
+
 
 @torch.no_grad()
-def keep_on_surface(
-    store: GaussianStore,
+def limits_of_triangles(
     limits: SurfaceLimits,
     sizes: Float[Tensor, " f"],
     hair: Float[Tensor, " f"],
     widening: Float[Tensor, " f"] | None = None,
-) -> None:
-    """Bring Gaussians that are beyond the limits back to them, in place.
+) -> Float[Tensor, "f 5"]:
+    """The limits in the frames of the triangles, for `keep_on_surface`.
+
+    They are the lowest and the highest place along the normal, the logarithms of the largest thickness and width, and
+    the sine of half the largest tilt.
 
     Args:
-        store: Gaussians with `face_index, means, quats, log_scales` in the frames of their triangles.
         limits: The limits.
         sizes: Sizes of the triangles, in metres per triangle unit.
         hair: Height of hair above each triangle, in metres; 0 where there is none.
         widening: Factors on the depth, the thickness and the tilt. None means 1.
     """
-    bound = store["face_index"]
-    means, quats, log_scales = (store[name].detach() for name in ("means", "quats", "log_scales"))
-    # The second axis of a triangle's frame is its normal.
     widen = torch.ones_like(sizes) if widening is None else widening
     depth, thickness = limits.depth * widen, limits.thickness * widen
     lowest, highest = -depth / sizes, (depth + limits.hair_share * hair) / sizes
     thickest = ((thickness + limits.hair_thickness * hair) / sizes).log()
     widest = ((limits.width + limits.hair_width * hair) / sizes).log()
-    low, high, thick, wide = torch.stack([lowest, highest, thickest, widest], dim=1)[bound].unbind(1)
+    most = (0.5 * math.radians(limits.tilt) * widen).clamp(max=0.5 * math.pi).sin()
+    return torch.stack([lowest, highest, thickest, widest, most], dim=1)
+
+
+@torch.no_grad()
+def keep_on_surface(
+    store: GaussianStore,
+    limits: Float[Tensor, "f 5"],
+    ratio: float,
+    pulls: Float[Tensor, "f 4"] | None = None,
+) -> None:
+    """Bring Gaussians that are beyond the limits back to them, in place. Native for float32 on a CPU.
+
+    Args:
+        store: Gaussians with `face_index, means, quats, log_scales` in the frames of their triangles.
+        limits: The limits of the triangles (`limits_of_triangles`).
+        ratio: Largest ratio of the widths along the triangle (`SurfaceLimits.ratio`).
+        pulls: Of each triangle, a first SH coefficient and the share of the way that colours go towards it. None means
+            that colours stay.
+    """
+    names = ("means", "quats", "log_scales")
+    arrays = [store[name].detach() for name in names]
+    colors = store[_COLORS].detach()[:, 0] if pulls is not None else arrays[0]
+    if is_native(*arrays, colors, limits) and all(own.is_contiguous() for own in (*arrays, colors)):
+        triangle, table = store["face_index"].long().contiguous(), limits.contiguous()
+        means, quats, log_scales = unpacked(*arrays)
+        own = None if pulls is None else pulls.contiguous()
+        tail = unpacked(own, colors)
+        _native.keep_on_surface(*unpacked(triangle, table), math.log(ratio), means, quats, log_scales, *tail)
+        return
+    keep_on_surface_reference(store, limits, ratio)
+    if pulls is not None:
+        pull_colors(store, pulls)
+
+
+@torch.no_grad()
+def keep_on_surface_reference(store: GaussianStore, limits: Float[Tensor, "f 5"], ratio: float) -> None:
+    """`keep_on_surface` in plain PyTorch, any dtype and device, without colours."""
+    means, quats, log_scales = (store[name].detach() for name in ("means", "quats", "log_scales"))
+    low, high, thick, wide, most = limits[store["face_index"]].unbind(1)
+    # The second axis of a triangle's frame is its normal.
     means[:, 1].clamp_(low, high)
     log_scales[:, 1].clamp_(max=thick)
     across, along = (torch.minimum(log_scales[:, axis], wide) for axis in (0, 2))
     # The shorter one grows. No picture holds it once it is thinner than a pixel, and it would draw the other with it.
-    log_scales[:, 0] = torch.maximum(across, along - math.log(limits.ratio))
-    log_scales[:, 2] = torch.maximum(along, across - math.log(limits.ratio))
+    log_scales[:, 0] = torch.maximum(across, along - math.log(ratio))
+    log_scales[:, 2] = torch.maximum(along, across - math.log(ratio))
     quats /= torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
     # The sine of half the angle between the thin axis and the normal is the length of the second and the fourth number.
-    most = (0.5 * math.radians(limits.tilt) * widen).clamp(max=0.5 * math.pi).sin()[bound]
     beyond = (quats[:, 1].square() + quats[:, 3].square() > most * most).nonzero()[:, 0]
     leaning, most = quats[beyond], most[beyond]
     tilted, level = torch.hypot(leaning[:, 1], leaning[:, 3]), torch.hypot(leaning[:, 0], leaning[:, 2])
     aside, upright = most / tilted.clamp_min(1e-12), (1 - most * most).clamp_min(0).sqrt() / level.clamp_min(1e-6)
     quats[beyond] = leaning * torch.stack([upright, aside, upright, aside], dim=1)
+
+
+@torch.no_grad()
+def pull_colors(store: GaussianStore, pulls: Float[Tensor, "f 4"]) -> None:
+    """Move the first SH coefficient of each Gaussian some way towards that of its triangle, in place."""
+    colors, own = store[_COLORS].detach()[:, 0], pulls[store["face_index"]]
+    colors += own[:, 3:] * (own[:, :3] - colors)

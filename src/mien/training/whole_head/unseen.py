@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.arrays import clear_rows
 from mien.avatar import Avatar, DensityControl, GaussianStore, Photometric, SurfacePrior
 from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
@@ -71,19 +72,15 @@ class Unseen:
         if filled_in is None:
             return
         store = avatar.gaussian_store()
-        for name in store.trained:
-            gradient = store[name].grad
-            if gradient is None:
-                continue
-            # The second axis of a triangle's frame is its normal.
-            height = gradient[:, 1].clone() if name == "means" else None
-            gradient.masked_fill_(filled_in.view(-1, *[1] * (gradient.ndim - 1)), 0)
-            if height is not None:
-                strong = height.sign() * (height.abs() - WHOLE_HEAD.fill_contradiction).clamp_min(0)
-                gradient[:, 1] = torch.where(filled_in, strong, height)
-        for rendering in renderings:
-            if rendering.means2d_offset.grad is not None:
-                rendering.means2d_offset.grad.masked_fill_(filled_in[:, None], 0)
+        gradients = [own for own in (store[name].grad for name in store.trained) if own is not None]
+        gradients += [own for own in (rendering.means2d_offset.grad for rendering in renderings) if own is not None]
+        # The second axis of a triangle's frame is its normal.
+        places = store["means"].grad
+        height = None if places is None else places[:, 1].clone()
+        clear_rows(filled_in, gradients)
+        if places is not None and height is not None:
+            strong = height.sign() * (height.abs() - WHOLE_HEAD.fill_contradiction).clamp_min(0)
+            places[:, 1] = torch.where(filled_in, strong, height)
 
 
 def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -> bool:
