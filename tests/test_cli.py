@@ -66,8 +66,8 @@ def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) 
     with pytest.raises(SystemExit):
         main(["create", "--help"])
     shown = capsys.readouterr().out
-    assert re.findall(r"^\W*(--[a-z][\w.-]*)", shown, re.MULTILINE) == [
-        "--out", "--name", "--device", "--view", "--method", "--preset"
+    assert sorted(re.findall(r"^\W*(--[a-z][\w.-]*)", shown, re.MULTILINE)) == [
+        "--device", "--method", "--name", "--out", "--preset", "--view",
     ]  # fmt: skip
     assert shown.rstrip().endswith("mien create --method gaussian_avatars --help-all")
     assert len(shown.splitlines()) < 45

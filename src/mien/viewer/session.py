@@ -27,6 +27,7 @@ from mien.viewer.drawing import (
     beside,
     draw,
     in_corner,
+    shrunk,
     words_about_view,
 )
 from mien.viewer.faces import random_expression
@@ -269,9 +270,11 @@ class Session:
             wide, high = max(1, wide // 2), max(1, high // 2)
         filmed = clip.pictures if clip is not None and side_by_side else None
         with self._drawing:
-            camera = view.camera(wide if filmed is None else max(1, wide // 2), high)
+            frame = None if filmed is None else filmed(timestep)
+            half = max(1, wide // 2)
+            camera = view.camera(wide, high) if frame is None else view.camera(half, high, shrunk(frame, half, high))
             shown = draw(self._gaussians(face), face, self.mesh, look, camera)
-            picture = shown if filmed is None else beside(filmed(timestep), shown, look.background)
+            picture = shown if frame is None else beside(frame, shown, look.background)
             if seen is not self._last_seen:
                 self._drawn = self._last_seen = seen
             return in_corner(seen.picture, picture) if seen is not None and self.with_camera else picture
