@@ -81,7 +81,7 @@ def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) 
 def test_an_unknown_option_is_told_with_the_one_that_was_meant(
     arguments: str, near: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert near in complaint(capsys, arguments)
+    assert f"did you mean {near}" in complaint(capsys, *arguments.split())
 
 
 @pytest.mark.parametrize("name", ["capture", "track"])
