@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
 from mien import runtime
@@ -33,6 +33,12 @@ _LEAST_ALPHA = 0.5
 _LITTLE = 1e-5
 """Weight of the colour of the nearest Gaussians, which decides where no picture shows the surface."""
 _NEAREST, _CHUNK = 8, 512
+_BARE = 0.01
+"""Distance in metres to the nearest Gaussian beyond which a triangle has none of its own."""
+_NEAREST_SEEN, _TURNED_AWAY = 24, 2.0
+"""Number of seen triangles whose colours such a triangle takes, and how much farther those count that face away."""
+_SURELY = 1e-3
+"""Weight from which on a texel was seen."""
 _ROUNDS = 8
 """Texels by which the texture is continued over the borders of its pieces, so that they do not show."""
 
@@ -66,7 +72,9 @@ def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[
     """A texture [size, size], 0..1, with its first row at v = 1: the colours of the Gaussians as one sees them outside.
 
     Each texel is the mean over the views that see it, weighted by how squarely they do. Surfaces that no view sees
-    have the mean colour of the Gaussians nearest to their triangle in the first pose.
+    have the mean colour of the Gaussians nearest to their triangle in the first pose. Where none is near, as below the
+    cut at the neck, they have the colours of the nearest surfaces that were seen and face the same way, so that the
+    nape continues the skin above it and not the inside of the mouth.
 
     Args:
         surface: The mesh.
@@ -87,8 +95,10 @@ def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[
             image, weight = _seen(points, normals, surface, shot, camera)
             colors += shot.weight * weight * image
             weights += shot.weight * weight
+    colors = (colors / weights).clamp(0, 1)
+    bare = _BareFaces(surface, shots[0], layout.face_index[covered].long())
     texture = torch.zeros(size, size, 3)
-    texture[covered] = (colors / weights).clamp(0, 1)
+    texture[covered] = bare.painted(colors, weights[:, 0] > _SURELY)
     return _continued(texture, covered).numpy()
 
 
@@ -140,6 +150,38 @@ def _nearest_colors(surface: Surface, shot: Shot) -> Float[Tensor, "f 3"]:
         weight = opacities[near].clamp_min(1e-6)[..., None]
         found.append((weight * colors[near]).sum(1) / weight.sum(1))
     return torch.cat(found)
+
+
+class _BareFaces:
+    """The triangles that have no Gaussian near, and the triangles of the texels."""
+
+    def __init__(self, surface: Surface, shot: Shot, owner: Int[Tensor, " p"]) -> None:
+        self._owner, self._count = owner, len(surface.faces)
+        self._middles = shot.vertices[surface.faces].mean(1)
+        normals = vertex_normals(shot.vertices, surface.faces)[surface.faces].mean(1)
+        self._normals = torch.nn.functional.normalize(normals, dim=-1)
+        means = torch.from_numpy(shot.gaussians.means)
+        apart = torch.cat([torch.cdist(part, means).amin(1) for part in self._middles.split(_CHUNK)])
+        self._bare = apart > _BARE
+
+    def painted(self, colors: Float[Tensor, "p 3"], seen: Bool[Tensor, " p"]) -> Float[Tensor, "p 3"]:
+        """The colours of texels, with those of bare triangles that were not seen replaced by what is seen around."""
+        counts = torch.zeros(self._count).index_add(0, self._owner[seen], torch.ones(int(seen.sum())))
+        sums = torch.zeros(self._count, 3).index_add(0, self._owner[seen], colors[seen])
+        known = (counts > 0).nonzero()[:, 0]
+        wanted = (self._bare & (counts == 0)).nonzero()[:, 0]
+        if len(known) == 0 or len(wanted) == 0:
+            return colors
+        means, filled = sums[known] / counts[known, None], torch.zeros(self._count, 3)
+        for part in wanted.split(_CHUNK):
+            facing = self._normals[part] @ self._normals[known].T
+            distance = torch.cdist(self._middles[part], self._middles[known]) * (1 + _TURNED_AWAY * (1 - facing))
+            near = distance.topk(min(_NEAREST_SEEN, len(known)), largest=False)
+            weight = 1 / near.values.clamp_min(1e-4)[..., None]
+            filled[part] = (weight * means[near.indices]).sum(1) / weight.sum(1)
+        replaced = torch.zeros(self._count, dtype=torch.bool)
+        replaced[wanted] = True
+        return torch.where(replaced[self._owner][:, None], filled[self._owner], colors)
 
 
 def _continued(texture: Float[Tensor, "s s 3"], covered: Tensor) -> Float[Tensor, "s s 3"]:
