@@ -11,12 +11,13 @@ import pytest
 from mien.capture.sound import RATE, read_sound
 from mien.capture.video import count_frames, read_video_frames, write_video
 from mien.cli import main
-from mien.commands.stages import driving
+from mien.commands.stages import driving, viewing, viewing_motions
 from mien.driving import Driver
 from mien.driving.motion import ARKIT_NAMES
 from mien.driving.speech import FPS, blink_at, motion_of_sound, read_speech, sway_at
 from mien.errors import UserError
 from mien.face import load_face_model
+from mien.viewer import Session
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
@@ -165,8 +166,29 @@ def test_the_command_writes_a_talking_avatar(
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(silent), "--size", "32"]) == 0
     assert "has no sound; only an .mp4" in capsys.readouterr().err
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--sequence", "a", "--out", str(out)]) == 2
-    assert main(["drive", str(tmp_path / "w"), "--by", str(voice)]) == 2
-    assert "needs --out" in capsys.readouterr().err
+    capsys.readouterr()
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--alone", "--size", "32"]) == 2
+    assert "--alone, the options of pictures: needs --out" in capsys.readouterr().err
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(out), "--port", "80"]) == 2
+    assert "--port 80: is for the viewer" in capsys.readouterr().err
+
+
+def test_without_an_output_the_viewer_plays_the_voice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser")
+    write_toy_workspace(tmp_path / "w")
+    voice, shown = write_wav(tmp_path / "voice.wav", tone(300.0)[0]), []
+
+    def serve(session: Session, door: object, port: int, *rest: object) -> None:
+        shown.append((session.chosen, session.playing, session.clip is not None and len(session.clip.motion), port))
+
+    def open_driver(by: Path, sequence: str | None, *rest: object, **named: object) -> Driver:
+        face = toy_face_model().neutral(90)
+        return Driver(face, face[0], FPS, None, by)
+
+    monkeypatch.setattr(viewing, "serve", serve)
+    monkeypatch.setattr(viewing_motions, "open_driver", open_driver)
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--port", "8123"]) == 0
+    assert shown == [("voice.wav", True, 90, 8123)]
 
 
 @pytest.mark.parametrize("rate", [0, 1, 3, 999, 2_000_000, 2**31 - 1])

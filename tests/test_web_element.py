@@ -86,7 +86,8 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
         script(
             "const told = new Promise((done) => avatar.addEventListener('error', (event) => done(event.detail)));",
             "avatar.src = 'nobody.packed'; const said = await told, box = avatar.shadowRoot;",
-            "return [said, box.querySelector('p[part=error][role=alert]').textContent, box.querySelectorAll('canvas').length];",
+            "const words = box.querySelector('p[part=error][role=alert]').textContent;",
+            "return [said, words, box.querySelectorAll('canvas').length];",
         ),
     ]  # fmt: skip
     with served(site) as address:
@@ -190,7 +191,8 @@ DROP = """
 SEEN = """
   await new Promise(requestAnimationFrame);
   await new Promise(requestAnimationFrame);
-  return [words.textContent, document.querySelector("canvas").toDataURL(), document.querySelectorAll("nav button").length];
+  const faces = document.querySelectorAll("nav button").length;
+  return [words.textContent, document.querySelector("canvas").toDataURL(), faces];
 """
 
 
@@ -203,8 +205,12 @@ def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
     write_glb(site / "same.glb", drawn, mesh_model(drawn), 64)
     (site / "none.txt").write_text("nobody")
     (site / "playground.html").write_text((EXAMPLES / "playground.html").read_text())
-    kept = "HTMLCanvasElement.prototype.getContext = ((get) => function (kind, made) {"
-    kept += " return get.call(this, kind, { ...made, preserveDrawingBuffer: true }); })(HTMLCanvasElement.prototype.getContext);"
+    kept = """
+      const get = HTMLCanvasElement.prototype.getContext;
+      HTMLCanvasElement.prototype.getContext = function (kind, made) {
+        return get.call(this, kind, { ...made, preserveDrawingBuffer: true });
+      };
+    """
     names = ("same.packed", "same.mien", "same.glb", "none.txt")
     steps = [script(DROP % (name, name), SEEN) for name in names[:3]]
     steps += [script("document.querySelector('nav button').click(); const words = { textContent: '' };", SEEN)]

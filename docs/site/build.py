@@ -41,7 +41,7 @@ _LINK = re.compile(r"(?P<before>\]\()(?P<target>[^)\s#:]+)(?P<after>(#[^)\s]*)?\
 _CODE = {".py": "python", ".h": "cpp", ".cpp": "cpp", ".toml": "toml"}
 _LONGEST_VALUE = 88
 """Longest value of a constant that the reference shows, in characters."""
-_PICTURE = re.compile(r"^!\[[^\]]*\]\(images/demo\.jpg\)$", re.MULTILINE)
+_PICTURE = re.compile(r"^!\[[^\]]*\]\([./\w]*images/demo\.jpg\)$", re.MULTILINE)
 """The picture of the front page, below which the living avatar stands."""
 _LIVING = """
 

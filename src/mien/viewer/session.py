@@ -76,6 +76,7 @@ class Session:
         self._posed: tuple[Face, runtime.Gaussians] | None = None
         self._version = 0
         self._clip: Clip | None = None
+        self._chosen: str | None = None
         self._timestep = 0
         self._playing_since: float | None = None
         """Time at which timestep 0 was due, or None if nothing plays."""
@@ -97,6 +98,11 @@ class Session:
     def clip(self) -> Clip | None:
         """The chosen motion."""
         return self._clip
+
+    @property
+    def chosen(self) -> str | None:
+        """The name of the chosen motion."""
+        return self._chosen
 
     @property
     def timestep(self) -> int:
@@ -181,7 +187,7 @@ class Session:
             clip = self._clips[name] if name in self._clips else self._makers[name]()
             self._clips[name] = clip
         with self._lock:
-            self._clip, self._playing_since = clip, None
+            self._clip, self._chosen, self._playing_since = clip, name, None
             self._timestep = 0
             self._take(self.avatar.face() if clip is None else clip.motion.face(0))
 
