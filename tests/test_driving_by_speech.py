@@ -71,6 +71,60 @@ def test_the_jaw_follows_the_envelope(frequency: float, loudness: float) -> None
     assert 0.4 < jaw.max() <= 0.6
 
 
+VOWELS = {"a": (750, 1200, 2600, 1.0, 0), "e": (290, 2300, 3000, 0.25, -5), "i": (420, 1950, 2600, 0.4, -4),
+          "o": (500, 880, 2500, 0.6, -2), "u": (320, 820, 2400, 0.25, -5)}  # fmt: skip
+"""Formants of five vowels in Hz, how open the jaw is, and loudness in dB."""
+CLOSED = {"p": (250, 900, 2400, 0, -60), "b": (250, 900, 2400, 0, -28), "m": (250, 1100, 2300, 0, -14)}
+
+
+def smooth(values: np.ndarray, seconds: float) -> np.ndarray:
+    window = np.hanning(int(2 * seconds * RATE) | 1)
+    return np.convolve(np.pad(values, len(window) // 2, mode="edge"), window / window.sum(), "valid")
+
+
+def synthesised(seed: int, syllables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return speech made of a buzz through three formants, with the jaw of each sample, and whether lips are closed."""
+    random = np.random.default_rng(seed)
+    rows, shut = [], []
+    for _ in range(syllables):
+        consonant = random.choice(["p", "b", "m", ""])
+        if consonant:
+            rows += [CLOSED[consonant]] * round(0.09 * RATE)
+            shut += [True] * round(0.09 * RATE)
+        count = round(random.uniform(0.15, 0.3) * RATE)
+        rows += [VOWELS[random.choice(list(VOWELS))]] * count
+        shut += [False] * count
+    table = np.array(rows, np.float64)
+    pulses = np.floor(np.cumsum(115 * (1 + 0.08 * np.sin(np.arange(len(table)) / 3000))) / RATE)
+    sound = smooth(np.diff(pulses, prepend=0), 0.0006) + 0.01 * random.standard_normal(len(table))
+    for formant, width in enumerate((80, 100, 140)):
+        reach = np.exp(-np.pi * width / RATE)
+        back = 2 * reach * np.cos(2 * np.pi * smooth(table[:, formant], 0.03) / RATE)
+        before = last = 0.0
+        for index in range(len(sound)):
+            before, last = last, (1 - back[index] + reach**2) * sound[index] + back[index] * last - reach**2 * before
+            sound[index] = last
+    sound *= 10 ** (smooth(table[:, 4], 0.012) / 20)
+    sound = 0.6 * sound / np.abs(sound).max() + 1e-4 * random.standard_normal(len(sound))
+    return sound.astype(np.float32), smooth(table[:, 3], 0.05), np.array(shut)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(seed: int) -> None:
+    sound, jaw, shut = synthesised(seed, 24)
+    motion = motion_of_sound(sound)
+    sampled = (np.arange(len(motion)) / FPS * RATE).astype(int)
+    found, press = (column(motion.coefficients, name) for name in ("jawOpen", "mouthPressLeft"))
+    assert np.corrcoef(found, jaw[sampled])[0, 1] >= 0.8
+    edges = np.flatnonzero(np.diff(shut.astype(int), prepend=0, append=0)) / RATE * FPS
+    closures = [slice(int(begin), int(end) + 2) for begin, end in edges.reshape(-1, 2)]
+    assert np.mean([found[one].min() < 0.06 for one in closures]) >= 0.8
+    inside = np.zeros(len(found), bool)
+    for one in closures:
+        inside[max(one.start - 1, 0) : one.stop + 1] = True
+    assert press[~inside].mean() < 0.1 * press[inside].max(), "lips are not pressed in vowels"
+
+
 def test_pauses_in_noise_close_the_mouth() -> None:
     samples, envelope = tone(300.0, 0.3)
     noisy = samples + 0.005 * np.random.default_rng(0).standard_normal(len(samples)).astype(np.float32)

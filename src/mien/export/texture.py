@@ -35,6 +35,8 @@ _LITTLE = 1e-5
 _NEAREST, _CHUNK = 8, 512
 _BARE = 0.01
 """Distance in metres to the nearest Gaussian beyond which a triangle has none of its own."""
+_ABOVE = 0.6
+"""Cosine between the normal and the way to the nearest Gaussian from which on that Gaussian stands above a triangle."""
 _NEAREST_SEEN, _TURNED_AWAY = 24, 2.0
 """Number of seen triangles whose colours such a triangle takes, and how much farther those count that face away."""
 _SURELY = 1e-3
@@ -161,15 +163,23 @@ class _BareFaces:
         normals = vertex_normals(shot.vertices, surface.faces)[surface.faces].mean(1)
         self._normals = torch.nn.functional.normalize(normals, dim=-1)
         means = torch.from_numpy(shot.gaussians.means)
-        apart = torch.cat([torch.cdist(part, means).amin(1) for part in self._middles.split(_CHUNK)])
-        self._bare = apart > _BARE
+        nearest = torch.cat([torch.cdist(part, means).argmin(1) for part in self._middles.split(_CHUNK)])
+        apart = means[nearest] - self._middles
+        distance = apart.norm(dim=-1)
+        # What stands out from the mesh, such as hair, has its Gaussians straight above it.
+        above = (apart * self._normals).sum(-1) > _ABOVE * distance
+        self._bare = (distance > _BARE) & ~above
 
     def painted(self, colors: Float[Tensor, "p 3"], seen: Bool[Tensor, " p"]) -> Float[Tensor, "p 3"]:
-        """The colours of texels, with those of bare triangles that were not seen replaced by what is seen around."""
+        """The colours of texels, with those of bare triangles replaced by what is seen around.
+
+        Pictures of bare triangles show what is behind them, such as the mouth through the nape.
+        """
+        seen = seen & ~self._bare[self._owner]
         counts = torch.zeros(self._count).index_add(0, self._owner[seen], torch.ones(int(seen.sum())))
         sums = torch.zeros(self._count, 3).index_add(0, self._owner[seen], colors[seen])
         known = (counts > 0).nonzero()[:, 0]
-        wanted = (self._bare & (counts == 0)).nonzero()[:, 0]
+        wanted = self._bare.nonzero()[:, 0]
         if len(known) == 0 or len(wanted) == 0:
             return colors
         means, filled = sums[known] / counts[known, None], torch.zeros(self._count, 3)
