@@ -76,7 +76,7 @@ def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(("arguments", "near"), [
     ("create a.mp4 --uot here", "--out"),
     ("render here --out a.png --sett smile=1", "--set"),
-    ("create a.mp4 --calibraton cameras.json --out here", "--calibration"),
+    ("create a.mp4 --calibrations cameras.json --out here", "--calibration"),
 ])  # fmt: skip
 def test_an_unknown_option_is_told_with_the_one_that_was_meant(
     arguments: str, near: str, capsys: pytest.CaptureFixture[str]
