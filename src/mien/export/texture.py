@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from mien import runtime
@@ -30,17 +30,12 @@ pixel of an inclined surface has. Lids are thin."""
 _LEAST_COSINE = 0.15
 _LEAST_ALPHA = 0.5
 """Least cosine between the normal and the direction to the camera, and least alpha, with which a texel is taken."""
+_BEHIND = 0.015
+"""Depth in metres behind a texel up to which the mean depth of what is drawn there may lie. Beyond it, a picture shows
+what is behind a thin surface, such as the mouth through the nape."""
 _LITTLE = 1e-5
 """Weight of the colour of the nearest Gaussians, which decides where no picture shows the surface."""
 _NEAREST, _CHUNK = 8, 512
-_BARE = 0.01
-"""Distance in metres to the nearest Gaussian beyond which a triangle has none of its own."""
-_ABOVE = 0.6
-"""Cosine between the normal and the way to the nearest Gaussian from which on that Gaussian stands above a triangle."""
-_NEAREST_SEEN, _TURNED_AWAY = 24, 2.0
-"""Number of seen triangles whose colours such a triangle takes, and how much farther those count that face away."""
-_SURELY = 1e-3
-"""Weight from which on a texel was seen."""
 _ROUNDS = 8
 """Texels by which the texture is continued over the borders of its pieces, so that they do not show."""
 
@@ -73,10 +68,9 @@ class Shot:
 def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[np.ndarray, "s s 3"]:
     """A texture [size, size], 0..1, with its first row at v = 1: the colours of the Gaussians as one sees them outside.
 
-    Each texel is the mean over the views that see it, weighted by how squarely they do. Surfaces that no view sees
-    have the mean colour of the Gaussians nearest to their triangle in the first pose. Where none is near, as below the
-    cut at the neck, they have the colours of the nearest surfaces that were seen and face the same way, so that the
-    nape continues the skin above it and not the inside of the mouth.
+    Each texel is the mean over the views that see it, weighted by how squarely they do. A view that sees through a thin
+    surface, such as the faded nape, sees what is behind it, and does not count. Surfaces that no view sees
+    have the mean colour of the Gaussians nearest to their triangle in the first pose.
 
     Args:
         surface: The mesh.
@@ -97,10 +91,8 @@ def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[
             image, weight = _seen(points, normals, surface, shot, camera)
             colors += shot.weight * weight * image
             weights += shot.weight * weight
-    colors = (colors / weights).clamp(0, 1)
-    bare = _BareFaces(surface, shots[0], layout.face_index[covered].long())
     texture = torch.zeros(size, size, 3)
-    texture[covered] = bare.painted(colors, weights[:, 0] > _SURELY)
+    texture[covered] = (colors / weights).clamp(0, 1)
     return _continued(texture, covered).numpy()
 
 
@@ -122,10 +114,11 @@ def _seen(
     """The colours of points in one picture, and their weights."""
     plain = runtime.Camera(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
     image, alpha = map(torch.from_numpy, runtime.render(shot.gaussians, plain, (0.0, 0.0, 0.0)))
+    drawn = torch.from_numpy(runtime.render(_with_depths(shot.gaussians, camera), plain, (0.0, 0.0, 0.0))[0])
     depth = rasterize_mesh(shot.vertices, surface.faces, camera).depth.nan_to_num(posinf=1e3)
     pixels, ahead = camera.project(points)
     grid = 2 * pixels / torch.tensor([float(camera.width), float(camera.height)]) - 1
-    picture = sample_picture(torch.cat([image, alpha[..., None]], -1), grid, "bilinear")
+    picture = sample_picture(torch.cat([image, alpha[..., None], drawn[..., :1]], -1), grid, "bilinear")
     nearest = sample_picture(depth[..., None], grid, "nearest")[:, 0]
     towards = torch.nn.functional.normalize(camera.position - points, dim=-1)
     cosine = (torch.nn.functional.normalize(normals, dim=-1) * towards).sum(-1)
@@ -137,8 +130,17 @@ def _seen(
         & (opacity > _LEAST_ALPHA)
     )
     usable &= (grid.abs() < 1).all(-1)
+    usable &= picture[:, 4] / opacity.clamp_min(_LEAST_ALPHA) < ahead + _BEHIND
     weight = torch.where(usable, cosine**4, torch.zeros_like(cosine))
     return picture[:, :3] / opacity.clamp_min(_LEAST_ALPHA)[:, None], weight[:, None]
+
+
+def _with_depths(gaussians: runtime.Gaussians, camera: Camera) -> runtime.Gaussians:
+    """The same Gaussians with their depths in metres as colours."""
+    sh = np.zeros((len(gaussians.means), 1, 3), np.float32)
+    depths = camera.project(torch.from_numpy(gaussians.means))[1].numpy()
+    sh[:, 0] = (depths[:, None] - 0.5) / SH_C0
+    return replace(gaussians, sh=sh)
 
 
 def _nearest_colors(surface: Surface, shot: Shot) -> Float[Tensor, "f 3"]:
@@ -152,46 +154,6 @@ def _nearest_colors(surface: Surface, shot: Shot) -> Float[Tensor, "f 3"]:
         weight = opacities[near].clamp_min(1e-6)[..., None]
         found.append((weight * colors[near]).sum(1) / weight.sum(1))
     return torch.cat(found)
-
-
-class _BareFaces:
-    """The triangles that have no Gaussian near, and the triangles of the texels."""
-
-    def __init__(self, surface: Surface, shot: Shot, owner: Int[Tensor, " p"]) -> None:
-        self._owner, self._count = owner, len(surface.faces)
-        self._middles = shot.vertices[surface.faces].mean(1)
-        normals = vertex_normals(shot.vertices, surface.faces)[surface.faces].mean(1)
-        self._normals = torch.nn.functional.normalize(normals, dim=-1)
-        means = torch.from_numpy(shot.gaussians.means)
-        nearest = torch.cat([torch.cdist(part, means).argmin(1) for part in self._middles.split(_CHUNK)])
-        apart = means[nearest] - self._middles
-        distance = apart.norm(dim=-1)
-        # What stands out from the mesh, such as hair, has its Gaussians straight above it.
-        above = (apart * self._normals).sum(-1) > _ABOVE * distance
-        self._bare = (distance > _BARE) & ~above
-
-    def painted(self, colors: Float[Tensor, "p 3"], seen: Bool[Tensor, " p"]) -> Float[Tensor, "p 3"]:
-        """The colours of texels, with those of bare triangles replaced by what is seen around.
-
-        Pictures of bare triangles show what is behind them, such as the mouth through the nape.
-        """
-        seen = seen & ~self._bare[self._owner]
-        counts = torch.zeros(self._count).index_add(0, self._owner[seen], torch.ones(int(seen.sum())))
-        sums = torch.zeros(self._count, 3).index_add(0, self._owner[seen], colors[seen])
-        known = (counts > 0).nonzero()[:, 0]
-        wanted = self._bare.nonzero()[:, 0]
-        if len(known) == 0 or len(wanted) == 0:
-            return colors
-        means, filled = sums[known] / counts[known, None], torch.zeros(self._count, 3)
-        for part in wanted.split(_CHUNK):
-            facing = self._normals[part] @ self._normals[known].T
-            distance = torch.cdist(self._middles[part], self._middles[known]) * (1 + _TURNED_AWAY * (1 - facing))
-            near = distance.topk(min(_NEAREST_SEEN, len(known)), largest=False)
-            weight = 1 / near.values.clamp_min(1e-4)[..., None]
-            filled[part] = (weight * means[near.indices]).sum(1) / weight.sum(1)
-        replaced = torch.zeros(self._count, dtype=torch.bool)
-        replaced[wanted] = True
-        return torch.where(replaced[self._owner][:, None], filled[self._owner], colors)
 
 
 def _continued(texture: Float[Tensor, "s s 3"], covered: Tensor) -> Float[Tensor, "s s 3"]:
