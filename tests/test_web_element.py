@@ -220,11 +220,15 @@ def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
     assert [words for words, _, _ in (packed, mien, glb)] == [
         f"{name}: drag it, or press a face." for name in names[:3]
     ]
-    assert picture(packed[1]).std() > 0.05, "somebody is seen"
-    assert psnr(picture(packed[1]), picture(mien[1])) >= 40
-    np.testing.assert_array_equal(picture(mien[1]), picture(glb[1]))
+    # Colours of clear pixels are rounded, so they count by their alpha.
+    by_packed, by_mien, by_glb, smile = (
+        picture(url)[..., :3] * picture(url)[..., 3:] for _, url, _ in (packed, mien, glb, smiling)
+    )
+    assert by_packed.std() > 0.05, "somebody is seen"
+    assert psnr(by_packed, by_mien) >= 40
+    np.testing.assert_array_equal(by_mien, by_glb)
     assert glb[2] > 5
-    assert psnr(picture(smiling[1]), picture(glb[1])) < 45
+    assert psnr(smile, by_glb) < 45
     assert none[0] == "none.txt is not a .mien file"
 
 
