@@ -97,9 +97,9 @@ def synthesised(seed: int, syllables: int) -> tuple[np.ndarray, np.ndarray, np.n
     table = np.array(rows, np.float64)
     pulses = np.floor(np.cumsum(115 * (1 + 0.08 * np.sin(np.arange(len(table)) / 3000))) / RATE)
     sound = smooth(np.diff(pulses, prepend=0), 0.0006) + 0.01 * random.standard_normal(len(table))
-    for formant, width in enumerate((80, 100, 140)):
+    for part, width in enumerate((80, 100, 140)):
         reach = np.exp(-np.pi * width / RATE)
-        back = 2 * reach * np.cos(2 * np.pi * smooth(table[:, formant], 0.03) / RATE)
+        back = 2 * reach * np.cos(2 * np.pi * smooth(table[:, part], 0.03) / RATE)
         before = last = 0.0
         for index in range(len(sound)):
             before, last = last, (1 - back[index] + reach**2) * sound[index] + back[index] * last - reach**2 * before

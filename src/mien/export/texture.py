@@ -30,7 +30,7 @@ pixel of an inclined surface has. Lids are thin."""
 _LEAST_COSINE = 0.15
 _LEAST_ALPHA = 0.5
 """Least cosine between the normal and the direction to the camera, and least alpha, with which a texel is taken."""
-_BEHIND = 0.015
+_BEHIND = 0.025
 """Depth in metres behind a texel up to which the mean depth of what is drawn there may lie. Beyond it, a picture shows
 what is behind a thin surface, such as the mouth through the nape."""
 _LITTLE = 1e-5
