@@ -137,6 +137,7 @@ format: setup
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 
 # The site of the documentation, with the reference of the public API: build/docs/index.html. A broken link is an error.
+# `make demo docs` puts the demo's person, alive, on its first page.
 docs: setup
 	$(BIN)/python docs/site/build.py --out build/docs
 	@echo "open build/docs/index.html"

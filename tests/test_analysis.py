@@ -21,7 +21,6 @@ from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands.analyze import Command
 from mien.errors import UserError
-from mien.evaluation.plots import Axes, Series
 from mien.face import FaceModel
 from mien.lab.analysis import (
     ANALYSES,
@@ -38,6 +37,7 @@ from mien.lab.analysis import (
 )
 from mien.lab.analysis.gaussian_avatars import growth, speed
 from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
+from mien.plots import Axes, Series
 from mien.storage import write_tensors
 from mien.training import read_curves
 from toy_workspace import write_toy_workspace

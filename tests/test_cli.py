@@ -1,6 +1,7 @@
 """The command line has help, exit codes and one-line messages. A real run is in test_end_to_end.py."""
 
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -61,7 +62,29 @@ def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(
     assert "default: )" not in shown
 
 
-@pytest.mark.parametrize("name", ["create", "capture", "track"])
+def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["create", "--help"])
+    shown = capsys.readouterr().out
+    assert sorted(re.findall(r"^\W*(--[a-z][\w.-]*)", shown, re.MULTILINE)) == [
+        "--device", "--method", "--name", "--out", "--preset", "--view",
+    ]  # fmt: skip
+    assert shown.rstrip().endswith("mien create --method gaussian_avatars --help-all")
+    assert len(shown.splitlines()) < 45
+
+
+@pytest.mark.parametrize(("arguments", "near"), [
+    ("create a.mp4 --uot here", "--out"),
+    ("render here --out a.png --sett smile=1", "--set"),
+    ("create a.mp4 --calibrations cameras.json --out here", "--calibration"),
+])  # fmt: skip
+def test_an_unknown_option_is_told_with_the_one_that_was_meant(
+    arguments: str, near: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert f"did you mean {near}" in complaint(capsys, *arguments.split())
+
+
+@pytest.mark.parametrize("name", ["capture", "track"])
 def test_help_leaves_details_to_help_all(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     shown = []
     for flag in ("--help", "--help-all"):

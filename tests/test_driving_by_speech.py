@@ -11,12 +11,13 @@ import pytest
 from mien.capture.sound import RATE, read_sound
 from mien.capture.video import count_frames, read_video_frames, write_video
 from mien.cli import main
-from mien.commands.stages import driving
+from mien.commands.stages import driving, viewing, viewing_motions
 from mien.driving import Driver
 from mien.driving.motion import ARKIT_NAMES
 from mien.driving.speech import FPS, blink_at, motion_of_sound, read_speech, sway_at
 from mien.errors import UserError
 from mien.face import load_face_model
+from mien.viewer import Session
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
@@ -68,6 +69,60 @@ def test_the_jaw_follows_the_envelope(frequency: float, loudness: float) -> None
     assert max(by_lag, key=lambda lag: by_lag[lag]) == 0, "there is no lag"
     assert jaw[:25].max() < 0.02, "it is silent before the tone"
     assert 0.4 < jaw.max() <= 0.6
+
+
+VOWELS = {"a": (750, 1200, 2600, 1.0, 0), "e": (290, 2300, 3000, 0.25, -5), "i": (420, 1950, 2600, 0.4, -4),
+          "o": (500, 880, 2500, 0.6, -2), "u": (320, 820, 2400, 0.25, -5)}  # fmt: skip
+"""Formants of five vowels in Hz, how open the jaw is, and loudness in dB."""
+CLOSED = {"p": (250, 900, 2400, 0, -60), "b": (250, 900, 2400, 0, -28), "m": (250, 1100, 2300, 0, -14)}
+
+
+def smooth(values: np.ndarray, seconds: float) -> np.ndarray:
+    window = np.hanning(int(2 * seconds * RATE) | 1)
+    return np.convolve(np.pad(values, len(window) // 2, mode="edge"), window / window.sum(), "valid")
+
+
+def synthesised(seed: int, syllables: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return speech made of a buzz through three formants, with the jaw of each sample, and whether lips are closed."""
+    random = np.random.default_rng(seed)
+    rows, shut = [], []
+    for _ in range(syllables):
+        consonant = random.choice(["p", "b", "m", ""])
+        if consonant:
+            rows += [CLOSED[consonant]] * round(0.09 * RATE)
+            shut += [True] * round(0.09 * RATE)
+        count = round(random.uniform(0.15, 0.3) * RATE)
+        rows += [VOWELS[random.choice(list(VOWELS))]] * count
+        shut += [False] * count
+    table = np.array(rows, np.float64)
+    pulses = np.floor(np.cumsum(115 * (1 + 0.08 * np.sin(np.arange(len(table)) / 3000))) / RATE)
+    sound = smooth(np.diff(pulses, prepend=0), 0.0006) + 0.01 * random.standard_normal(len(table))
+    for part, width in enumerate((80, 100, 140)):
+        reach = np.exp(-np.pi * width / RATE)
+        back = 2 * reach * np.cos(2 * np.pi * smooth(table[:, part], 0.03) / RATE)
+        before = last = 0.0
+        for index in range(len(sound)):
+            before, last = last, (1 - back[index] + reach**2) * sound[index] + back[index] * last - reach**2 * before
+            sound[index] = last
+    sound *= 10 ** (smooth(table[:, 4], 0.012) / 20)
+    sound = 0.6 * sound / np.abs(sound).max() + 1e-4 * random.standard_normal(len(sound))
+    return sound.astype(np.float32), smooth(table[:, 3], 0.05), np.array(shut)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(seed: int) -> None:
+    sound, jaw, shut = synthesised(seed, 24)
+    motion = motion_of_sound(sound)
+    sampled = (np.arange(len(motion)) / FPS * RATE).astype(int)
+    found, press = (column(motion.coefficients, name) for name in ("jawOpen", "mouthPressLeft"))
+    assert np.corrcoef(found, jaw[sampled])[0, 1] >= 0.8
+    edges = np.flatnonzero(np.diff(shut.astype(int), prepend=0, append=0)) / RATE * FPS
+    closures = [slice(int(begin), int(end) + 2) for begin, end in edges.reshape(-1, 2)]
+    assert np.mean([found[one].min() < 0.06 for one in closures]) >= 0.8
+    inside = np.zeros(len(found), bool)
+    for one in closures:
+        inside[max(one.start - 1, 0) : one.stop + 1] = True
+    assert press[~inside].mean() < 0.1 * press[inside].max(), "lips are not pressed in vowels"
 
 
 def test_pauses_in_noise_close_the_mouth() -> None:
@@ -165,8 +220,29 @@ def test_the_command_writes_a_talking_avatar(
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(silent), "--size", "32"]) == 0
     assert "has no sound; only an .mp4" in capsys.readouterr().err
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--sequence", "a", "--out", str(out)]) == 2
-    assert main(["drive", str(tmp_path / "w"), "--by", str(voice)]) == 2
-    assert "needs --out" in capsys.readouterr().err
+    capsys.readouterr()
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--alone", "--size", "32"]) == 2
+    assert "--alone, the options of pictures: needs --out" in capsys.readouterr().err
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(out), "--port", "80"]) == 2
+    assert "--port 80: is for the viewer" in capsys.readouterr().err
+
+
+def test_without_an_output_the_viewer_plays_the_voice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser")
+    write_toy_workspace(tmp_path / "w")
+    voice, shown = write_wav(tmp_path / "voice.wav", tone(300.0)[0]), []
+
+    def serve(session: Session, door: object, port: int, *rest: object) -> None:
+        shown.append((session.chosen, session.playing, session.clip is not None and len(session.clip.motion), port))
+
+    def open_driver(by: Path, sequence: str | None, *rest: object, **named: object) -> Driver:
+        face = toy_face_model().neutral(90)
+        return Driver(face, face[0], FPS, None, by)
+
+    monkeypatch.setattr(viewing, "serve", serve)
+    monkeypatch.setattr(viewing_motions, "open_driver", open_driver)
+    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--port", "8123"]) == 0
+    assert shown == [("voice.wav", True, 90, 8123)]
 
 
 @pytest.mark.parametrize("rate", [0, 1, 3, 999, 2_000_000, 2**31 - 1])

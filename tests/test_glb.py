@@ -276,6 +276,29 @@ def test_the_texture_has_the_colors_of_the_gaussians() -> None:
     assert np.median(np.abs(texels - expected)[outer]) < 0.03
 
 
+def test_what_is_seen_through_a_thin_surface_is_not_painted_on_it() -> None:
+    """Faint red skin in front of an opaque dark core, as of a mouth behind the nape, stays red in the texture."""
+    vertices = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]], np.float32)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    uv = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.1, 0.1, 30)] * 2), -1).reshape(-1, 2).astype(np.float32)
+    count = len(grid)
+    for opacity, depth, least in ((0.1, 0.05, 0.85), (0.1, 0.0, 0.0)):
+        core = np.concatenate([grid, np.full((count, 1), -depth, np.float32)], 1)
+        skin = np.concatenate([grid, np.zeros((count, 1), np.float32)], 1)
+        colors = np.repeat(np.array([[0.9, 0.1, 0.1], [0.0, 0.0, 0.0]], np.float32), count, 0)
+        gaussians = runtime.Gaussians(
+            np.concatenate([skin, core]), np.tile(np.array([1, 0, 0, 0], np.float32), (2 * count, 1)),
+            np.full((2 * count, 3), 0.004, np.float32),
+            np.repeat(np.array([opacity, 0.99], np.float32), count),
+            ((colors - 0.5) / SH_C0)[:, None].astype(np.float32), None,
+        )  # fmt: skip
+        shot = Shot(torch.from_numpy(vertices), gaussians, views=((0, 0),))
+        texture = bake_texture(Surface(faces, uv, faces), [shot], 16)
+        red = float(np.median(texture[..., 0]))
+        assert red >= least if least else red < 0.7, "a core at the surface itself is seen, and painted"
+
+
 def test_export_writes_a_glb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_toy_workspace(tmp_path / "W")
     capsys.readouterr()

@@ -22,7 +22,7 @@ from mien.tracking import (
 )
 from mien.tracking.pixels import SkinTexture, even_light, model_pictures, window_of
 from mien.tracking.pixels.outcome import appearance_in_world, turn_light
-from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames, worst_of_runs
+from mien.tracking.report.contact_sheet import sheet_frames, sheet_rows, worst_of_runs
 from mien.tracking.report.heat import heat_map
 from mien.tracking.report.overlay import OverlayPainter, overlay_stride
 from mien.tracking.report.page import findings, name_runs
@@ -139,8 +139,13 @@ def test_the_sheet_has_what_stands_out(case, truth):
     frames = sheet_frames(odd, flagged=[3, 4], alone=[1])
     assert [frame.timestep for frame in frames] == sorted({frame.timestep for frame in frames})
     assert {frame.timestep: frame.why for frame in frames if frame.why} == {4: "flagged", 1: "landmarks only"}
-    sheet = contact_sheet(case.capture, odd, case.model, frames)
-    assert sheet.shape[1] > 4 * 240
+    rows = sheet_rows(case.capture, odd, case.model, frames)
+    assert [(row.name, row.odd) for row in rows if row.odd] == [
+        ("Frame 1, landmarks only", True),
+        ("Frame 4, flagged", True),
+    ]
+    assert {tile.shape for row in rows for tile in row.tiles} == {(240, 240, 3)}
+    assert {len(row.tiles) for row in rows} == {4}
     assert worst_of_runs([2, 3, 7], np.array([0, 0, 1, 5, 0, 0, 0, 3.0])) == [3, 7]
     assert name_runs([3, 7, 8, 9, 12]) == "3, 7-9, 12"
 
@@ -162,7 +167,11 @@ def test_the_page_says_aloud_what_decided(case, truth, tmp_path, schedule, appea
     assert said in told
     page = (tmp_path / "report.html").read_text()
     assert said in page
-    assert page.count("data:image/") == 2
+    panels = 4 if appearance else 2
+    assert page.count("data:image/") == panels * page.count('<figure class="card">') + 1, "all panels, and the poster"
+    assert page.index("<video") < page.index("Findings")
+    assert page.count("<svg") == (5 if appearance else 4)
+    assert 'class="dot second"' in page or not residual_report(case.capture, shown, case.model)["flagged_frames"]
     odd = [text for kind, text in findings(shown, residual_report(case.capture, shown, case.model)) if kind == "odd"]
     assert (said in odd) or said.split(" so ")[0] in " ".join(odd) or schedule == "landmarks" or alone == 0
 

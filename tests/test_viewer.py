@@ -249,6 +249,19 @@ def test_the_filmed_frame_is_beside_the_avatar(session: Session) -> None:
     assert (frame[2, :20] == 128).all()
 
 
+def test_both_heads_have_one_size(session: Session) -> None:
+    avatar = session.avatar
+    clip = clip_of(avatar)
+    rest = to_rgb(runtime.render(runtime.pose(avatar.portable.baked, clip.motion.face(0)), avatar.camera)[0])
+    beside_it = Session(avatar, None, {"clip": lambda: replace(clip, pictures=lambda timestep: rest)})
+    beside_it.choose("clip")
+    beside_it.show(side_by_side=True)
+    for width, height in ((96, 128), (400, 128)):
+        picture = beside_it.picture(front_view(avatar, width, height))
+        filmed, drawn = (np.argwhere((half < 250).any(-1)) for half in np.split(picture, 2, axis=1))
+        np.testing.assert_allclose(np.ptp(filmed, 0), np.ptp(drawn, 0), atol=4)
+
+
 def test_words_tell_which_side_was_filmed(session: Session) -> None:
     face, view = session.avatar.face(head_rotation=(0, 0, 0), head_translation=(0, 0, 0)), View(np.eye(4), 0.5, 9, 9)
     limits = np.radians(np.array([[-30, 40], [-10, 10]])).astype(np.float32)

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gzip
 import http.client
 import json
 import os
@@ -110,6 +111,18 @@ def until(done: Callable[[], bool]) -> None:
     while not done():
         assert time.monotonic() < ends, "it never came"
         time.sleep(0.01)
+
+
+def test_the_page_does_not_look_for_a_gpu_and_folds_its_panel_on_phones(serving: Serving) -> None:
+    for encoding in ("identity", "gzip"):
+        status, headers, body = request(
+            serving.port, "/index.html", Cookie=serving.door.cookie, **{"Accept-Encoding": encoding}
+        )
+        page = gzip.decompress(body) if headers["Content-Encoding"] == "gzip" else body
+        assert (status, headers["Content-Length"]) == (200, str(len(body)))
+        assert page.index(b"<script>\n// mien draws the pictures") == page.index(b"<script"), "it runs before viser's"
+        assert b"WEBGL_debug_renderer_info" in page
+        assert b"max-width: 36em" in page
 
 
 def test_two_clients_see_their_own_views_and_one_may_vanish(serving: Serving, session: Session) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from mien import runtime
-from mien.export import write_packed
+from mien.export import write_glb, write_packed
+from test_glb import mesh_model
 from test_web import picture, psnr
 from web_case import WEB, browse, build, chromium, drawn_head, node
 
@@ -84,7 +85,9 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
         script("avatar.remove(); const gone = avatar.viewer; document.body.append(avatar);", LOADED, "return gone;"),
         script(
             "const told = new Promise((done) => avatar.addEventListener('error', (event) => done(event.detail)));",
-            "avatar.src = 'nobody.packed'; return told;",
+            "avatar.src = 'nobody.packed'; const said = await told, box = avatar.shadowRoot;",
+            "const words = box.querySelector('p[part=error][role=alert]').textContent;",
+            "return [said, words, box.querySelectorAll('canvas').length];",
         ),
     ]  # fmt: skip
     with served(site) as address:
@@ -101,7 +104,8 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
     assert psnr(picture(turned)[..., :3], wide) < 30
     assert facts == ["img", "Avatar of drawn", False, 0]
     assert gone is None
-    assert error == "nobody.packed cannot be fetched: the server answers 404"
+    words = "nobody.packed cannot be fetched: the server answers 404"
+    assert error == [words, words, 0], "the box says it, too"
     assert all(request.startswith(address) for request in told["requests"])
     # Once for the page, and once when it came back.
     assert sum(request.endswith("me.packed") for request in told["requests"]) == 2
@@ -178,6 +182,56 @@ def test_an_avatar_stands_in_a_scene_of_three(site: Path) -> None:
             assert np.abs(scene - alone).max(-1)[near_blue][solid].max() < 0.03
 
 
+DROP = """
+  const words = document.getElementById("words"), data = new DataTransfer();
+  data.items.add(new File([await (await fetch("%s")).arrayBuffer()], "%s"));
+  dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
+  while (!/drag it|cannot|is not/.test(words.textContent)) await new Promise((done) => setTimeout(done, 50));
+"""
+SEEN = """
+  for (let i = 0; i < 4; ++i) await new Promise(requestAnimationFrame);
+  const faces = document.querySelectorAll("nav button").length;
+  return [words.textContent, document.querySelector("canvas").toDataURL(), faces];
+"""
+
+
+@pytest.mark.slow
+def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
+    """A .packed, a .mien and a .glb show the same person, and a face moves it; anything else is told."""
+    drawn = drawn_head(2000)
+    write_packed(site / "same.packed", drawn)
+    runtime.write_portable(site / "same.mien", drawn)
+    write_glb(site / "same.glb", drawn, mesh_model(drawn), 64)
+    (site / "none.txt").write_text("nobody")
+    (site / "playground.html").write_text((EXAMPLES / "playground.html").read_text())
+    kept = """
+      const get = HTMLCanvasElement.prototype.getContext;
+      HTMLCanvasElement.prototype.getContext = function (kind, made) {
+        return get.call(this, kind, { ...made, preserveDrawingBuffer: true });
+      };
+    """
+    names = ("same.packed", "same.mien", "same.glb", "none.txt")
+    steps = [script(DROP % (name, name), SEEN) for name in names[:3]]
+    steps += [script("document.querySelector('nav button').click(); const words = { textContent: '' };", SEEN)]
+    steps += [script(DROP % (names[3], names[3]), SEEN)]
+    with served(site) as address:
+        told = browse(f"{address}/playground.html", steps, size=(600, 700), opening=kept)
+    packed, mien, glb, smiling, none = told["results"]
+    assert [words for words, _, _ in (packed, mien, glb)] == [
+        f"{name}: drag it, or press a face." for name in names[:3]
+    ]
+    # Colours of clear pixels are rounded, so they count by their alpha.
+    by_packed, by_mien, by_glb, smile = (
+        picture(url)[..., :3] * picture(url)[..., 3:] for _, url, _ in (packed, mien, glb, smiling)
+    )
+    assert by_packed.std() > 0.05, "somebody is seen"
+    assert psnr(by_packed, by_mien) >= 40
+    np.testing.assert_array_equal(by_mien, by_glb)
+    assert glb[2] > 5
+    assert psnr(smile, by_glb) < 45
+    assert none[0] == "none.txt is not a .mien file"
+
+
 def scene_camera(turn: float, side: int) -> runtime.Camera:
     """The camera of the example, which looks at the origin from 0.8 m, with OpenCV's axes."""
     eye = np.array([0.8 * np.sin(turn), 0.05, 0.8 * np.cos(turn)])
@@ -197,6 +251,8 @@ def test_the_package_has_what_it_promises() -> None:
     node()
     package = json.loads((WEB / "package.json").read_text())
     assert "dependencies" not in package
+    readme = (WEB / "README.md").read_text()
+    assert "](" not in readme.replace("](https://", ""), "links to files of the repository lead nowhere on npm"
     assert (WEB / "LICENSE").read_text() == (WEB.parent / "LICENSE").read_text()
     subprocess.run(["npm", "run", "build", "--prefix", str(WEB)], check=True, capture_output=True)
     done = subprocess.run(

@@ -3,7 +3,7 @@
 The pages are those of docs/, README.md, CONTRIBUTING.md, SECURITY.md, CHANGELOG.md and the pages beside code. They are
 copied into one folder, and the links between them are changed to match. A page is added for each room of the public
 API, and for each file of code that a page links. docs/README.md becomes the front page, and its sections become the
-menu.
+menu. If `make demo` has drawn its person, the front page shows that avatar, alive.
 
 Any warning of Sphinx (a link, a heading or a reference that leads nowhere) fails the build, and so does a path of this
 machine in the result. External links are not opened.
@@ -41,6 +41,15 @@ _LINK = re.compile(r"(?P<before>\]\()(?P<target>[^)\s#:]+)(?P<after>(#[^)\s]*)?\
 _CODE = {".py": "python", ".h": "cpp", ".cpp": "cpp", ".toml": "toml"}
 _LONGEST_VALUE = 88
 """Longest value of a constant that the reference shows, in characters."""
+_PICTURE = re.compile(r"^!\[[^\]]*\]\([./\w]*images/demo\.jpg\)$", re.MULTILINE)
+"""The picture of the front page, below which the living avatar stands."""
+_LIVING = """
+
+```{raw} html
+<iframe class="living" src="avatar.html" title="A drawn person as a living avatar" loading="lazy"></iframe>
+```"""
+_MOST_BYTES = 1_200_000
+"""Largest page of an avatar that the front page shows, in bytes."""
 _REFERENCE = "| Reference |"
 """Where the front page names the reference, which exists in the site only."""
 
@@ -55,14 +64,17 @@ def pages() -> dict[str, str]:
     return {**below_docs, FRONT: "index.md", **_BESIDE_CODE}
 
 
-def copy_pages(to: Path) -> None:
-    """Copy every page, and whatever it links."""
+def copy_pages(to: Path, living: bool) -> None:
+    """Copy every page, and whatever it links. The front page shows a living avatar if there is one."""
     for source, name in pages().items():
         text = _with_links_of_the_site((ROOT / source).read_text("utf-8"), source, name, to)
         if source == FRONT:
             assert _REFERENCE in text
             text = text.replace(_REFERENCE, "| [Reference](reference.md) |")
             text += _menu(text)
+            if living:
+                assert _PICTURE.search(text)
+                text = _PICTURE.sub(lambda match: match[0] + _LIVING, text, count=1)
         _write(to / name, text)
 
 
@@ -174,17 +186,31 @@ def marks_in_the_reference(site: Path) -> list[str]:
     return [str(page.relative_to(site)) for page in pages if "Annotated[" in page.read_text("utf-8")]
 
 
-def build(out: Path) -> int:
-    """Build the site into `out`, and return the exit code."""
+def is_small(avatar: Path) -> bool:
+    """Whether there is a page of an avatar that the front page can show. If not, say why."""
+    if not avatar.is_file():
+        print(f"The front page has no living avatar: {avatar} is made by `make demo`; then run `make docs` again.")
+        return False
+    if avatar.stat().st_size > _MOST_BYTES:
+        print(f"The front page has no living avatar: {avatar} has more than {_MOST_BYTES:,} bytes.")
+        return False
+    return True
+
+
+def build(out: Path, avatar: Path) -> int:
+    """Build the site into `out`, with the page of an avatar if there is one, and return the exit code."""
     work = out.with_name(out.name + "-pages")
     for folder in (work, out):
         shutil.rmtree(folder, ignore_errors=True)
-    copy_pages(work)
+    living = is_small(avatar)
+    copy_pages(work, living)
     write_reference(work)
     (out.parent).mkdir(parents=True, exist_ok=True)
     arguments = ["-b", "html", "-q", "-W", "--keep-going", "-c", str(Path(__file__).parent)]
     code = sphinx_build([*arguments, "-d", str(work / "_doctrees"), str(work), str(out)])
     (out / ".buildinfo").unlink(missing_ok=True)
+    if living:
+        shutil.copyfile(avatar, out / "avatar.html")
     leaks = paths_of_this_machine(out)
     for name in leaks:
         print(f"{out / name} holds a path of this machine", file=sys.stderr)
@@ -202,4 +228,6 @@ def _write(path: Path, text: str) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "docs", help="folder of the site")
-    sys.exit(build(parser.parse_args().out))
+    parser.add_argument("--avatar", type=Path, default=ROOT / "out" / "demo" / "me.html", help="page of a drawn person")
+    given = parser.parse_args()
+    sys.exit(build(given.out, given.avatar))

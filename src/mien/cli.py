@@ -15,6 +15,7 @@ import tempfile
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mien
 from mien.bounded import MAX_SIDE
@@ -166,7 +167,7 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
-    from mien.commands.help_text import list_options, readable, without_details
+    from mien.commands.help_text import at_a_glance, list_options, readable, without_details
     from mien.commands.options import settings_groups, with_settings
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
@@ -181,13 +182,15 @@ def _run(name: str, rest: list[str]) -> int:
         options = readable(with_settings(module.Command, rest))
     elif "-h" in rest or "--help" in rest:
         options, groups = without_details(module.Command)
-        options = readable(options)
+        glance = at_a_glance(module.Command, name)
+        options = readable(glance or options)
         further, words = settings_groups(module.Command, rest)
         names = ", ".join(f"--{group}.*" for group in groups + further)
+        names += ", and others" if glance is not None else ""
         more = f"More options ({names}): mien {name}{words} --help-all" if names else ""
     else:
         options = with_settings(module.Command, rest)
-    complaints = io.StringIO()
+    complaints, style = io.StringIO(), (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     try:
         with contextlib.redirect_stderr(complaints):
             command = tyro.cli(
@@ -195,14 +198,14 @@ def _run(name: str, rest: list[str]) -> int:
                 prog=f"mien {name}",
                 description=inspect.getdoc(module.Command),
                 args=rest,
-                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
+                config=style,
             )
     except SystemExit as stop:
         if stop.code != EXIT_USER_ERROR:
             if more:
                 show(more)
             raise
-        complaint = _in_one_line(complaints.getvalue())
+        complaint = _with_near_options(_in_one_line(complaints.getvalue()), options, style)
         # The short help leaves out the options of groups, whose names have a dot.
         every = "-all" if re.search(r"--[a-z-]+\.[a-z]", complaint) else ""
         raise UserError(f"{complaint}; see mien {name} --help{every}") from None
@@ -233,6 +236,22 @@ def _in_one_line(box: str) -> str:
             comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
             parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
     return "; ".join(_reworded(part.rstrip(".")) for part in parts if part and not part.startswith(_USELESS))
+
+
+def _with_near_options(complaint: str, options: type, style: Any) -> str:
+    """A complaint of unknown options, with the known ones that look like them."""
+    unknown = re.search(r"unknown: ([^;]*)", complaint)
+    if unknown is None or "did you mean" in complaint:
+        return complaint
+    import tyro
+
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+        tyro.cli(options, args=["--help"], config=style)
+    known = re.findall(r"^\W*(--[a-z][\w.-]*)", shown.getvalue(), re.MULTILINE)
+    typed = [word for word in unknown[1].split(", ") if word.startswith("--")]
+    near = [found for word in typed for found in difflib.get_close_matches(word, known, 1)]
+    return f"{complaint}; did you mean {', '.join(dict.fromkeys(near))}?" if near else complaint
 
 
 def _reworded(complaint: str) -> str:

@@ -8,7 +8,7 @@ import { Viewer } from "./viewer";
 import type { BackendName } from "./webgpu";
 
 const RADIANS = Math.PI / 180;
-const STYLE = ":host{display:inline-block;width:320px;height:320px}canvas{display:block;width:100%;height:100%;outline-offset:-2px}:host([controls]) canvas{touch-action:none;cursor:grab}";
+const STYLE = ":host{display:inline-block;width:320px;height:320px}canvas{display:block;width:100%;height:100%;outline-offset:-2px}p{margin:0;padding:1em;font:14px/1.4 system-ui,sans-serif;overflow-wrap:anywhere}:host([controls]) canvas{touch-action:none;cursor:grab}";
 
 /**
  * An avatar as an element. Attributes:
@@ -18,7 +18,8 @@ const STYLE = ":host{display:inline-block;width:320px;height:320px}canvas{displa
  * `backend`: `auto` or `webgpu` loads webgpu.js, which lies beside this file; without it, WebGL2 draws.
  * `controls`: may be turned by hand. `idle`: blinks and moves a little.
  *
- * Events: `load` when it can be seen, `error` (a CustomEvent whose detail is the message) when it cannot.
+ * Events: `load` when it can be seen, `error` (a CustomEvent whose detail is the message) when it cannot. The message is
+ * also in its box, as `::part(error)` for CSS.
  */
 export class MienAvatar extends HTMLElement {
   static readonly observedAttributes = ["src", "expression", "yaw", "pitch", "zoom", "idle"];
@@ -87,6 +88,23 @@ export class MienAvatar extends HTMLElement {
     this.viewer = this.loading = null;
   }
 
+  private show(content: HTMLElement): void {
+    const style = document.createElement("style");
+    style.textContent = STYLE;
+    (this.shadowRoot ?? this.attachShadow({ mode: "open" })).replaceChildren(style, content);
+  }
+
+  /** Shows a message where the avatar would be. */
+  private tell(words: string): void {
+    this.viewer?.dispose();
+    this.viewer = null;
+    const text = document.createElement("p");
+    text.textContent = words;
+    text.setAttribute("part", "error");
+    text.setAttribute("role", "alert");
+    this.show(text);
+  }
+
   private async open(): Promise<void> {
     this.close();
     if (!this.src) return;
@@ -98,10 +116,8 @@ export class MienAvatar extends HTMLElement {
       const named = this.getAttribute("backend") as BackendName | null;
       const backend = named && named !== "webgl2" ? await webgpu(named) : undefined;
       if (loading.signal.aborted) return;
-      const root = this.shadowRoot ?? this.attachShadow({ mode: "open" }), canvas = document.createElement("canvas");
-      const style = document.createElement("style");
-      style.textContent = STYLE;
-      root.replaceChildren(style, canvas);
+      const canvas = document.createElement("canvas");
+      this.show(canvas);
       if (!this.hasAttribute("aria-label")) this.setAttribute("aria-label", `Avatar of ${avatar.about.name}`);
       const viewer = (this.viewer = new Viewer(canvas, avatar, motion, backend));
       if (this.hasAttribute("controls")) {
@@ -118,6 +134,7 @@ export class MienAvatar extends HTMLElement {
       if (loading.signal.aborted) return;
       const { message } = error as Error;
       const detail = error instanceof AvatarError ? `${this.src} ${message}` : `${this.src} cannot be shown: ${message}`;
+      this.tell(detail);
       this.dispatchEvent(new CustomEvent("error", { detail }));
     }
   }
@@ -158,6 +175,22 @@ const webgpu = (named: BackendName) =>
   import("./webgpu.js").then(({ findBackend }) => findBackend(named), (error) => void console.warn(`<mien-avatar>: ${error.message}; WebGL2 draws instead`));
 
 if (!customElements.get("mien-avatar")) customElements.define("mien-avatar", MienAvatar);
+
+/** The events of the element beside those of all elements. */
+export interface MienAvatarEvents {
+  load: Event;
+  error: CustomEvent<string>;
+}
+
+type Listener<K extends keyof MienAvatarEvents> = (this: MienAvatar, event: MienAvatarEvents[K]) => void;
+
+// Its events have types of their own: `event.detail` of "error" is the message.
+export interface MienAvatar {
+  addEventListener<K extends keyof MienAvatarEvents>(type: K, listener: Listener<K>, options?: boolean | AddEventListenerOptions): void;
+  addEventListener(type: string, listener: EventListenerOrEventListenerObject, options?: boolean | AddEventListenerOptions): void;
+  removeEventListener<K extends keyof MienAvatarEvents>(type: K, listener: Listener<K>, options?: boolean | EventListenerOptions): void;
+  removeEventListener(type: string, listener: EventListenerOrEventListenerObject, options?: boolean | EventListenerOptions): void;
+}
 
 declare global {
   interface HTMLElementTagNameMap {

@@ -24,8 +24,8 @@ class Command:
     Live Link Face, a .json of blend shapes, a voice (.wav, .mp3, ...), or camera, which opens a viewer (docs/using.md).
     camera:/dev/video0 names the device; camera:clip.mp4 plays a file as a camera."""
     out: Path | None = None
-    """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left. A camera
-    needs none; with an .mp4, it is recorded."""
+    """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left. Without
+    it, a viewer in the browser plays the motion. A camera is recorded as .mp4."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the avatar's run (default: the only one)."""
     sequence: str | None = None
@@ -47,7 +47,7 @@ class Command:
     camera_format: CameraFormat | None = None
     """What reads the camera: v4l2 (Linux), avfoundation (macOS) or dshow (Windows). The default is the platform's."""
     port: int = 0
-    """Port of the camera's viewer, from 1 to 65535. 0 means a free one."""
+    """Port of the viewer, from 1 to 65535. 0 means a free one."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
     def check(self) -> None:
@@ -55,15 +55,29 @@ class Command:
         if is_camera(self.by):
             self._check_camera()
             return
-        if self.camera_format is not None or self.port:
-            raise UserError(f"--camera-format and --port: are for --by camera, and --by is {self.by}; leave them out")
+        if self.camera_format is not None:
+            raise UserError(f"--camera-format: is for --by camera, and --by is {self.by}; leave it out")
         open_workspace(self.workspace).pick_run(self.run_name)
         if self.out is None:
-            raise UserError(f"--by {self.by}: needs --out FILE.mp4; to watch it in a browser, use `mien view --play`")
-        # The number of frames is known only after tracking, but a video or numbered pictures take any number.
-        self.picture.plan(self.out, 2)
+            self._check_viewer()
+        elif self.port:
+            raise UserError(f"--port {self.port}: is for the viewer, and --out writes a file; leave one of them out")
+        else:
+            # The number of frames is known only after tracking, but a video or numbered pictures take any number.
+            self.picture.plan(self.out, 2)
         check_driver(Path(self.by), self.sequence, self.fps)
         check_neutral(self.neutral)
+
+    def _check_viewer(self) -> None:
+        """Check that the viewer can show it, which has no options of pictures."""
+        check_port(self.port)
+        check_viewer()
+        films = {"--sequence": self.sequence, "--fps": self.fps, "--no-head-pose": not self.head_pose}
+        films |= {"--unlimited": self.unlimited, "--alone": self.alone}
+        films["the options of pictures"] = self.picture != PictureOptions()
+        given = [name for name, value in films.items() if value not in (None, False)]
+        if given:
+            raise UserError(f"{', '.join(given)}: needs --out FILE.mp4, because the viewer does without; add it")
 
     def _check_camera(self) -> None:
         check_avatar(self.workspace, self.run_name)
@@ -78,17 +92,25 @@ class Command:
             raise UserError(f"--out {self.out}: a camera is recorded as .mp4; choose such a name")
 
     def run(self) -> None:
-        """Track the driver if necessary, then pose and render every timestep. Follow a camera until Ctrl-C."""
+        """Track the driver if necessary, then pose and render every timestep. A viewer shows it until Ctrl-C."""
         if is_camera(self.by):
             self._follow()
             return
         from mien.commands.stages.driving import DriveOptions, run_driving_stage
 
-        assert self.out is not None, "checked"
+        if self.out is None:
+            self._show()
+            return
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps, self.unlimited, self.neutral)
         run_driving_stage(run_dir, Path(self.by), self.out, options, self.picture)
+
+    def _show(self) -> None:
+        from mien.commands.stages.viewing import Motions, Place, run_viewing_stage
+
+        motions = Motions(self.by, self.neutral, at_once=True)
+        run_viewing_stage(self.workspace, self.run_name, motions, Place("127.0.0.1", self.port))
 
     def _follow(self) -> None:
         from mien.commands.stages.following import CameraOptions, run_following_stage

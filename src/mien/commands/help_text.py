@@ -15,6 +15,8 @@ _COMMON = {
     "scoring": (),
 }
 """Common fields of each group of settings, by the prefix of the group's options."""
+_FIRST = {"create": ("out", "name", "preset", "method", "device", "view")}
+"""Commands for newcomers: the only options that their help shows, so that it can be read at a glance."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,12 @@ class OtherValues:
     """A mark beside an option: the values that presets give it, such as "paper: white", for the help."""
 
     texts: tuple[str, ...]
+
+
+def at_a_glance(command: type, name: str) -> type | None:
+    """The few options of a command that newcomers need, or None if its help is short anyway. The others stay hidden."""
+    kept = _FIRST.get(name)
+    return None if kept is None else _only(command, kept)
 
 
 def without_details(command: type) -> tuple[type, list[str]]:
@@ -49,6 +57,25 @@ def without_details(command: type) -> tuple[type, list[str]]:
             shown[name] = Annotated[(settings, *marks)] if marks else settings
     defaults = {name: field(default_factory=getattr(hint, "__origin__", hint)) for name, hint in shown.items()}
     return subclass_with(command, shown, defaults), groups
+
+
+def _only(options: type, kept: tuple[str, ...]) -> type:
+    """The same options without any but `kept`, also in groups, and without hiding positional arguments."""
+    import tyro
+
+    changed: dict[str, Any] = {}
+    defaults: dict[str, Any] = {}
+    hints = get_type_hints(options, include_extras=True)
+    for one in fields(options):
+        kind, *marks = _unwrapped(hints[one.name])
+        if isinstance(kind, type) and is_dataclass(kind):
+            part = _only(kind, kept if any(getattr(mark, "name", None) == "" for mark in marks) else ())
+            changed[one.name] = Annotated[(part, *marks)] if marks else part
+            defaults[one.name] = field(default_factory=part)
+        elif one.name not in kept and tyro.conf.Positional not in marks:
+            changed[one.name] = Annotated[hints[one.name], tyro.conf.Suppress]
+            defaults[one.name] = _default_of(one)
+    return subclass_with(options, changed, defaults)
 
 
 def _hiding(settings: type, kept: tuple[str, ...]) -> type:

@@ -109,6 +109,15 @@ class DrivingConstants:
     """Largest coefficient of wide lips."""
     speech_less_jaw: float = 0.6
     """Share of the jaw's opening that high sounds take away."""
+    speech_press: float = 0.3
+    """Largest coefficient of pressed lips, at p, b and m."""
+    speech_shut_within: float = 0.14
+    """Time within which sound is as loud before and after a drop at which lips shut, in seconds."""
+    speech_shut_drop: tuple[float, float] = (4.0, 9.0)
+    """Drops of the loudness in dB from which on lips begin to shut, and at which they are shut. With both, 9 in 10 of
+    p, b and m of synthesised speech shut the lips (tests/test_driving_by_speech.py); without, 3 in 10."""
+    speech_shut_hiss: float = 3.0
+    """How much energy at high frequencies keeps lips open, as at s: from its inverse on, they are."""
     speech_sway: tuple[float, float, float] = (0.012, 0.02, 0.008)
     """Sizes of the head's slow waves about x, y and z, in radians."""
     speech_blink_every: float = 3.5

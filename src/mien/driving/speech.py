@@ -2,7 +2,8 @@
 
 It knows no words, so it makes mouths that fit the rhythm of speech, not its sounds. Loudness is in dB above the noise
 floor of the file, because the ear hears it so and because recordings differ. Where most energy is at high frequencies
-(s, sh, i), the mouth is wide and less open; where it is at low ones (o, u), the lips are rounded.
+(s, sh, i), the mouth is wide and less open; where it is at low ones (o, u), the lips are rounded. Where the sound drops
+for a moment (p, b, m), the lips shut.
 """
 
 import math
@@ -33,7 +34,8 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
     """The motion for a sound with one channel and `mien.capture.sound.RATE` samples a second, -1..1."""
     count = max(1, math.ceil(len(samples) / RATE * FPS))
     loudness, low, high = _measured(samples, count)
-    opening = _smooth(_opening(loudness))
+    shut = _shut(loudness, high)
+    opening = _smooth(_opening(loudness)) * (1 - shut)
     low, high = _smooth(low), _smooth(high)
     seconds = np.arange(count) / FPS
     blink = np.array([blink_at(moment) for moment in seconds])
@@ -46,6 +48,8 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
         "mouthFunnel": DRIVING.speech_funnel * opening * low,
         "mouthStretchLeft": DRIVING.speech_stretch * opening * high,
         "mouthStretchRight": DRIVING.speech_stretch * opening * high,
+        "mouthPressLeft": DRIVING.speech_press * shut,
+        "mouthPressRight": DRIVING.speech_press * shut,
         "eyeBlinkLeft": blink,
         "eyeBlinkRight": blink,
     }
@@ -90,6 +94,21 @@ def _opening(loudness: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
     )
     above = (loudness - floor) / (loud - floor)
     return np.clip((above - DRIVING.speech_gate) / (1 - DRIVING.speech_gate), 0, 1) ** DRIVING.speech_exponent
+
+
+def _shut(loudness: Float[np.ndarray, " t"], high: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """How shut the lips are in the midst of speech, 0..1: at p, b and m, sound drops for a moment, but does not hiss.
+
+    So it does at t and k, behind open lips. The mouth shuts there, too, for a tenth of a second.
+    """
+    reach = round(DRIVING.speech_shut_within * FPS)
+    around = np.pad(loudness, reach, constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(around, reach + 1)
+    drop = np.minimum(windows[: len(loudness)].max(1), windows[reach:].max(1)) - loudness
+    least, most = DRIVING.speech_shut_drop
+    found = np.clip((drop - least) / (most - least), 0, 1) * (1 - np.clip(DRIVING.speech_shut_hiss * high, 0, 1))
+    spread = np.pad(found, 1, mode="edge")
+    return np.maximum(found, 0.5 * np.maximum(spread[:-2], spread[2:]))
 
 
 def _smooth(values: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:

@@ -2,16 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
+import numpy as np
+
+from mien.capture.video import read_video_frames
 from mien.errors import UserError
-from mien.evaluation.compare import Comparison, Row, Table
+from mien.evaluation.compare import Comparison, Row, ScoredRun, Table
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
+from mien.evaluation.living import FILM
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import COLUMNS, figure
 from mien.evaluation.page import (
     GLOSSARY,
+    Card,
     Cell,
     DataTable,
     Picture,
@@ -22,7 +28,8 @@ from mien.evaluation.page import (
 )
 from mien.evaluation.report_sections import frame_name
 from mien.pages import render
-from mien.pictures import Box, error_heat, to_uint8
+from mien.pictures import Box, data_uri, error_heat, picture_uri, to_uint8
+from mien.plots import Axes, Series, line_chart
 from mien.progress import track_progress
 from mien.storage import write_atomically
 from mien.training.footage import Frame
@@ -31,6 +38,8 @@ _FRAMES = 5
 _PICTURE_SIZE = 320
 _MAX_RUNS = 8
 _PARTS = (None, "head")
+_STYLES = ("main", "second", "third", "fourth")
+"""Styles of the curves of the first runs. Those of more runs are quiet."""
 
 
 def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[Path, Sequence[Path]]) -> None:
@@ -41,7 +50,8 @@ def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[
         comparison: The comparison to show.
         sequence_dirs: The folders of the sequences of each run, by the run's folder.
     """
-    text = comparison_html(comparison, [_pictures(table, sequence_dirs) for table in comparison.tables])
+    frames = [_pictures(table, sequence_dirs) for table in comparison.tables]
+    text = comparison_html(comparison, frames, _films(comparison.runs, path.parent))
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
@@ -55,18 +65,53 @@ class _DrawnFrame:
     notes: Sequence[str]
 
 
-def comparison_html(comparison: Comparison, frames: Sequence[Sequence[_DrawnFrame]]) -> str:
+@dataclass(frozen=True)
+class _Film:
+    """The film of a run's avatar in motion."""
+
+    label: str
+    poster: str
+    """Data URI of its first picture."""
+    source: str
+    """Data URI."""
+
+
+def comparison_html(
+    comparison: Comparison, frames: Sequence[Sequence[_DrawnFrame]], films: Sequence[_Film] = ()
+) -> str:
     """The page as text. `frames` holds the drawn frames of each table."""
     return render(
         "evaluation/templates/compare.html",
         runs=", ".join(run.label for run in comparison.runs),
+        films=films,
         warnings=comparison.warnings,
         sections=[
-            {"heading": _heading(table), "table": _data_table(table), "frames": shown}
+            {"heading": _heading(table), "table": _data_table(table), "chart": _chart(table), "frames": shown}
             for table, shown in zip(comparison.tables, frames, strict=True)
         ],
         glossary=GLOSSARY,
     )
+
+
+def _films(runs: Sequence[ScoredRun], page_folder: Path) -> list[_Film]:
+    """The films of the first runs that have one. All show the same motion, so they can be watched side by side."""
+    found = [(run.label, run.run_dir / FILM) for run in runs if (run.run_dir / FILM).is_file()]
+    return [
+        _Film(label, picture_uri(next(read_video_frames(path))[1]), data_uri("video/mp4", path.read_bytes()))
+        for label, path in found[:_MAX_RUNS]
+    ]
+
+
+def _chart(table: Table) -> Card:
+    """PSNR on the head crop of every held-out frame, by run."""
+    runs = [row.run for row in table.rows if row.run is not None]
+    series = []
+    for run, style in zip_longest(runs, _STYLES[: len(runs)], fillvalue="quiet"):
+        assert not isinstance(run, str)
+        values = np.array(run.metrics["protocols"][table.protocol]["per_frame"]["head_psnr"], dtype=np.float64)
+        series.append(Series(run.label, np.arange(len(values), dtype=np.float64), values, style))
+    title = "PSNR on the head crop, dB, over the held-out frames in order"
+    return Card(title, line_chart(series, Axes("held-out frame", "PSNR, head crop, dB", 1080, 260)))
 
 
 def _heading(table: Table) -> str:

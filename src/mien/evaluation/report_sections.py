@@ -15,9 +15,9 @@ from mien.evaluation.living import SIDE, strip, to_bytes
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import BASELINE_NAMES
 from mien.evaluation.page import Card, Cell, DataTable, Picture, Video, figure_text, picture_of, video_of
-from mien.evaluation.plots import Axes, Series, line_chart
 from mien.evaluation.protocols import AVATAR, MESH, Evaluation
 from mien.pictures import Box, error_heat, picture_uri, to_uint8
+from mien.plots import Axes, Series, line_chart
 from mien.render.mesh import render_mesh
 from mien.training.footage import Coverage, Frame, confidence_picture, filmed_words
 

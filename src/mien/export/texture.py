@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,6 +30,9 @@ pixel of an inclined surface has. Lids are thin."""
 _LEAST_COSINE = 0.15
 _LEAST_ALPHA = 0.5
 """Least cosine between the normal and the direction to the camera, and least alpha, with which a texel is taken."""
+_BEHIND = 0.025
+"""Depth in metres behind a texel up to which the mean depth of what is drawn there may lie. Beyond it, a picture shows
+what is behind a thin surface, such as the mouth through the nape."""
 _LITTLE = 1e-5
 """Weight of the colour of the nearest Gaussians, which decides where no picture shows the surface."""
 _NEAREST, _CHUNK = 8, 512
@@ -65,7 +68,8 @@ class Shot:
 def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[np.ndarray, "s s 3"]:
     """A texture [size, size], 0..1, with its first row at v = 1: the colours of the Gaussians as one sees them outside.
 
-    Each texel is the mean over the views that see it, weighted by how squarely they do. Surfaces that no view sees
+    Each texel is the mean over the views that see it, weighted by how squarely they do. A view that sees through a thin
+    surface, such as the faded nape, sees what is behind it, and does not count. Surfaces that no view sees
     have the mean colour of the Gaussians nearest to their triangle in the first pose.
 
     Args:
@@ -110,10 +114,11 @@ def _seen(
     """The colours of points in one picture, and their weights."""
     plain = runtime.Camera(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
     image, alpha = map(torch.from_numpy, runtime.render(shot.gaussians, plain, (0.0, 0.0, 0.0)))
+    drawn = torch.from_numpy(runtime.render(_with_depths(shot.gaussians, camera), plain, (0.0, 0.0, 0.0))[0])
     depth = rasterize_mesh(shot.vertices, surface.faces, camera).depth.nan_to_num(posinf=1e3)
     pixels, ahead = camera.project(points)
     grid = 2 * pixels / torch.tensor([float(camera.width), float(camera.height)]) - 1
-    picture = sample_picture(torch.cat([image, alpha[..., None]], -1), grid, "bilinear")
+    picture = sample_picture(torch.cat([image, alpha[..., None], drawn[..., :1]], -1), grid, "bilinear")
     nearest = sample_picture(depth[..., None], grid, "nearest")[:, 0]
     towards = torch.nn.functional.normalize(camera.position - points, dim=-1)
     cosine = (torch.nn.functional.normalize(normals, dim=-1) * towards).sum(-1)
@@ -125,8 +130,17 @@ def _seen(
         & (opacity > _LEAST_ALPHA)
     )
     usable &= (grid.abs() < 1).all(-1)
+    usable &= picture[:, 4] / opacity.clamp_min(_LEAST_ALPHA) < ahead + _BEHIND
     weight = torch.where(usable, cosine**4, torch.zeros_like(cosine))
     return picture[:, :3] / opacity.clamp_min(_LEAST_ALPHA)[:, None], weight[:, None]
+
+
+def _with_depths(gaussians: runtime.Gaussians, camera: Camera) -> runtime.Gaussians:
+    """The same Gaussians with their depths in metres as colours."""
+    sh = np.zeros((len(gaussians.means), 1, 3), np.float32)
+    depths = camera.project(torch.from_numpy(gaussians.means))[1].numpy()
+    sh[:, 0] = (depths[:, None] - 0.5) / SH_C0
+    return replace(gaussians, sh=sh)
 
 
 def _nearest_colors(surface: Surface, shot: Shot) -> Float[Tensor, "f 3"]:

@@ -51,9 +51,12 @@ class View:
         wide, high = (round(scale * side) for side in (self.width, self.height))
         return min(MAX_SIDE, max(MIN_SIDE, wide)), min(MAX_SIDE, max(MIN_SIDE, high))
 
-    def camera(self, width: int, height: int) -> runtime.Camera:
-        """The camera of a picture of this view. Its shape may differ from that of the canvas."""
-        focal = 0.5 * height / math.tan(0.5 * self.field)
+    def camera(self, width: int, height: int, scale: float = 1.0) -> runtime.Camera:
+        """The camera of a picture of this view. Its shape may differ from that of the canvas.
+
+        `scale` makes what it shows smaller or larger, about the middle.
+        """
+        focal = scale * 0.5 * height / math.tan(0.5 * self.field)
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
         return runtime.Camera(K, self.viewmat.astype(np.float32), width, height)
 
@@ -138,7 +141,7 @@ def beside(
     import cv2
 
     height, width = shown.shape[:2]
-    scale = min(width / filmed.shape[1], height / filmed.shape[0])
+    scale = height / filmed.shape[0] * shrunk(filmed, width, height)
     size = (max(1, round(filmed.shape[1] * scale)), max(1, round(filmed.shape[0] * scale)))
     color = [round(255 * part) for part in BACKGROUNDS[background]]
     left = np.full((height, width, 3), color, np.uint8)
@@ -146,6 +149,14 @@ def beside(
     fitted = cv2.resize(filmed, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
     left[top : top + size[1], start : start + size[0]] = fitted
     return np.concatenate([left, shown], axis=1)
+
+
+def shrunk(filmed: UInt8[np.ndarray, "h w 3"], width: int, height: int) -> float:
+    """How much smaller a filmed frame is that fits a half of the picture than one of the half's height, at most 1.
+
+    The avatar in the other half is drawn as much smaller, so that both heads have one size.
+    """
+    return min(1.0, width * filmed.shape[0] / (filmed.shape[1] * height))
 
 
 def in_corner(seen: UInt8[np.ndarray, "_ _ 3"], shown: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

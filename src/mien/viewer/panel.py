@@ -150,12 +150,14 @@ class Panel:
     def _add_motion(self) -> None:
         gui, session = self._server.gui, self._session
         with gui.add_folder("Motion"):
-            chosen = gui.add_dropdown("Motion", (_NOTHING, *session.clip_names), initial_value=_NOTHING)
-            play = gui.add_button("Play")
-            timeline = self._time = gui.add_slider("Frame", 0, 1, 1, 0)
+            first, clip = session.chosen or _NOTHING, session.clip
+            chosen = gui.add_dropdown("Motion", (_NOTHING, *session.clip_names), initial_value=first)
+            play = gui.add_button("Pause" if session.playing else "Play")
+            last = 1 if clip is None else max(1, len(clip.motion) - 1)
+            timeline = self._time = gui.add_slider("Frame", 0, last, 1, 0)
             filmed = gui.add_checkbox("Filmed frame beside it", False)
         self._play = play
-        before = [_NOTHING]
+        before = [first]
 
         def choose(name: str, client: viser.ClientHandle | None) -> None:
             if name == before[0]:

@@ -27,6 +27,7 @@ from mien.viewer.drawing import View
 from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
 from mien.viewer.messages import MOST_BYTES, Gate
+from mien.viewer.page import adapted
 from mien.viewer.panel import Panel, filmed_from
 from mien.viewer.session import Session, center_of
 
@@ -255,7 +256,10 @@ def _guarded(door: Door, gate: Gate) -> Iterator[None]:
         **named: Any,
     ) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
-            response = _refused(door, request) or process_request(connection, request)
+            response = _refused(door, request)
+            if response is None:
+                given = process_request(connection, request)
+                response = None if given is None else adapted(given)
             if response is not None:
                 response.headers.update(HEADERS)
             return response

@@ -27,6 +27,7 @@ from mien.viewer.drawing import (
     beside,
     draw,
     in_corner,
+    shrunk,
     words_about_view,
 )
 from mien.viewer.faces import random_expression
@@ -75,6 +76,7 @@ class Session:
         self._posed: tuple[Face, runtime.Gaussians] | None = None
         self._version = 0
         self._clip: Clip | None = None
+        self._chosen: str | None = None
         self._timestep = 0
         self._playing_since: float | None = None
         """Time at which timestep 0 was due, or None if nothing plays."""
@@ -96,6 +98,11 @@ class Session:
     def clip(self) -> Clip | None:
         """The chosen motion."""
         return self._clip
+
+    @property
+    def chosen(self) -> str | None:
+        """The name of the chosen motion."""
+        return self._chosen
 
     @property
     def timestep(self) -> int:
@@ -180,7 +187,7 @@ class Session:
             clip = self._clips[name] if name in self._clips else self._makers[name]()
             self._clips[name] = clip
         with self._lock:
-            self._clip, self._playing_since = clip, None
+            self._clip, self._chosen, self._playing_since = clip, name, None
             self._timestep = 0
             self._take(self.avatar.face() if clip is None else clip.motion.face(0))
 
@@ -269,9 +276,11 @@ class Session:
             wide, high = max(1, wide // 2), max(1, high // 2)
         filmed = clip.pictures if clip is not None and side_by_side else None
         with self._drawing:
-            camera = view.camera(wide if filmed is None else max(1, wide // 2), high)
+            frame = None if filmed is None else filmed(timestep)
+            half = max(1, wide // 2)
+            camera = view.camera(wide, high) if frame is None else view.camera(half, high, shrunk(frame, half, high))
             shown = draw(self._gaussians(face), face, self.mesh, look, camera)
-            picture = shown if filmed is None else beside(filmed(timestep), shown, look.background)
+            picture = shown if frame is None else beside(frame, shown, look.background)
             if seen is not self._last_seen:
                 self._drawn = self._last_seen = seen
             return in_corner(seen.picture, picture) if seen is not None and self.with_camera else picture

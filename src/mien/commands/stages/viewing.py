@@ -60,6 +60,8 @@ class Motions:
     """What `mien drive --by` takes."""
     neutral: str | None = None
     """The face at rest of all motions, as `--neutral` names it."""
+    at_once: bool = False
+    """Whether the motion plays as soon as the viewer opens."""
 
 
 def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Place, follow: bool = False) -> None:
@@ -74,6 +76,10 @@ def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Pl
         if motions.play is not None:
             clips[Path(motions.play).name] = clip_of(viewed, Path(motions.play), None, motions.neutral)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
+
+    if motions.play is not None and motions.at_once:
+        session.choose(Path(motions.play).name)
+        session.play(True, time.monotonic())
 
     def ready(address: str) -> None:
         say(f"Open {address} in a browser; Ctrl-C ends the viewer")

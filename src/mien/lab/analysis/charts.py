@@ -1,4 +1,4 @@
-"""Charts as png files, in the colours of the pages (`mien.evaluation.plots` draws the same charts as SVG)."""
+"""Charts as png files, in the colours of the pages (`mien.plots` draws the same charts as SVG)."""
 
 from pathlib import Path
 

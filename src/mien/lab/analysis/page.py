@@ -9,12 +9,12 @@ from markupsafe import Markup
 
 from mien.bounded import read_bytes
 from mien.evaluation.page import Card, Cell, DataTable, Picture, video_of
-from mien.evaluation.plots import line_chart
 from mien.inside import inside
 from mien.lab.analysis.result import chart_from
 from mien.lab.analysis.spec import Analysis
 from mien.pages import render
 from mien.pictures import data_uri
+from mien.plots import line_chart
 from mien.storage import write_atomically
 
 _MAX_PICTURE_BYTES = 64 << 20

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.evaluation.plots import Axes, Series, thin
+from mien.plots import Axes, Series, thin
 
 
 @dataclass(frozen=True)

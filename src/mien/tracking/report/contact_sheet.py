@@ -10,7 +10,6 @@ from jaxtyping import Float, UInt8
 
 from mien.capture.capture import Capture
 from mien.face import FaceModel
-from mien.pictures import picture_grid
 from mien.tracking.report.heat import draw_legend, write_text
 from mien.tracking.report.overlay import OverlayPainter, frontal_camera
 from mien.tracking.tracking import Tracking
@@ -19,8 +18,6 @@ _EVEN, _MAX_FLAGGED, _MAX_ALONE = 8, 8, 4
 """Largest numbers of evenly spread frames, of flagged frames, and of frames tracked from landmarks alone."""
 _TILE = 240
 """Side of each tile, in pixels."""
-_STRIPS = 2
-"""Number of frames side by side."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +28,16 @@ class SheetFrame:
     camera: int
     why: str = ""
     """Why the frame stands out; empty for an evenly spread frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class SheetRow:
+    """A frame of the contact sheet with its panels, which are square and of one size."""
+
+    name: str
+    odd: bool
+    """Whether the frame stands out."""
+    tiles: Sequence[UInt8[np.ndarray, "h w 3"]]
 
 
 def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int]) -> list[SheetFrame]:
@@ -62,30 +69,33 @@ def worst_of_runs(timesteps: Sequence[int], values: Float[np.ndarray, " t"]) -> 
     return sorted(worst, key=lambda one: -known[one])
 
 
-def contact_sheet(
+def sheet_rows(
     capture: Capture, tracking: Tracking, face_model: FaceModel, frames: Sequence[SheetFrame]
-) -> UInt8[np.ndarray, "h w 3"]:
-    """The frames as a grid of strips (see `strip`)."""
+) -> list[SheetRow]:
+    """The pictures of each frame: all panels, cut to the head."""
     painter = OverlayPainter(capture, tracking, face_model)
-    strips = [strip(painter, capture, frame, _name(capture, frame)) for frame in frames]
-    return picture_grid(strips, min(_STRIPS, len(strips)))
+    return [SheetRow(_name(capture, frame), bool(frame.why), _tiles(painter, capture, frame)) for frame in frames]
 
 
 def _name(capture: Capture, frame: SheetFrame) -> str:
-    camera = "" if len(capture.camera_ids) == 1 else f"{capture.camera_ids[frame.camera]} "
-    return f"{frame.timestep} {camera}{frame.why}".rstrip()
+    camera = "" if len(capture.camera_ids) == 1 else f", camera {capture.camera_ids[frame.camera]}"
+    return f"Frame {frame.timestep}{camera}{', ' * bool(frame.why)}{frame.why}"
 
 
 def strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: str) -> UInt8[np.ndarray, "h w 3"]:
     """A frame's picture and the mesh over it. If pixels were compared, also the model's picture and the heat map."""
-    image = np.asarray(capture.images[frame.timestep, frame.camera])
-    rows, columns = painter.head_box(frame.timestep, frame.camera)
-    panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]
-    tiles = [cv2.resize(panel[rows, columns], (_TILE, _TILE), interpolation=cv2.INTER_AREA) for panel in panels]
+    tiles = _tiles(painter, capture, frame)
     write_text(tiles[0], name, (6, 16), 0.45)
     if len(tiles) > 2:
         draw_legend(tiles[-1], 8)
     return np.concatenate(tiles, axis=1)
+
+
+def _tiles(painter: OverlayPainter, capture: Capture, frame: SheetFrame) -> list[UInt8[np.ndarray, "h w 3"]]:
+    image = np.asarray(capture.images[frame.timestep, frame.camera])
+    rows, columns = painter.head_box(frame.timestep, frame.camera)
+    panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]
+    return [cv2.resize(panel[rows, columns], (_TILE, _TILE), interpolation=cv2.INTER_AREA) for panel in panels]
 
 
 def _camera_of_face(residuals: Float[torch.Tensor, " c"]) -> int:

@@ -6,7 +6,7 @@ from jaxtyping import Float, UInt8
 
 from mien.pictures import heat_colors
 
-_HOTTEST = 0.15
+HOTTEST = 0.15
 """Length of the colour difference (each channel 0..1) that is drawn brightest."""
 _DIMMED = 0.35
 """Brightness of pixels that are not compared."""
@@ -16,7 +16,7 @@ _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 
 def heat_map(difference: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Differences in the colours of `inferno`. Black is no difference, or an unknown one (NaN)."""
-    return heat_colors(difference, _HOTTEST)
+    return heat_colors(difference, HOTTEST)
 
 
 def dimmed(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -36,7 +36,7 @@ def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:
     picture[top : top + _BAR, left : left + length] = heat_colors(bar, 255.0)
     cv2.rectangle(picture, (left - 1, top - 1), (left + length, top + _BAR), _WHITE, 1)
     write_text(picture, "0", (_MARGIN, top + _BAR), 0.4)
-    write_text(picture, f"{100 * _HOTTEST:.0f} %", (left + length + _MARGIN, top + _BAR), 0.4)
+    write_text(picture, f"{100 * HOTTEST:.0f} %", (left + length + _MARGIN, top + _BAR), 0.4)
 
 
 def write_text(picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, int], size: float = 0.5) -> None:

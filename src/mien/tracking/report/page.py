@@ -7,12 +7,18 @@ from typing import Any
 from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.pages import render
-from mien.pictures import data_uri, picture_uri
+from mien.pictures import picture_uri, shrink
 from mien.storage import write_atomically
-from mien.tracking.report.contact_sheet import contact_sheet, sheet_frames
+from mien.tracking.report.contact_sheet import SheetRow, sheet_frames, sheet_rows
+from mien.tracking.report.curves import Curves, charts
+from mien.tracking.report.heat import HOTTEST
+from mien.tracking.report.overlay import OverlayPainter
 from mien.tracking.tracking import Tracking
 
 _JPEG_QUALITY = 85
+_POSTER = 960
+"""Longer side of the poster of the video, in pixels."""
+_PANELS = ("Picture", "Tracked mesh", "Model", "Difference")
 _SOME = 40
 """Largest number of frames, or runs of frames, that a finding names."""
 _FOCAL_FROM = {
@@ -33,40 +39,44 @@ _WAYS = {
 
 
 def write_report_page(
-    folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict[str, Any]
+    folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict[str, Any], curves: Curves
 ) -> None:
     """Write report.html into `folder`. Except for the overlay video, the page is complete in one file.
 
     Args:
-        folder: Folder of the tracking, which has residuals.png already.
+        folder: Folder of the tracking.
         capture: The capture.
         tracking: The tracking of the capture.
         face_model: The face model of the tracking.
         report: The result of `residual_report`.
+        curves: What is drawn over time.
     """
     frames = sheet_frames(tracking, report["flagged_frames"], report["landmarks_only_frames"])
-    sheet = contact_sheet(capture, tracking, face_model, frames)
-    plot = (folder / "residuals.png").read_bytes()
-    text = page_html(capture.name, tracking, report, data_uri("image/png", plot), picture_uri(sheet, _JPEG_QUALITY))
+    rows = [_shown(row) for row in sheet_rows(capture, tracking, face_model, frames)]
+    middle = next((frame for frame in frames if not frame.why), frames[0])
+    painter = OverlayPainter(capture, tracking, face_model)
+    poster = picture_uri(shrink(painter.picture(middle.timestep, middle.camera), _POSTER), _JPEG_QUALITY)
+    text = render(
+        "tracking/report/templates/report.html",
+        name=capture.name,
+        poster=poster,
+        findings=findings(tracking, report),
+        tiles=_tiles(report),
+        figures=_figures(report),
+        panels=_PANELS[: len(rows[0]["pictures"])],
+        rows=rows,
+        hottest=f"{100 * HOTTEST:.0f} %",
+        charts=charts(curves),
+    )
     write_atomically(folder / "report.html", lambda path: path.write_text(text, encoding="utf-8"))
 
 
-def page_html(name: str, tracking: Tracking, report: dict[str, Any], plot: str, sheet: str) -> str:
-    """The page as html. `plot` and `sheet` are addresses of pictures."""
-    panels = "the picture and the tracked mesh over it"
-    if tracking.appearance is not None:
-        panels = ("the picture, the tracked mesh over it, the model's own picture (its texture in the fitted light), "
-                  "and the difference of colours (black is none; grey parts, such as hair, eyes and mouth, are not "
-                  "compared)")  # fmt: skip
-    return render(
-        "tracking/report/templates/report.html",
-        name=name,
-        findings=findings(tracking, report),
-        figures=_figures(report),
-        panels=panels,
-        sheet=sheet,
-        plot=plot,
-    )
+def _shown(row: SheetRow) -> dict[str, Any]:
+    pictures = [
+        {"what": f"{row.name}: {panel.lower()}", "source": picture_uri(tile, _JPEG_QUALITY)}
+        for panel, tile in zip(_PANELS, row.tiles, strict=False)
+    ]
+    return {"name": row.name, "odd": row.odd, "pictures": pictures}
 
 
 def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]]:
@@ -126,10 +136,21 @@ def name_runs(timesteps: Sequence[int]) -> str:
     return ", ".join(parts[:_SOME]) + (", ..." if len(parts) > _SOME else "")
 
 
+def _tiles(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """The few figures to read first, each with its name."""
+    colors, flagged = report["residual_colors"], len(report["flagged_frames"])
+    tiles = [
+        (str(report["frames"]), "frames"),
+        (_number(report["residual_px"]["median"], 1, "px"), "landmarks, median"),
+    ]
+    if colors is not None:
+        tiles.append((_number(colors["median"], 100, "%"), "difference of colours, median"))
+    return [*tiles, (str(flagged), "frame stands out" if flagged == 1 else "frames stand out")]
+
+
 def _figures(report: dict[str, Any]) -> list[tuple[str, str]]:
     colors, iris = report["residual_colors"], report["iris_distance"]
     rows = [
-        ("Frames", str(report["frames"])),
         ("Distance of landmarks from the detected ones: median, 95 %, largest", _three(report["residual_px"], 1, "px")),
     ]
     if colors is not None:

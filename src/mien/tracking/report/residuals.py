@@ -1,7 +1,6 @@
-"""The residual report: figures and a plot that show whether a tracking can be trusted."""
+"""The residual report: figures and curves that show whether a tracking can be trusted."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,9 +10,9 @@ from torch import Tensor
 from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.storage import write_atomically, write_json
+from mien.storage import write_json
 from mien.tracking.landmarks import BROWS, LEFT_EYELIDS, LEFT_IRIS, LIPS, NOSE, OVAL, RIGHT_EYELIDS, RIGHT_IRIS
-from mien.tracking.report.contact_sheet import worst_of_runs
+from mien.tracking.report.curves import Curves
 from mien.tracking.report.overlay import frontal_camera
 from mien.tracking.report.page import findings, write_report_page
 from mien.tracking.report.rig import (
@@ -25,9 +24,6 @@ from mien.tracking.report.rig import (
 )
 from mien.tracking.tracking import PARTS, Tracking
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 _FORMAT, _VERSION = "mien.residual_report", 1
 _GROUPS = {
     "oval": OVAL, "brows": BROWS, "nose": NOSE, "lips": LIPS, "eyelids": LEFT_EYELIDS + RIGHT_EYELIDS,
@@ -38,8 +34,6 @@ _NEAR_FRONTAL = 0.26
 _MOVED = 0.03
 """Standard deviation above which a coefficient counts as used."""
 _CHUNK = 32
-_NAMED = 10
-"""Largest number of runs of flagged frames in which the plot names the worst frame."""
 _MIN_COLOR_STEP = 0.005
 """Least amount (0..1) by which a frame's colour residual must stand out to be flagged."""
 
@@ -152,11 +146,11 @@ def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
 
 
 def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> str:
-    """Write residuals.json, residuals.png and report.html into `folder` and return the main findings as text."""
+    """Write residuals.json and report.html into `folder` and return the main findings as text."""
     report = residual_report(capture, tracking, face_model)
     write_json(folder / "residuals.json", _FORMAT, _VERSION, report)
-    write_atomically(folder / "residuals.png", lambda path: _plot(path, capture, tracking, face_model, report))
-    write_report_page(folder, capture, tracking, face_model, report)
+    curves = _curves(capture, tracking, face_model, report)
+    write_report_page(folder, capture, tracking, face_model, report, curves)
     return " ".join(text for _, text in findings(tracking, report))
 
 
@@ -216,45 +210,18 @@ def _summary(values: Float[Tensor, "*n"]) -> dict[str, float | None]:
     return {"median": float(values.median()), "p95": float(values.quantile(0.95)), "max": float(values.max())}
 
 
-def _plot(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict) -> None:
-    from matplotlib.figure import Figure  # It is slow to import and only needed here.
-
-    time = np.asarray(capture.timestamps)
-    frontal, residuals = frontal_camera(tracking), _timestep_residuals(tracking)
+def _curves(capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict) -> Curves:
+    frontal = frontal_camera(tracking)
     detected = torch.from_numpy(np.asarray(capture.landmarks[:, frontal], dtype=np.float32))
     depth = tracking.cameras[frontal].project(_landmarks(face_model, tracking))[1]
-    iris = iris_distances(tracking, detected, depth, frontal)
-    figure = Figure(figsize=(9, 10), layout="constrained")
-    axes = figure.subplots(5, 1, sharex=True)
-    _plot_flagged(axes[0], time, residuals.numpy(), report["flagged_frames"], "landmarks, px")
-    if tracking.pixel_residuals is not None:
-        colors = 100 * tracking.pixel_residuals.nanmedian(1).values
-        _plot_flagged(axes[1], time, colors.numpy(), report["flagged_frames"], "colours, %")
-    else:
-        axes[1].text(0.5, 0.5, "pixels were not used", ha="center", transform=axes[1].transAxes)
-    axes[2].plot(time, seen_rotation(tracking, frontal).rad2deg().numpy(), label=["pitch", "yaw", "roll"])
-    axes[2].set_ylabel("head rotation, degrees")
-    axes[2].legend(loc="upper right")
-    axes[3].plot(time, _depth(tracking, frontal).numpy())
-    axes[3].set_ylabel("depth, m")
-    axes[4].plot(time, 1e3 * iris.numpy())
-    axes[4].set_ylabel("iris distance, mm")
-    axes[4].set_xlabel("time, s")
-    for axis in axes:
-        for missing in report["frames_without_face"]:
-            axis.axvspan(time[missing], time[min(missing + 1, len(time) - 1)], color="0.85")
-    figure.suptitle(f"{capture.name}: landmarks against the tracked {tracking.face_model} head")
-    figure.savefig(path, dpi=100)
-
-
-def _plot_flagged(axis: "Axes", time: np.ndarray, values: np.ndarray, flagged: list[int], label: str) -> None:
-    """Plot a curve, mark the flagged frames and name the worst of them."""
-    axis.plot(time, values)
-    axis.set_ylabel(label)
-    if not flagged:
-        return
-    axis.plot(time[flagged], values[flagged], "rx", label="flagged")
-    for timestep in worst_of_runs(flagged, values)[:_NAMED]:
-        axis.annotate(str(timestep), (time[timestep], values[timestep]), fontsize=8, color="tab:red",
-                      xytext=(3, 3), textcoords="offset points", annotation_clip=True)  # fmt: skip
-    axis.legend(loc="upper right")
+    colors = tracking.pixel_residuals
+    return Curves(
+        np.asarray(capture.timestamps, dtype=np.float64),
+        _timestep_residuals(tracking).double().numpy(),
+        None if colors is None else colors.nanmedian(1).values.double().numpy(),
+        seen_rotation(tracking, frontal).rad2deg().double().numpy(),
+        _depth(tracking, frontal).double().numpy(),
+        1e3 * iris_distances(tracking, detected, depth, frontal).double().numpy(),
+        report["flagged_frames"],
+        report["frames_without_face"],
+    )

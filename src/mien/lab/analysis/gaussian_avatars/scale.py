@@ -6,10 +6,10 @@ import numpy as np
 import torch
 
 from mien.avatar import GaussianAvatarsConfig
-from mien.evaluation.plots import Axes, Series
 from mien.lab.analysis.context import Context, Variant, mean_psnr
 from mien.lab.analysis.drawing import measure_in_turn
 from mien.lab.analysis.result import Chart, PartResult, Table
+from mien.plots import Axes, Series
 from mien.storage import file_digest
 from mien.training.footage import spread_frames
 

@@ -4,12 +4,12 @@ import numpy as np
 import torch
 
 from mien import _native
-from mien.evaluation.plots import Axes, Series
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.result import Chart, PartResult, Picture, Table
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.pictures import to_uint8
+from mien.plots import Axes, Series
 from mien.progress import track_progress
 from mien.render import rasterize
 from mien.storage import file_digest

@@ -3,12 +3,12 @@
 import numpy as np
 
 from mien import _native
-from mien.evaluation.plots import Axes, Series
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.headgas.trained import busy_face
 from mien.lab.analysis.result import Chart, PartResult, Table
 from mien.lab.benchmarking.timing import format_machine, measure_machine
+from mien.plots import Axes, Series
 from mien.progress import track_progress
 from mien.storage import file_digest
 from mien.terminal import counted

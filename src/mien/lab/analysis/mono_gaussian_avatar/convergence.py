@@ -9,11 +9,11 @@ from mien.avatar import Avatar, Progress
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import crop_to, psnr
-from mien.evaluation.plots import Axes, Series
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.result import Chart, PartResult, Picture, Table
 from mien.lab.analysis.views import labeled
 from mien.pictures import side_by_side, to_uint8
+from mien.plots import Axes, Series
 from mien.progress import progress_bar
 from mien.render import rasterize
 from mien.threads import one_torch_thread

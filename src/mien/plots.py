@@ -1,6 +1,6 @@
 """Line charts as inline SVG, without scripts or fonts. The page's CSS sets the colours, so they fit light and dark.
 
-The SVG is in `templates/chart.html`. The code here finds the ticks and the positions.
+The SVG is in `mien/templates/chart.html`. The code here finds the ticks and the positions.
 """
 
 import math
@@ -27,7 +27,7 @@ class Series:
     y: Float[np.ndarray, " n"]
     """NaN breaks the line."""
     style: str = "main"
-    """CSS class that sets the colour: `main`, `second`, `quiet`."""
+    """CSS class that sets the colour: `main`, `second`, `third`, `fourth`, `quiet`."""
     points: bool = False
     """Whether to draw dots with tooltips instead of a line."""
 
@@ -56,7 +56,7 @@ def line_chart(series: Sequence[Series], axes: Axes) -> Markup:
     y_range = _padded(_range(np.concatenate([one.y for one in drawn])), axes.from_zero)
     plot = _Plot(axes, x_range, y_range)
     return render(
-        "evaluation/templates/chart.html",
+        "templates/chart.html",
         axes=axes,
         about=f"{axes.y_label} over {axes.x_label}: " + ", ".join(one.label for one in drawn),
         left=_LEFT,
