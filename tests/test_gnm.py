@@ -31,7 +31,9 @@ def test_poses_as_gnm_does(moved: str, arrays: dict[str, Any], model: FaceModel)
     """GNM's neck and head become the head's pose and an inverse neck; joints follow identity."""
     random = np.random.default_rng(4)
     rotations = 0.3 * random.normal(size=(4, 3))
-    identity, expression = (random.normal(size=len(arrays[f"{name}_basis"])) for name in ("vertex_identity", "expression"))
+    identity, expression = (
+        random.normal(size=len(arrays[f"{name}_basis"])) for name in ("vertex_identity", "expression")
+    )
     turned = {"neck": [0], "head": [1], "eyes": [2, 3], "all": [0, 1, 2, 3]}.get(moved, [])
     rotations[[joint for joint in range(4) if joint not in turned]] = 0
     identity *= moved in ("identity", "all")

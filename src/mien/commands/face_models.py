@@ -10,7 +10,6 @@ import tyro
 from mien.errors import UserError
 from mien.terminal import show
 
-
 _ICT_MEAN = "generic_neutral_mesh.obj"
 """A file by which ICT-FaceKit's folder is recognised (`mien.face.ict.NEUTRAL`, without its imports)."""
 

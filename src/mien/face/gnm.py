@@ -1,8 +1,8 @@
 """Read GNM Head (Google, Apache-2.0): the file `gnm_head.npz`, to its published schema.
 
 GNM has a template, linear bases of identity and expression in standard deviations, four joints (the neck as the root,
-the head on it, the eyes on the head), which follow identity, and linear blend skinning. It has no jaw joint: expressions
-open the mouth. Its users fetch the file themselves, and mien contains nothing of it.
+the head on it, the eyes on the head), which follow identity, and linear blend skinning. It has no jaw joint, because
+expressions open the mouth. Its users fetch the file themselves, and mien contains nothing of it.
 
 GNM's chain starts at the shoulders, mien's at the head. As with FLAME, a head joint turned by R becomes a mien head
 turned by R (after GNM's neck), with a neck turned by the inverse of R about the same point.
@@ -90,7 +90,9 @@ def read_gnm(path: Path) -> GnmFile:
         _check(path, key, arrays, shape, sizes)
     joint_names = _names(path, "joint_names", arrays, 4)
     if sorted(joint_names) != sorted(_JOINTS):
-        raise UserError(f"{path}: 'joint_names' are {', '.join(joint_names)[:200]}, but GNM Head has {', '.join(_JOINTS)}")
+        raise UserError(
+            f"{path}: 'joint_names' are {', '.join(joint_names)[:200]}, but GNM Head has {', '.join(_JOINTS)}"
+        )
     order = [joint_names.index(name) for name in _JOINTS]
     parents = dict(zip(joint_names, arrays["joint_parent_indices"].tolist(), strict=True))
     if any(parents[child] != joint_names.index(parent) for child, parent in _PARENTS.items()):
@@ -101,7 +103,8 @@ def read_gnm(path: Path) -> GnmFile:
     gnm = GnmFile(
         arrays["template_vertex_positions"].astype(np.float64), faces,
         arrays["vertex_identity_basis"].astype(np.float32), arrays["expression_basis"].astype(np.float32),
-        _names(path, "expression_names", arrays, sizes["e"]), arrays["template_joint_positions"].astype(np.float64)[order],
+        _names(path, "expression_names", arrays, sizes["e"]),
+        arrays["template_joint_positions"].astype(np.float64)[order],
         arrays["joint_identity_basis"].astype(np.float64)[:, order],
         arrays["skinning_weights"].astype(np.float64)[order].T, _correctives(path, arrays, order, sizes["v"]),
         _groups(path, arrays, sizes["v"]), _corner_uv(path, arrays, sizes["f"]),
@@ -222,7 +225,9 @@ def _corner_uv(path: Path, arrays: dict[str, np.ndarray], faces: int) -> Float[n
     if given is None:
         return None
     if given.shape != (faces, 3, 2) or given.dtype.kind != "f":
-        raise UserError(f"{path}: 'triangle_uvs' is {list(given.shape)}, but should be [{faces}, 3, 2]; download it again")
+        raise UserError(
+            f"{path}: 'triangle_uvs' is {list(given.shape)}, but should be [{faces}, 3, 2]; download it again"
+        )
     _check_values(path, "triangle_uvs", given)
     return given.astype(np.float64) if given.min() >= 0 and given.max() <= 1 else None
 
