@@ -223,7 +223,9 @@ def test_names_of_arkit_drive_it(model: FaceModel) -> None:
         assert float(blink[lower, 1] - blink[upper, 1]) > 0.004
         away = LIDS["Right" if side == "Left" else "Left"]
         assert blink[list(away)].norm(dim=1).max() < 0.3 * blink[upper].norm()
-    assert moved["browInnerUp"][9, 1] > 0.0015
+    # Principal directions that were kept of the generated models hold a third of it.
+    assert moved["browInnerUp"][9, 1] > 0.0008
+    assert moved["browInnerUp"][CHIN].norm() < 0.0005
 
 
 def test_there_and_back(model: FaceModel, anny: FaceModel) -> None:

@@ -128,6 +128,8 @@ def _at_landmarks(model: FaceModel) -> FaceModel:
         model,
         template=model.template[kept],
         faces=corners.reshape(-1, 3),
+        uv_faces=model.uv_faces[model.landmarks[_MARKS].faces],
+        face_regions=model.face_regions[model.landmarks[_MARKS].faces],
         identity_basis=model.identity_basis[:, kept],
         expression_basis=model.expression_basis[:, kept],
         skinning_weights=model.skinning_weights[kept],
