@@ -211,7 +211,7 @@ def test_names_of_arkit_drive_it(model: FaceModel) -> None:
     face, rest = face_of_motion(Motion(25.0, coefficients, gaze_of(coefficients), still, still, 0), model)
     driven = drive(face, rest, model.neutral(), model.expression_bounds)
     marks = _marks(model, driven)
-    moved = dict(zip(names, marks[1:] - marks[0], strict=True))
+    moved: dict[str, Tensor] = dict(zip(names, marks[1:] - marks[0], strict=True))
     assert float(moved["jawOpen"][UPPER_LIP, 1] - moved["jawOpen"][LOWER_LIP, 1]) > 0.012
     assert moved["jawOpen"][NOSE].norm() < 0.003
     for side, corner, other in (("Left", CORNER_LEFT, CORNER_RIGHT), ("Right", CORNER_RIGHT, CORNER_LEFT)):
