@@ -1,4 +1,4 @@
-"""One suite over face models of all schemas: mesh, regions, joints, landmarks, gradients, tracking, driving."""
+"""One suite over face models of all schemas: mesh, regions, joints, landmarks, gradients, training, driving."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +19,9 @@ from mien.face import FaceModel, FaceParams, add_face_model, load_face_model
 from mien.face.chart import find_outside
 from mien.face.checks import check_face_model
 from mien.render import render_mesh
-from mien.tracking import Scoring, Tracking, TrackingSettings, track, write_scoring, write_tracking
+from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
 from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS
 from mien.training import read_sequence, train
-from tracking_case import capture_of, still_camera
 
 UPPER_LIP, LOWER_LIP, CHIN, NOSE, CORNER_LEFT, CORNER_RIGHT = 13, 14, 152, 4, 291, 61
 LIDS = {"Left": (386, 374), "Right": (159, 145)}
@@ -142,19 +141,6 @@ def _moving(model: FaceModel, timesteps: int) -> FaceParams:
         head_rotation=torch.stack([0.1 * (5 * time).sin(), 0.3 * (4 * time).cos(), 0.05 * time], 1),
         head_translation=torch.tensor([0.0, 0.0, -0.9]).expand(timesteps, 3),
     )
-
-
-def test_a_small_capture_is_tracked(model: FaceModel) -> None:
-    face = _moving(model, 12)
-    camera = still_camera()
-    points = model.landmark_positions(model(face), "mediapipe").double()
-    tracking = track(capture_of(camera.project(points)[0]), model, TrackingSettings(schedule="landmarks", keyframes=6))
-    assert tracking.residuals.nanmedian() < 0.5
-    turn = torch.stack([tracking.face.head_rotation[:, 1], face.head_rotation[:, 1]]).double()
-    assert torch.corrcoef(turn)[0, 1] > 0.995
-    found = model.landmark_positions(model.head_vertices(tracking.face), "mediapipe")
-    opened = torch.stack([(m[:, UPPER_LIP] - m[:, LOWER_LIP]).norm(dim=1) for m in (found, _marks(model, face))])
-    assert torch.corrcoef(opened)[0, 1] > 0.97
 
 
 def test_an_avatar_is_trained_and_driven_by_a_recording(
