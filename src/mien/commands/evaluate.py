@@ -41,6 +41,9 @@ class Command:
     """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
     perceptual_frames: int = 24
     """Largest number of frames, evenly spread, on which ST-LPIPS is computed. 0 means all frames."""
+    lpips_weights: Path | None = None
+    """Torchvision's alexnet-owt-7be5be79.pth or vgg16-397923af.pth, to compute exact LPIPS as well, as papers report
+    it. It needs the package lpips."""
     edges: Literal["cleaned", "filmed"] = "cleaned"
     """Truth at soft edges of the matte: colours of the person alone (cleaned), or pictures as they were filmed, which
     hold some of the background there (filmed), for figures beside those of other programs."""
@@ -73,6 +76,8 @@ class Command:
         """Check without heavy libraries which of the three tasks is asked for, and that its input exists."""
         if self.perceptual_frames < 0:
             raise UserError(f"--perceptual-frames {self.perceptual_frames}: give a positive number, or 0 for all")
+        if self.lpips_weights is not None and not self.lpips_weights.is_file():
+            raise UserError(f"--lpips-weights {self.lpips_weights}: no such file; give torchvision's file of AlexNet")
         if not 1 <= self.fit_steps <= 10_000:
             raise UserError(f"--fit-steps {self.fit_steps}: give a number from 1 to 10000")
         if self.fit_faces and (self.compare or self.images is not None):
@@ -109,6 +114,7 @@ class Command:
             perceptual=self.perceptual,
             perceptual_frames=self.perceptual_frames,
             pictures=self.pictures,
+            lpips_weights=self.lpips_weights,
             edges="filmed" if self.protocol is not None else self.edges,
             dataset=self.protocol,
             fit_faces=self.fit_faces,
@@ -144,7 +150,9 @@ class Command:
         from mien.evaluation.text import scores_lines
 
         folders = ImageFolders(images, truth, self.mattes, self.crops, self.background)
-        scores = score_folders(folders, ScoreSettings(self.perceptual, self.perceptual_frames))
+        scores = score_folders(
+            folders, ScoreSettings(self.perceptual, self.perceptual_frames, lpips_weights=self.lpips_weights)
+        )
         if self.out is not None:
             write_scores(self.out, scores)
         if self.as_json:

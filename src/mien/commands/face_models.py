@@ -10,15 +10,18 @@ import tyro
 from mien.errors import UserError
 from mien.terminal import show
 
+_ICT_MEAN = "generic_neutral_mesh.obj"
+"""A file by which ICT-FaceKit's folder is recognised (`mien.face.ict.NEUTRAL`, without its imports)."""
+
 
 @dataclass(frozen=True)
 class Command:
     """List the face models. --add adds a model of your own; --bake prepares a model before its first use."""
 
     add: Path | None = None
-    """A head model in FLAME's schema (FLAME's own .pkl, or a .npz) to add. It is kept with your other models, its
-    landmarks are placed (some minutes, once), and --face-model accepts its name. Reading a pickle runs no code from
-    it."""
+    """A head model to add: in FLAME's schema (FLAME's own .pkl, or a .npz), gnm_head.npz, or ICT-FaceKit's folder
+    FaceXModel. It is checked and kept with your other models, its landmarks are placed (some minutes, once), and
+    --face-model accepts its name. Reading a pickle runs no code from it."""
     name: str | None = None
     """Name of the added model (default: the file's name)."""
     shareable: bool = False
@@ -37,7 +40,7 @@ class Command:
             raise UserError(
                 "--name, --shareable and --teeth belong to a model that is added: give its file with --add FILE"
             )
-        if self.add is not None and not self.add.is_file():
+        if self.add is not None and not self.add.is_file() and not (self.add / _ICT_MEAN).is_file():
             raise UserError(
                 f"{self.add}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz"
             )

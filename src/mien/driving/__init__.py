@@ -7,6 +7,7 @@ from mien.lazy import lazy_names
 if TYPE_CHECKING:
     from mien.driving.blendshape_json import read_blendshape_json
     from mien.driving.drivers import Driver, read_recording, read_tracked_driver
+    from mien.driving.expression_map import ExpressionMap, fit_expression_map
     from mien.driving.keeping import keep_to_filmed
     from mien.driving.live_link_face import read_live_link_face
     from mien.driving.motion import ARKIT_NAMES, Motion
@@ -19,10 +20,12 @@ else:
 __all__ = [
     "ARKIT_NAMES",
     "Driver",
+    "ExpressionMap",
     "Motion",
     "drive",
     "face_of_motion",
     "facing",
+    "fit_expression_map",
     "keep_to_filmed",
     "read_blendshape_json",
     "read_live_link_face",

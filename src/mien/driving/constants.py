@@ -10,6 +10,21 @@ from dataclasses import dataclass
 class DrivingConstants:
     """The constants of this room, by the file that uses them. Formats of recordings have theirs beside their code."""
 
+    # expression_map.py
+    transfer_noise: float = 0.0005
+    """Distance in metres by which a landmark of a matched motion may be off: the weight of the fit against the priors
+    below. Not varied, as the next three."""
+    transfer_spread: float = 0.5
+    """Standard deviation of ARKit's coefficients."""
+    transfer_jaw_spread: float = 0.2
+    """The same of the angles of a jaw that is a joint, in radians."""
+    transfer_jaw: tuple[tuple[float, float], ...] = ((-0.05, 0.6), (-0.15, 0.15), (-0.1, 0.1))
+    """Bounds of its angles about x, y and z, in radians."""
+    transfer_jaw_step: float = 0.2
+    """Angle in radians over which a jaw's motion is taken as linear. Not varied."""
+    transfer_sweeps: int = 40
+    """Rounds of the bounded fit. Not varied."""
+
     # live/follower.py
     learn_seconds: float = 1.0
     """Time over which the face at rest is learnt, in seconds. Not varied."""

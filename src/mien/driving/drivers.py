@@ -12,13 +12,14 @@ from torch import Tensor
 from mien.avatar import neutral_of
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.expression_map import fit_expression_map
 from mien.driving.live_link_face import read_live_link_face
 from mien.driving.rest import facing
 from mien.driving.speech import read_speech
 from mien.driving.timing import at_moments, even_moments, rate_of
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.params import concatenate, most_frontal_camera
 from mien.progress import say
 from mien.training import Sequence, read_sequence
@@ -77,10 +78,15 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
     return Driver(face, at_rest, motion.fps, None, path if is_voice else None, rest_is=_RECORDED_REST)
 
 
-def read_tracked_driver(folders: Items[Path]) -> Driver:
+def read_tracked_driver(folders: Items[Path], face_model: FaceModel | None = None) -> Driver:
     """Read a driver from the folders of tracked sequences of one person, one sequence after the other.
 
     Frames of a variable rate are resampled by their times (`mien.driving.timing`).
+
+    Args:
+        folders: Folders of the sequences.
+        face_model: The avatar's face model, in whose terms the motion is returned (`fit_expression_map`). None leaves
+            it as it was tracked.
 
     Raises:
         UserError: no frame was tracked, the sequences were tracked with several face models, a file is damaged, or a
@@ -108,8 +114,15 @@ def read_tracked_driver(folders: Items[Path]) -> Driver:
         if moments is not None:
             say(f"{one.name}: its frames have times of their own; they become {len(shown)} at {fps:.4g} a second")
 
+    face = concatenate(faces)
+    tracked_by = sequences[0].tracking.face_model
+    if face_model is not None and tracked_by != face_model.name:
+        say(f"{names}: tracked with {tracked_by}; its expressions are transferred to {face_model.name}")
+        transferred = fit_expression_map(load_face_model(tracked_by), face_model)
+        face, at_rest, found = transferred(face), transferred(at_rest), transferred(found)
+
     def picture(index: int) -> UInt8[np.ndarray, "h w 3"]:
         sequence, timestep = places[index]
         return np.asarray(sequence.capture.images[timestep, 0])
 
-    return Driver(concatenate(faces), at_rest, fps, picture, found=found, ahead=ahead)
+    return Driver(face, at_rest, fps, picture, found=found, ahead=ahead)

@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.driving.expression_map import fit_expression_map
 from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, load_face_model
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.runtime.named import within_lids
 
@@ -86,16 +87,18 @@ def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FacePa
 
     Coefficients go to the expressions of the same names, gaze goes to the eye joints, within what the lids
     can follow (`within_lids`). At rest, which is one timestep,
-    all coefficients are zero, as in ARKit and MediaPipe, and the head has its median pose.
+    all coefficients are zero, as in ARKit and MediaPipe, and the head has its median pose. A model without ARKit's
+    names gets the motion of the default model by `fit_expression_map`.
 
     Raises:
-        UserError: the face model has none of ARKit's expressions.
+        UserError: the face model has neither ARKit's expressions nor landmarks.
     """
     known = [(ours, ARKIT_NAMES.index(name)) for ours, name in enumerate(model.expression_names) if name in ARKIT_NAMES]
     if not known:
-        raise UserError(
-            f"the face model {model.name!r} has none of ARKit's expressions; drive it by a video or a sequence"
-        )
+        guide = load_face_model()
+        face, rest = face_of_motion(motion, guide)
+        transferred = fit_expression_map(guide, model)
+        return transferred(face), transferred(rest)
     face, coefficients = model.neutral(len(motion)), torch.from_numpy(motion.coefficients)
     expression, joints = face.expression.clone(), face.joints.clone()
     for ours, theirs in known:

@@ -20,6 +20,7 @@ from mien.evaluation.report_sections import cross_section
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
 from mien.locks import hold
+from mien.perceptual.lpips import load_lpips
 from mien.ranges import check_ranges
 from mien.storage import file_digest, write_json
 from mien.training import read_coverage, read_curves, read_run_config, read_training_summary, run_camera
@@ -135,6 +136,8 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
     ]  # fmt: skip
     if settings.dataset is not None:
         content.append(settings.dataset)
+    if settings.lpips_weights is not None:
+        content.append(load_lpips(settings.lpips_weights).backbone)
     if settings.fit_faces:
         content.append(settings.fit_steps)
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

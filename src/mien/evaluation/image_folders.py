@@ -17,6 +17,7 @@ from mien.evaluation.scoring import (
     SSIM_WINDOW,
     Scores,
     ScoreSettings,
+    lpips_metric,
     mean_scores,
     perceptual_metric,
     score_pictures,
@@ -78,13 +79,14 @@ def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) 
     """
     settings = settings or ScoreSettings()
     pairs = _Pairs(folders)
-    metric = perceptual_metric(settings)
+    metric, lpips = perceptual_metric(settings), lpips_metric(settings)
     judged = set(evenly_spread(range(len(pairs.names)), settings.perceptual_frames))
 
     def score(job: tuple[int, _Pair]) -> Scores:
         index, pair = job
         own = {"image": _floats(pair.image)}
-        return score_pictures(own, _floats(pair.truth), pair.crop, metric if index in judged else None)["image"]
+        judges = (metric, lpips) if index in judged else (None, None)
+        return score_pictures(own, _floats(pair.truth), pair.crop, judges[0], lpips=judges[1])["image"]
 
     rows: list[Scores] = []
     with progress_bar("score", len(pairs.names)) as advance:
@@ -95,6 +97,7 @@ def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) 
         **mean_scores(rows),
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
         "perceptual_frames": sum("perceptual" in row for row in rows),
+        **({} if lpips is None else {"lpips_backbone": lpips.backbone}),
         "frames": len(rows),
         "crop": pairs.crop_source,
         "mask": "none: whole pictures" if folders.mattes is None else f"mattes, over {folders.background}",

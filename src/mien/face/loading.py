@@ -177,11 +177,15 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
-    file = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
-    if not file.is_file():
-        file = _landmark_file(_added_file(name))
-    if not file.is_file():
-        return {}
+    file = _shipped_landmarks(name) if name in _SOURCES else _landmark_file(_added_file(name))
+    return _read_landmark_file(file, name, model) if file.is_file() else {}
+
+
+def _shipped_landmarks(name: str) -> Path:
+    return Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
+
+
+def _read_landmark_file(file: Path, name: str, model: FaceModel) -> dict[str, Landmarks]:
     with expect_whole(file, _PLACE_AGAIN):
         content = parse_json(read_bytes(file, _MAX_LANDMARK_BYTES).decode("utf-8"))
         if content["topology_hash"] != model.topology_hash:

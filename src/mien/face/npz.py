@@ -20,10 +20,16 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _ENDING = ".npy"
+_NUMBERS = "biuf"
+"""Kinds of plain numbers, by numpy's letters."""
 
 
-def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, np.ndarray]]:
+def read_npz(
+    path: Path, wanted: Collection[str], texts: Collection[str] = ()
+) -> tuple[list[str], dict[str, np.ndarray]]:
     """Return the names of all members of an .npz, and its wanted arrays of plain numbers.
+
+    Those that `texts` names may hold texts of a fixed length instead.
 
     Raises:
         ValueError: a wanted member is no array of plain numbers, occurs twice, or is damaged; or the arrays are larger
@@ -41,16 +47,16 @@ def read_npz(path: Path, wanted: Collection[str]) -> tuple[list[str], dict[str, 
             if name in arrays:
                 raise ValueError(f"{name!r} occurs twice")
             try:
-                arrays[name] = _read_member(archive, member, left)
+                arrays[name] = _read_member(archive, member, left, _NUMBERS + "U" if name in texts else _NUMBERS)
             except ValueError as error:
                 raise ValueError(f"{name!r}: {error}") from None
             left -= arrays[name].nbytes
     return names, arrays
 
 
-def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int) -> np.ndarray:
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int, kinds: str) -> np.ndarray:
     with open_member(archive, member) as file:
-        return _read_array(file, limit)
+        return _read_array(file, limit, kinds)
 
 
 def parse_npy(data: bytes) -> np.ndarray:
@@ -62,12 +68,12 @@ def parse_npy(data: bytes) -> np.ndarray:
     return _read_array(io.BytesIO(data), len(data))
 
 
-def _read_array(file: io.BufferedIOBase, limit: int) -> np.ndarray:
+def _read_array(file: io.BufferedIOBase, limit: int, kinds: str = _NUMBERS) -> np.ndarray:
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
         raise ValueError(f"is of version {version} of numpy's format")
     shape, by_column, kind = _HEADERS[version](file)
-    if kind.kind not in "biuf":
+    if kind.kind not in kinds:
         raise ValueError(f"holds {kind}, not plain numbers")
     size = math.prod(shape) * kind.itemsize
     if not all(length >= 0 for length in shape):

@@ -23,5 +23,9 @@ OBTAINABLE = (
                     "flame.is.tue.mpg.de, with an account", "trackings of VHAP (with --teeth) and NeRSemble"),
     ObtainableModel("flame2023_open", "FLAME 2023 Open", "CC-BY-4.0", "flame.is.tue.mpg.de, with an account",
                     "avatars that may carry their face model (add it with --shareable)"),
+    ObtainableModel("ict", "the folder FaceXModel (ICT-FaceKit Light)", "MIT",
+                    "github.com/ICT-VGL/ICT-FaceKit", "ARKit's expressions on a dense mesh with teeth and tongue"),
+    ObtainableModel("gnm_head", "gnm_head.npz (GNM Head 3)", "Apache-2.0",
+                    "github.com/google/GNM", "a statistical head with eyes, teeth and tongue"),
 )  # fmt: skip
 """In the order in which they are listed."""

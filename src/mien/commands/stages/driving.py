@@ -67,11 +67,11 @@ def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | No
         workspace, names = _tracked_video(by, face_model.name)
         names = names if sequence is None else [workspace.pick_sequence(sequence)]
     elif is_tracked_sequence(by):
-        return read_tracked_driver([by])
+        return read_tracked_driver([by], face_model)
     else:
         workspace = open_workspace(by)
         names = [workspace.pick_sequence(sequence)]
-    return read_tracked_driver([workspace.sequence_dir(name) for name in names])
+    return read_tracked_driver([workspace.sequence_dir(name) for name in names], face_model)
 
 
 def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:

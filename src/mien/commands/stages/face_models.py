@@ -5,28 +5,28 @@ from pathlib import Path
 
 from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
-from mien.face.flame import flame_face_model, read_flame
+from mien.face.ict import NEUTRAL, is_ict_folder
 from mien.face.loading import cache_folder, is_built_in
-from mien.face.teeth import TOOTH_VERTICES, VERTICES, with_teeth
+from mien.face.model_files import SUFFIXES, default_name, read_model_file
+from mien.face.teeth import TOOTH_VERTICES, VERTICES
 from mien.locks import hold
 from mien.progress import say
 from mien.storage import file_digest
 from mien.tracking.landmarks import EmbeddingSettings, embed_landmarks, with_regions_by_landmarks
 
-_SUFFIXES = (".npz", ".pkl", ".pickle")
 _FIRST_PICTURES = 80
 """Number of pictures in the first round, when lips and brows are not known. The second round paints these, and uses the
 number in `EmbeddingSettings`."""
 
 
 def face_model_of(choice: str) -> FaceModel:
-    """The face model of a name or a file. A file in FLAME's schema is added at its first use.
+    """The face model of a name or a file. A file is added at its first use.
 
     Raises:
         UserError: there is no such model, or the file is not a face model.
     """
     path = Path(choice).expanduser()
-    if path.suffix.lower() in _SUFFIXES:
+    if path.suffix.lower() in SUFFIXES or is_ict_folder(path):
         return add_face_model_file(path)
     if path.is_file() or "/" in choice:
         raise UserError(
@@ -37,34 +37,33 @@ def face_model_of(choice: str) -> FaceModel:
 
 
 def add_face_model_file(path: Path, name: str | None = None, shareable: bool = False, teeth: bool = False) -> FaceModel:
-    """Add a file in FLAME's schema to this user's face models, unless it is already there.
+    """Add a face model's file (FLAME's schema, GNM Head, ICT-FaceKit) to this user's, unless it is already there.
 
-    The default name is the file's. Landmarks are placed by running the landmark detector on pictures of the model (some
-    minutes, once). With `teeth`, FLAME gets those of GaussianAvatars.
+    The default name is the file's; ICT-FaceKit is `ict`. Landmarks are placed by running the landmark detector on
+    pictures of the model (some minutes, once). With `teeth`, FLAME gets those of GaussianAvatars.
 
     Raises:
         UserError: the file is missing, damaged or in another schema, or the name is taken.
     """
-    name = name or path.stem.lower().replace(" ", "_")
+    name = name or default_name(path)
     if not name.replace("-", "").replace("_", "").isalnum():
         raise UserError(f"{name!r}: give the face model a name of letters, digits, '-' and '_' with --name")
-    if not path.is_file():
+    if not path.is_file() and not is_ict_folder(path):
         raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
     with hold(cache_folder() / "face_models" / "added" / name):
         return _add(path, name, shareable, teeth)
 
 
 def _add(path: Path, name: str, shareable: bool, teeth: bool) -> FaceModel:
-    digest, known = file_digest(path), read_added_source(name)
+    digest = file_digest(path / NEUTRAL if path.is_dir() else path)
+    known = read_added_source(name)
     other = f"add this one under another name: mien face-models --add {path} --name NAME"
     if is_built_in(name):
         raise UserError(f"{path}: {name!r} is the name of one of mien's own face models; {other}")
     if known is not None and known["sha256"] != digest:
         raise UserError(f"{path}: another file has the name {name!r}, {known['path']}; {other}")
     if known is None:
-        flame = read_flame(path)
-        flame = with_teeth(flame, str(path)) if teeth else flame
-        model = _calibrated(flame_face_model(flame, name, shareable))
+        model = _calibrated(read_model_file(path, name, shareable, teeth))
     else:
         model = load_face_model(name)
         if teeth and len(model.template) != VERTICES + TOOTH_VERTICES:

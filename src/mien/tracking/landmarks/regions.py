@@ -18,7 +18,7 @@ _FOREHEAD, _CHIN, _TEMPLES, _TRAGI, _JAW_CORNERS = 10, 152, (127, 356), (234, 45
 
 
 def with_regions_by_landmarks(model: FaceModel) -> FaceModel:
-    """Return the model with the regions of the default model, except teeth and tongue. Eyes stay as they are."""
+    """Return the model with the regions of the default model. Those that it has stay, except skin and neck."""
     marks = model.landmark_positions(model.template, "mediapipe").numpy()
     middle = model.template[model.faces].numpy().mean(1)
     outside = find_outside(model.template.numpy(), model.faces.numpy())
@@ -69,11 +69,12 @@ def _around_eyes(
 
 
 def _named(model: FaceModel, found: dict[str, Bool[np.ndarray, " f"]]) -> FaceModel:
-    names = ("skin", "eyes", "irises", *found)
+    known = [name for name in model.region_names if name not in ("skin", "neck")]
+    names = ("skin", *known, *(name for name in found if name not in known))
     regions = np.zeros(len(model.faces), np.int64)
     for name, mask in found.items():  # Later regions overwrite earlier ones.
         regions[mask] = names.index(name)
-    for name in ("eyes", "irises"):
+    for name in known:
         regions[model.region_mask(name).numpy()] = names.index(name)
     return replace(model, region_names=names, face_regions=torch.from_numpy(regions))
 

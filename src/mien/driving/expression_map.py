@@ -1,0 +1,188 @@
+"""Expressions of one face model in the terms of another, so that any recording drives any avatar.
+
+Models whose expressions have ARKit's names share them by name. For others, a linear map is fitted here, without
+anybody's weights: both neutral faces are registered by their landmarks, and each motion of the one is matched by the
+other's motions in the least-squares sense, within their bounds. Eyes and neck turn alike in all models.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.driving.constants import DRIVING
+from mien.driving.motion import ARKIT_NAMES
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams
+
+_MARKS = "mediapipe"
+_FACE_MARKS = 468
+"""Number of landmarks before those of the irises, which turn with the eyes."""
+_JAW = "jaw"
+_BATCH = 16
+"""Number of motions that are posed at once, which bounds the memory."""
+_LEAST_COMMON = 30
+"""Least number of ARKit's names that two models need in common to share them by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExpressionMap:
+    """The map from a source model's motions (expressions, then a free jaw's axis-angle) to a target's."""
+
+    source: FaceModel
+    target: FaceModel
+    toward: Float[Tensor, "s t"]
+    """What each motion of the source asks of each motion of the target: the right sides of the normal equations, or
+    the solution itself if `normal` is None."""
+    normal: Float[Tensor, "t t"] | None
+    """Matrix of the normal equations of the target's motions. None if names are shared."""
+
+    def __call__(self, face: FaceParams) -> FaceParams:
+        """Return the target's mean person with the same motions and head poses, within the bounds of its expressions.
+
+        Args:
+            face: Face parameters of the source model.
+        """
+        given = _motions(self.source, face)
+        wanted = given.double() @ self.toward
+        lower, upper = _bounds(self.target)
+        if self.normal is not None:
+            wanted = _within_bounds(self.normal, wanted, lower, upper)
+        found = wanted.clamp(lower, upper).to(face.expression)
+        rest, e = self.target.neutral(len(face)), len(self.target.expression_names)
+        joints = rest.joints.clone()
+        for row, name in enumerate(self.target.free_joint_names):
+            if name == _JAW:
+                joints[:, row] = found[:, e:]
+            elif name in self.source.free_joint_names:
+                joints[:, row] = face.joints[:, self.source.free_joint_names.index(name)]
+        return replace(
+            rest,
+            expression=found[:, :e],
+            joints=joints,
+            head_rotation=face.head_rotation,
+            head_translation=face.head_translation,
+        )
+
+
+def fit_expression_map(source: FaceModel, target: FaceModel) -> ExpressionMap:
+    """Fit the map between two face models.
+
+    Raises:
+        UserError: one of them has no landmarks, by which faces are registered.
+    """
+    shared = set(source.expression_names) & set(target.expression_names) & set(ARKIT_NAMES)
+    if len(shared) >= _LEAST_COMMON and not any(_JAW in model.free_joint_names for model in (source, target)):
+        by_name = torch.zeros(len(source.expression_names), len(target.expression_names), dtype=torch.float64)
+        for name in shared:
+            by_name[source.expression_names.index(name), target.expression_names.index(name)] = 1
+        return ExpressionMap(source, target, by_name, None)
+    for model in (source, target):
+        if _MARKS not in model.landmarks:
+            raise UserError(
+                f"the face model {model.name!r} has no landmarks, by which expressions are transferred; add it again "
+                "(`mien face-models --add FILE`)"
+            )
+    (rest, theirs), (our_rest, ours) = _displacements(_at_landmarks(source)), _displacements(_at_landmarks(target))
+    theirs = (theirs @ _registration(rest, our_rest).T).flatten(1)
+    ours = ours.flatten(1)
+    noise = DRIVING.transfer_noise
+    normal = ours @ ours.T / noise**2 + torch.diag(_precisions(target))
+    return ExpressionMap(source, target, theirs @ ours.T / noise**2, normal)
+
+
+def _motions(model: FaceModel, face: FaceParams) -> Float[Tensor, "b s"]:
+    if _JAW not in model.free_joint_names:
+        return face.expression
+    return torch.cat([face.expression, face.joints[:, model.free_joint_names.index(_JAW)]], dim=1)
+
+
+def _bounds(model: FaceModel) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
+    bounds = model.expression_bounds.double()
+    if _JAW in model.free_joint_names:
+        bounds = torch.cat([bounds, torch.tensor(DRIVING.transfer_jaw, dtype=torch.float64)])
+    return bounds[:, 0], bounds[:, 1]
+
+
+def _precisions(model: FaceModel) -> Float[Tensor, " t"]:
+    """Inverse variances of the motions, by which the fit prefers usual faces."""
+    e, sigmas = len(model.expression_names), model.expression_sigmas
+    spread = torch.full((e,), DRIVING.transfer_spread) if sigmas is None else sigmas
+    if _JAW in model.free_joint_names:
+        spread = torch.cat([spread, torch.full((3,), DRIVING.transfer_jaw_spread)])
+    return spread.double().clamp_min(1e-6).square().reciprocal()
+
+
+def _marks(model: FaceModel, face: FaceParams) -> Float[Tensor, "b l 3"]:
+    vertices = model.head_vertices_reference(face)
+    return model.landmark_positions(vertices, _MARKS)[:, :_FACE_MARKS].double()
+
+
+def _at_landmarks(model: FaceModel) -> FaceModel:
+    """Return the model without the vertices that no landmark needs, so that it is posed quickly."""
+    corners = model.faces[model.landmarks[_MARKS].faces]
+    kept, corners = torch.unique(corners, return_inverse=True)
+    marks = replace(model.landmarks[_MARKS], faces=torch.arange(len(corners)))
+    return replace(
+        model,
+        template=model.template[kept],
+        faces=corners.reshape(-1, 3),
+        uv_faces=model.uv_faces[model.landmarks[_MARKS].faces],
+        face_regions=model.face_regions[model.landmarks[_MARKS].faces],
+        identity_basis=model.identity_basis[:, kept],
+        expression_basis=model.expression_basis[:, kept],
+        skinning_weights=model.skinning_weights[kept],
+        pose_basis=None if model.pose_basis is None else model.pose_basis[:, kept],
+        joint_regressor=None,
+        landmarks={_MARKS: marks},
+    )
+
+
+def _displacements(model: FaceModel) -> tuple[Float[Tensor, "l 3"], Float[Tensor, "s l 3"]]:
+    """The landmarks of the mean face in metres, and how far each motion moves them, in metres per unit."""
+    e = len(model.expression_names)
+    has_jaw = _JAW in model.free_joint_names
+    count = e + 3 * has_jaw
+    rest = _marks(model, model.neutral())
+    found = []
+    for start in range(0, count, _BATCH):
+        end = min(start + _BATCH, count)
+        face = model.neutral(end - start)
+        expression, joints = face.expression.clone(), face.joints.clone()
+        for row, motion in enumerate(range(start, end)):
+            if motion < e:
+                expression[row, motion] = 1
+            else:
+                joints[row, model.free_joint_names.index(_JAW), motion - e] = DRIVING.transfer_jaw_step
+        found.append(_marks(model, replace(face, expression=expression, joints=joints)) - rest)
+    moved = torch.cat(found)
+    moved[e:] /= DRIVING.transfer_jaw_step
+    return rest[0], moved
+
+
+def _registration(theirs: Float[Tensor, "l 3"], ours: Float[Tensor, "l 3"]) -> Float[Tensor, "3 3"]:
+    """Return the rotation, times the scale, of the similarity that takes one neutral face to the other (Umeyama)."""
+    a, b = theirs - theirs.mean(0), ours - ours.mean(0)
+    u, sizes, vt = torch.linalg.svd(b.T @ a)
+    signs = torch.ones(3, dtype=a.dtype)
+    signs[2] = torch.linalg.det(u @ vt).sign()
+    return (sizes * signs).sum() / a.square().sum() * (u * signs) @ vt
+
+
+def _within_bounds(
+    normal: Float[Tensor, "t t"], wanted: Float[Tensor, "b t"], lower: Float[Tensor, " t"], upper: Float[Tensor, " t"]
+) -> Float[Tensor, "b t"]:
+    """Minimise x normal x / 2 - wanted x within bounds, from the clamped free solution, one motion after the other."""
+    found = torch.linalg.solve(normal, wanted.T).T
+    if bool(((found >= lower) & (found <= upper)).all()):
+        return found
+    found = found.clamp(lower, upper)
+    slope = found @ normal - wanted
+    for _ in range(DRIVING.transfer_sweeps):
+        for motion in range(len(normal)):
+            old = found[:, motion]
+            new = (old - slope[:, motion] / normal[motion, motion]).clamp(lower[motion], upper[motion])
+            slope += (new - old)[:, None] * normal[motion]
+            found[:, motion] = new
+    return found
