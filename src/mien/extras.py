@@ -12,6 +12,7 @@ EXTRA_OF = {
     "av": "create",
     "cv2": "create",
     "mediapipe": "create",
+    "ai_edge_litert": "create",
     "anny": "create",
     "stlpips_pytorch": "create",
     "matplotlib": "create",
@@ -26,6 +27,7 @@ EXTRA_OF = {
 """Name of a module -> the extra that installs it."""
 PACKAGE_OF = {
     "cv2": "opencv-python-headless",
+    "ai_edge_litert": "ai-edge-litert",
     "stlpips_pytorch": "stlpips-pytorch",
     "PIL": "pillow",
     "pxr": "usd-core",

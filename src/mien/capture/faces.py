@@ -107,7 +107,8 @@ class MeshReader:
             is_video: whether pictures are consecutive, so that faces are followed.
             detector: what runs the networks.
         """
-        self._most, self._is_video, self._detector = most_faces, is_video, detector
+        self._most, self._is_video = most_faces, is_video
+        self._detector: DetectorChoice = detector
 
     def __enter__(self) -> "MeshReader":
         self._stack = ExitStack()

@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from mien.capture.litert.boxes import BoxNetwork
 from mien.capture.litert.networks import Network, cut_out, to_picture
 
+_LANDMARKS = 478
 _ROOM = 1.5
 """Side of the square that the network sees, in sides of the face's box."""
 _OUTER_CORNERS = (33, 263)
@@ -48,9 +49,7 @@ class Mesh:
                     face = self._read(image, square)
                     faces += [] if face is None else [face]
         self._squares = [_around(face) for face in faces]
-        return np.array(faces).reshape(-1, self.landmarks, 3)
-
-    landmarks = 478
+        return np.array(faces).reshape(-1, _LANDMARKS, 3)
 
     def _read(self, image: np.ndarray, square: _Square) -> Float[np.ndarray, "478 3"] | None:
         side = self._network.side
@@ -64,10 +63,8 @@ class Mesh:
 
 
 def _square(corners: Float[np.ndarray, "2 2"], eyes: Float[np.ndarray, "2 2"]) -> _Square:
-    along = eyes[1] - eyes[0]
-    return _Square(
-        corners.mean(0), _ROOM * float((corners[1] - corners[0]).max()), float(np.arctan2(along[1], along[0]))
-    )
+    extent, along = (corners[1] - corners[0]).max(), eyes[1] - eyes[0]
+    return _Square(corners.mean(0), _ROOM * float(extent), float(np.arctan2(along[1], along[0])))
 
 
 def _around(face: Float[np.ndarray, "478 3"]) -> _Square:
@@ -76,8 +73,6 @@ def _around(face: Float[np.ndarray, "478 3"]) -> _Square:
 
 
 def _is_same(one: _Square, other: _Square) -> bool:
-    shared = ((one.extent + other.extent) / 2 - np.abs(one.center - other.center)).clip(
-        0, min(one.extent, other.extent)
-    )
-    area = float(shared.prod())
+    reach = (one.extent + other.extent) / 2 - np.abs(one.center - other.center)
+    area = float(reach.clip(0, min(one.extent, other.extent)).prod())
     return area / (one.extent**2 + other.extent**2 - area) > _SAME_FACE
