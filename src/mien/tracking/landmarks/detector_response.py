@@ -93,15 +93,18 @@ def read_response(face_model: FaceModel, sigma: float, detector: Detector = "med
         return DetectorResponse(mean, by_turn, by_expression, by_person, scale * float(file["rest_sigma"]))
 
 
-def write_response(path: Path, face_model: FaceModel, response: DetectorResponse, people: int) -> None:
+def write_response(
+    path: Path, face_model: FaceModel, response: DetectorResponse, people: int, detector: Detector = "mediapipe"
+) -> None:
     """Write a response for `read_response`."""
     arrays = {
         name: (1e3 * getattr(response, name)).numpy().astype(np.float16)
         for name in ("mean", "by_turn", "by_expression", "by_person")
     }
     path.parent.mkdir(parents=True, exist_ok=True)
+    ending = "" if detector == "mediapipe" else f" --detector {detector}"
     np.savez_compressed(
         path, rest_sigma=1e3 * response.rest_sigma, people=people, topology_hash=face_model.topology_hash,
-        content_hash=face_model.content_hash, command=f"{_COMMAND} {face_model.name}",
+        content_hash=face_model.content_hash, command=f"{_COMMAND} {face_model.name}{ending}",
         **arrays,
     )  # fmt: skip
