@@ -56,7 +56,7 @@ def missing_package(error: ImportError) -> str | None:
     if module == "mediapipe" and sys.version_info[:2] > _LAST_PYTHON_OF_MEDIAPIPE:
         here = ".".join(map(str, sys.version_info[:2]))
         return (
-            f"the detector of faces, mediapipe 0.10.21, has no package for Python {here}; use Python 3.11 or 3.12 to "
-            "make avatars from video. Finished avatars can be used here"
+            f"the detector mediapipe 0.10.21 has no package for Python {here}; leave out --capture.detector, so that "
+            "ai-edge-litert finds the faces"
         )
     return f"this needs the package {package}, which is not installed; run `pip install 'mien[{extra}]'`"

@@ -49,8 +49,7 @@ class CaptureSettings:
     """Landmarks made elsewhere, a row for each frame of the source: .csv or .safetensors (docs/conventions.md)."""
 
     detector: DetectorChoice = "auto"
-    """Library that runs the networks which find face and person. auto: mediapipe where it is installed, and otherwise
-    litert (ai-edge-litert), as on Python 3.13 and later and on Linux on ARM."""
+    """Library that runs the networks for face and person. auto: mediapipe if installed, otherwise litert."""
 
     def check(self) -> None:
         """Raise a UserError for the first value that is not allowed."""
