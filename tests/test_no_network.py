@@ -48,7 +48,7 @@ def test_an_avatar_is_made_and_used_without_a_network(subject: Path) -> None:
 @pytest.mark.slow
 def test_a_capture_by_litert_is_made_without_a_network(subject: Path) -> None:
     pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
-    video = next(subject.glob("*.mp4"))
+    video = next(subject.glob("synthetic*.mp4"))
     offline("capture", str(video), "--out", str(subject.parent / "other"), "--capture.detector", "litert")
 
 
