@@ -37,7 +37,7 @@ def test_an_avatar_is_made_and_used_without_a_network(subject: Path) -> None:
     run = subject / "runs" / DEFAULT_METHOD
     assert (run / "report.html").is_file()
     avatar, out = str(subject), subject.parent
-    for ending in ("html", "mien", "glb"):
+    for ending in ("html", "mien"):
         offline("export", avatar, "--out", str(out / f"me.{ending}"))
     offline("render", str(out / "me.mien"), "--out", str(out / "still.png"))
     offline("drive", avatar, "--by", avatar, "--out", str(out / "driven.mp4"))
