@@ -23,12 +23,14 @@ NO_WEBGPU = "Chromium has no adapter of WebGPU"
 NO_VALIDATOR = "no gltf-validator in web/node_modules"
 NO_SPLAT_TRANSFORM = "no @playcanvas/splat-transform in web/node_modules"
 NO_MOUNT = "no right to mount a small disk"
+NO_NAMESPACE = "no right to make a network namespace"
 NO_TASKS_VISION = "no @mediapipe/tasks-vision in web/node_modules"
 
 _REMEDIES = {
     NO_GPU: "run `make gpu` on a machine with an NVIDIA GPU and the CUDA toolkit",
     NO_TEST_DATA: "set MIEN_TEST_DATA to the folder that holds it",
     NO_MOUNT: "run the tests as root, in a container that may mount",
+    NO_NAMESPACE: "run the tests on Linux where `unshare -rn true` works",
     IS_ROOT: "run the tests as another user",
     NO_PROC: "run them on Linux",
     NO_PACKAGE: "run `make setup`; some packages exist on some platforms only",
@@ -44,7 +46,7 @@ _REMEDIES = {
 }
 
 
-_EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_MOUNT, NO_INSTRUCTIONS)
+_EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_MOUNT, NO_NAMESPACE, NO_INSTRUCTIONS)
 """Reasons that lie in the machine alone. Others mean an incomplete set-up; MIEN_STRICT makes them an error."""
 _AREAS = {
     "pages in a browser": (NO_CHROMIUM, NO_WEBGPU),

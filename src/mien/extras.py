@@ -12,6 +12,7 @@ EXTRA_OF = {
     "av": "create",
     "cv2": "create",
     "mediapipe": "create",
+    "ai_edge_litert": "create",
     "anny": "create",
     "stlpips_pytorch": "create",
     "matplotlib": "create",
@@ -26,6 +27,7 @@ EXTRA_OF = {
 """Name of a module -> the extra that installs it."""
 PACKAGE_OF = {
     "cv2": "opencv-python-headless",
+    "ai_edge_litert": "ai-edge-litert",
     "stlpips_pytorch": "stlpips-pytorch",
     "PIL": "pillow",
     "pxr": "usd-core",
@@ -54,7 +56,7 @@ def missing_package(error: ImportError) -> str | None:
     if module == "mediapipe" and sys.version_info[:2] > _LAST_PYTHON_OF_MEDIAPIPE:
         here = ".".join(map(str, sys.version_info[:2]))
         return (
-            f"the detector of faces, mediapipe 0.10.21, has no package for Python {here}; use Python 3.11 or 3.12 to "
-            "make avatars from video. Finished avatars can be used here"
+            f"the detector mediapipe 0.10.21 has no package for Python {here}; leave out --capture.detector, so that "
+            "ai-edge-litert finds the faces"
         )
     return f"this needs the package {package}, which is not installed; run `pip install 'mien[{extra}]'`"

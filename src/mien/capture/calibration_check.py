@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mien.camera import Camera
+from mien.capture.backend import DetectorChoice
 from mien.capture.calibration import CalibratedCamera
 from mien.capture.crop import Crop
 from mien.capture.faces import LANDMARKS, LandmarkDetector
@@ -51,7 +52,7 @@ def some_timesteps(found: Bool[np.ndarray, "t c"]) -> list[int]:
 
 
 def landmarks_at(
-    frames: FrameSource, boxes: Float[np.ndarray, "t 4"], timesteps: Sequence[int]
+    frames: FrameSource, boxes: Float[np.ndarray, "t 4"], timesteps: Sequence[int], detector: DetectorChoice = "auto"
 ) -> Float[np.ndarray, "n l 2"]:
     """Return landmarks in pixels of the source's pictures at some timesteps; NaN where no face is found.
 
@@ -59,17 +60,18 @@ def landmarks_at(
         frames: the source.
         boxes: left, top, right, bottom of the face in pixels of its pictures, at all timesteps; NaN for no face.
         timesteps: increasing numbers of the frames taken.
+        detector: what runs the networks.
     """
     found = np.full((len(timesteps), LANDMARKS, 2), np.nan)
     places = {timestep: place for place, timestep in enumerate(timesteps) if np.isfinite(boxes[timestep, 0])}
     if not places:
         return found
-    with LandmarkDetector(several_faces=False) as detector:
+    with LandmarkDetector(several_faces=False, detector=detector) as finder:
         for timestep, frame in enumerate(itertools.islice(frames.frames(), max(places) + 1)):
             if timestep in places:
                 picture = frame.picture()
                 crop = _around(boxes[timestep], picture.shape[1], picture.shape[0])
-                for face in detector.detect(crop.apply(picture))[:1]:
+                for face in finder.detect(crop.apply(picture))[:1]:
                     found[places[timestep]] = face + (crop.left, crop.top)
     return found
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mien.camera import Camera
+from mien.capture.backend import detector_entry
 from mien.capture.calibration import CalibratedCamera, match_sources, read_calibration
 from mien.capture.calibration_check import advise_on, landmarks_at, some_timesteps, warn_of_misfit
 from mien.capture.capture import Capture
@@ -205,7 +206,7 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
     for job, camera in zip(jobs, cameras, strict=True):
         landmarks = read_given(job.settings, job.frames).landmarks
         tell_kind(job.frames)
-        survey = survey_source(job.frames, folder / camera.camera_id, landmarks)
+        survey = survey_source(job.frames, folder / camera.camera_id, landmarks, job.detector)
         tell_fields(job.frames, survey)
         fitted = camera.for_pictures(*(int(side) for side in survey.picture_size))
         views.append(_View(camera.camera_id, job, survey, choose_person(survey), fitted, camera))
@@ -240,6 +241,7 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
             layout,
             work / _chunks_of(view.camera_id),
             index,
+            whole.detector,
         )
         for index, (view, crop) in enumerate(zip(views, crops, strict=True))
     ]
@@ -253,7 +255,7 @@ def _advice(views: list[_View], boxes: Float[np.ndarray, "t c 4"]) -> str:
     for index, view in enumerate(views):
         given = read_given(view.job.settings, view.job.frames).landmarks
         if given is None:
-            landmarks[:, index] = landmarks_at(view.job.frames, boxes[:, index], timesteps)
+            landmarks[:, index] = landmarks_at(view.job.frames, boxes[:, index], timesteps, view.job.detector)
         else:
             landmarks[:, index] = given[view.survey.numbers[timesteps]]
     calibrated = [view.calibrated for view in views]
@@ -309,6 +311,7 @@ def _finish(
                 }
                 for view, crop in zip(views, crops, strict=True)
             },
+            **detector_entry("mediapipe" if whole.settings.landmarks else whole.detector),
         },
         calibration=calibration,
         quality=quality,

@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 
+from mien.capture.backend import Detector, choose_detector, detector_entry
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FrameLayout
 from mien.capture.given import GivenInputs, read_given
@@ -46,6 +47,7 @@ class CaptureJob:
     name: str
     key: str
     replace: bool
+    detector: Detector = "mediapipe"
 
 
 def capture_video(
@@ -159,14 +161,17 @@ def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_
         "landmarks": file_digest(settings.landmarks) if settings.landmarks else None,
         "mattes": open_source(settings.mattes, FrameSelection(), 25.0).content_hash if settings.mattes else None,
     }
+    detector = "mediapipe" if settings.landmarks and settings.mattes else choose_detector(settings.detector)
+    own = asdict(settings) | contents
+    del own["detector"]
     content = {
         "recipe": RECIPE,
         "source": frames.content_hash,
         "name": name,
-        "settings": asdict(settings) | contents,
+        "settings": own | detector_entry(detector),
     }
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    return CaptureJob(frames, settings, name, key, replace_others)
+    return CaptureJob(frames, settings, name, key, replace_others, detector)
 
 
 def _part_key(job: CaptureJob, number: int, count: int) -> str:
@@ -263,10 +268,10 @@ def _leads_out(work: Path) -> bool:
 
 def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> Survey:
     tell_kind(job.frames)
-    survey = survey_source(job.frames, prepare(folder, job.key), given.landmarks)
+    survey = survey_source(job.frames, prepare(folder, job.key), given.landmarks, job.detector)
     tell_fields(job.frames, survey)
     if given.landmarks is None:
-        check_upright(job.frames, survey, job.settings.turn)
+        check_upright(job.frames, survey, job.settings.turn, job.detector)
     return survey
 
 
@@ -278,8 +283,9 @@ def _process(job: CaptureJob, reel: Reel, part: Part, place: tuple[int, int], gi
     work = prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
     check_room(layout, part.name, out)
-    chunks = process_part(reel, part, given, layout, work / _CHUNKS)
-    finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place), (STATE, _CHUNKS))
+    chunks = process_part(reel, part, given, layout, work / _CHUNKS, detector=job.detector)
+    detector = job.detector if given.landmarks is None else "mediapipe"
+    finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place, detector), (STATE, _CHUNKS))
 
 
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:

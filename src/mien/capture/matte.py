@@ -1,6 +1,6 @@
 """Step 4, mattes: made by segmentation, made with a clean plate, or read from files that were made elsewhere.
 
-The segmentation is MediaPipe's at 256x256, stabilised over time and refined at the picture's full size.
+The segmentation is MediaPipe's network at 256x256, stabilised over time and refined at the picture's full size.
 """
 
 from abc import ABC, abstractmethod
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mien.capture.backend import DetectorChoice, choose_detector
 from mien.capture.constants import CAPTURE
 from mien.capture.crop import Crop
 from mien.capture.given import GivenMattes
@@ -25,23 +26,29 @@ _MODEL_SIZE = 256
 class Segmenter:
     """Computes soft person masks of consecutive pictures of one clip. Use as a context manager."""
 
+    def __init__(self, detector: DetectorChoice = "auto") -> None:
+        self._detector: DetectorChoice = detector
+
     def __enter__(self) -> "Segmenter":
-        module = load_solution("selfie_segmentation")
-        with quiet_mediapipe():
-            self._model = module.SelfieSegmentation(model_selection=0)
-            self._model.process(np.zeros((_MODEL_SIZE, _MODEL_SIZE, 3), np.uint8))
+        self._stack = ExitStack()
+        if choose_detector(self._detector) == "litert":
+            from mien.capture.litert.person import PersonNetwork
+
+            self._find = PersonNetwork().find
+        else:
+            self._find = _mediapipe_person(self._stack)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._model.close()
+        self._stack.close()
 
     def segment(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "256 256"]:
         """Return the probability of a person in each part of the picture, 0..1, stabilised by the previous one."""
         small = cv2.resize(image, (_MODEL_SIZE, _MODEL_SIZE), interpolation=cv2.INTER_AREA)
-        mask = self._model.process(small).segmentation_mask.copy()
+        mask = self._find(small)
         colors = cv2.blur(small, (5, 5)).astype(np.float32) / 255
         if self._last is not None:
             last_mask, last_colors = self._last
@@ -51,6 +58,14 @@ class Segmenter:
             mask = mask + weight * (last_mask - mask)
         self._last = (mask, colors)
         return mask
+
+
+def _mediapipe_person(stack: ExitStack) -> Callable[[np.ndarray], np.ndarray]:
+    module = load_solution("selfie_segmentation")
+    with quiet_mediapipe():
+        model = stack.enter_context(module.SelfieSegmentation(model_selection=0))
+        model.process(np.zeros((_MODEL_SIZE, _MODEL_SIZE, 3), np.uint8))
+    return lambda image: model.process(image).segmentation_mask.copy()
 
 
 def refine_matte(image: UInt8[np.ndarray, "h w 3"], mask: Float[np.ndarray, "256 256"]) -> UInt8[np.ndarray, "h w"]:
@@ -167,11 +182,15 @@ class ReadMattes(Matting):
 
 
 def choose_matting(
-    stack: ExitStack, crop: Crop, plate: UInt8[np.ndarray, "h w 3"] | None, mattes: GivenMattes | None
+    stack: ExitStack,
+    crop: Crop,
+    plate: UInt8[np.ndarray, "h w 3"] | None,
+    mattes: GivenMattes | None,
+    detector: DetectorChoice = "auto",
 ) -> Matting:
     """Return the matting that the user's inputs allow. `stack` closes whatever is opened."""
     if mattes is not None:
         return ReadMattes(mattes, crop)
-    segmenter = stack.enter_context(Segmenter())
+    segmenter = stack.enter_context(Segmenter(detector))
     refine = refine_matte if plate is None else partial(plate_matte, plate=crop.apply(plate))
     return SegmentedMattes(segmenter, refine)

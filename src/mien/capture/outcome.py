@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mien.capture.backend import Detector, detector_entry
 from mien.capture.faces import second_difference_jitter
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.capture.pace import frame_rate, pace_report
@@ -31,6 +32,8 @@ class Origin:
     """Name of the whole, which may have several parts."""
     place: tuple[int, int]
     """The part's number, from 1, and the number of parts."""
+    detector: Detector = "mediapipe"
+    """What found the landmarks."""
 
 
 def finish_part(
@@ -66,6 +69,7 @@ def finish_part(
             "crop": {"left": crop.left, "top": crop.top, "width": crop.crop_width, "height": crop.crop_height},
             "first_frame": int(survey.numbers[0]),
             "part": {"of": origin.name, "number": origin.place[0], "count": origin.place[1]},
+            **detector_entry(origin.detector),
         },
         quality=quality,
     )

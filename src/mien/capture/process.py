@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt64
 
+from mien.capture.backend import DetectorChoice
 from mien.capture.constants import CAPTURE
 from mien.capture.crop import Crop
 from mien.capture.faces import LANDMARKS, LandmarkDetector
@@ -127,9 +128,10 @@ def _center(box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 2"]:
 class PartProcessor:
     """Processes the frames of one part in order, a chunk at a time."""
 
-    def __init__(self, reel: Reel, part: Part, given: GivenInputs, done: int) -> None:
+    def __init__(self, reel: Reel, part: Part, given: GivenInputs, done: int, detector: DetectorChoice) -> None:
         """Prepare to process the part, skipping its first `done` frames."""
         self._path, self._part, self._given = reel.path, part, given
+        self._detector: DetectorChoice = detector
         begin = done - CAPTURE.lead_in if done >= CAPTURE.lead_in else 0
         left = part.timesteps - begin
         self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
@@ -153,9 +155,9 @@ class PartProcessor:
         with ExitStack() as stack:
             follower = None
             if self._given.landmarks is None:
-                detector = stack.enter_context(LandmarkDetector(bool(part.person.crowded.any())))
+                detector = stack.enter_context(LandmarkDetector(bool(part.person.crowded.any()), self._detector))
                 follower = LandmarkFollower(detector, part.survey, part.person, part.crop)
-            matting = choose_matting(stack, part.crop, self._given.plate, self._given.mattes)
+            matting = choose_matting(stack, part.crop, self._given.plate, self._given.mattes, self._detector)
             for timestep, image in self._recent:
                 if follower is not None:
                     follower.find(timestep, image)
@@ -208,7 +210,13 @@ def _read(path: Path) -> Chunk:
 
 
 def process_part(
-    reel: Reel, part: Part, given: GivenInputs, layout: FrameLayout, work: Path, camera: int = 0
+    reel: Reel,
+    part: Part,
+    given: GivenInputs,
+    layout: FrameLayout,
+    work: Path,
+    camera: int = 0,
+    detector: DetectorChoice = "auto",
 ) -> list[Chunk]:
     """Process all frames of a part, as those of one camera of the layout.
 
@@ -224,7 +232,7 @@ def process_part(
     done = sum(len(chunk.valid) for chunk in chunks)
     if done == layout.timesteps:
         return chunks
-    processor = PartProcessor(reel, part, given, done)
+    processor = PartProcessor(reel, part, given, done, detector)
     with FrameWriter(layout, camera) as writer, progress_bar(f"capture {part.name}", layout.timesteps, done) as advance:
         for start, path in itertools.islice(paths.items(), len(chunks), None):
             chunk = processor.process(start, min(_CHUNK, layout.timesteps - start), writer, camera, advance)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from mien.bounded import MAX_SIDE
+from mien.capture.backend import DetectorChoice
 from mien.capture.deinterlacing import Deinterlace
 from mien.errors import UserError
 
@@ -46,6 +47,9 @@ class CaptureSettings:
     """Mattes made elsewhere: a video or a folder of pictures, one for each frame of the source. White is the person."""
     landmarks: Path | None = None
     """Landmarks made elsewhere, a row for each frame of the source: .csv or .safetensors (docs/conventions.md)."""
+
+    detector: DetectorChoice = "auto"
+    """Library that runs the networks for face and person. auto: mediapipe if installed, otherwise litert."""
 
     def check(self) -> None:
         """Raise a UserError for the first value that is not allowed."""

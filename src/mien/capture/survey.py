@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
 
+from mien.capture.backend import DetectorChoice
 from mien.capture.constants import CAPTURE
 from mien.capture.faces import MAX_FACES, FaceFinder
 from mien.capture.source import FrameSource, SourceFrame
@@ -58,7 +59,12 @@ class Survey:
     """Width and height of the source in pixels."""
 
 
-def survey_source(frames: FrameSource, work: Path, landmarks: Float[np.ndarray, "n l 2"] | None = None) -> Survey:
+def survey_source(
+    frames: FrameSource,
+    work: Path,
+    landmarks: Float[np.ndarray, "n l 2"] | None = None,
+    detector: DetectorChoice = "auto",
+) -> Survey:
     """Survey all frames. Results that an earlier call left in the folder `work` are kept.
 
     Args:
@@ -66,6 +72,7 @@ def survey_source(frames: FrameSource, work: Path, landmarks: Float[np.ndarray, 
         work: the folder for the results.
         landmarks: landmarks for every frame of the source in pixels, NaN for no face. If they are given, faces are not
             searched.
+        detector: what runs the networks.
 
     Raises:
         UserError: the source cannot be decoded.
@@ -81,7 +88,7 @@ def survey_source(frames: FrameSource, work: Path, landmarks: Float[np.ndarray, 
     stream = itertools.islice(frames.frames(CAPTURE.survey_side), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
     with ExitStack() as stack:
-        find = _search(stack.enter_context(FaceFinder())) if landmarks is None else _look_up(landmarks / size)
+        find = _search(stack.enter_context(FaceFinder(detector))) if landmarks is None else _look_up(landmarks / size)
         advance = stack.enter_context(progress_bar(title, frames.expected_frames, len(done) * _CHUNK))
         while seen := _observe(itertools.islice(stream, _CHUNK), find, size, advance):
             _write(_chunk_path(work, len(done)), seen)
@@ -188,18 +195,19 @@ def _join(chunks: list[Survey]) -> Survey:
     return Survey(**joined, picture_size=chunks[0].picture_size)
 
 
-def check_upright(frames: FrameSource, survey: Survey, turned: int) -> None:
+def check_upright(frames: FrameSource, survey: Survey, turned: int, detector: DetectorChoice = "auto") -> None:
     """Warn if faces lie on their side, and refuse a video without a face.
 
     Args:
         frames: the source.
         survey: the source's survey.
         turned: degrees by which the pictures have been turned already.
+        detector: what runs the networks.
 
     Raises:
         UserError: no face was found. The message names the remedy that fits.
     """
-    turn = _best_turn(frames, survey)
+    turn = _best_turn(frames, survey, detector)
     option = f"--capture.turn {(turned + turn) % 360}"
     if not np.isfinite(survey.boxes).any():
         raise _no_face_because(frames, survey, option if turn else "")
@@ -208,13 +216,13 @@ def check_upright(frames: FrameSource, survey: Survey, turned: int) -> None:
         say(f"warning: {frames.path}: the face seems to lie {lies}; if it does, add {option}")
 
 
-def _best_turn(frames: FrameSource, survey: Survey) -> int:
+def _best_turn(frames: FrameSource, survey: Survey, detector: DetectorChoice) -> int:
     """Return the degrees clockwise after which faces are found with the most confidence."""
     seen = np.flatnonzero(np.isfinite(survey.boxes[:_BEGINNING, 0, 0]))
     numbers = seen if len(seen) else np.arange(min(_BEGINNING, len(survey.boxes)))
     chosen = set(numbers[:: -(-len(numbers) // _MAX_TURNED)].tolist())
     totals = np.zeros(4)
-    with FaceFinder() as finder:
+    with FaceFinder(detector) as finder:
         for index, frame in enumerate(itertools.islice(frames.frames(CAPTURE.survey_side), max(chosen) + 1)):
             if index in chosen:
                 picture = frame.picture()

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from mien.camera import Camera
 from mien.capture import Capture
+from mien.capture.backend import choose_detector, detector_entry
 from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import FilmedSequence, TrackedSequence
@@ -109,6 +110,7 @@ def filmed_sequence(
     """
     _check_cameras(path, cameras)
     _check_fps(path, fps)
+    found_by = detector_entry(choose_detector()) if landmarks is None else {}
     landmarks = detected_landmarks(images) if landmarks is None else landmarks
     valid = np.asarray(np.isfinite(landmarks).all((2, 3)))
     if not valid.any():
@@ -125,7 +127,7 @@ def filmed_sequence(
             landmarks=np.where(valid[..., None, None], landmarks, np.nan).astype(np.float32),
             valid=valid,
             principal_point=np.stack([camera.K[:2, 2].double().numpy() for camera in views]),
-            source={"file": path.name},
+            source={"file": path.name, **found_by},
             calibration=views,
         )
     )

@@ -11,7 +11,7 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+from mien.capture.faces import MeshReader
 from mien.rotation import align_centered
 from mien.tracking.landmarks import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
@@ -27,33 +27,18 @@ class FaceReader:
     """Detects landmarks in single pictures. Use as a context manager."""
 
     def __enter__(self) -> "FaceReader":
-        module = load_solution("face_mesh")
-        with quiet_mediapipe():
-            self._mesh = module.FaceMesh(static_image_mode=True, max_num_faces=1, refine_landmarks=True)
-            self._mesh.process(np.zeros((64, 64, 3), np.uint8))
-        self._quiet_until_found = True
+        self._mesh = MeshReader(1, is_video=False).__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._mesh.close()
+        self._mesh.__exit__(kind, error, traceback)
 
     def read(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 3"] | None:
         """Landmarks in pixels (z, away from the camera, in the same unit), or None if no face is found."""
-        picture = np.ascontiguousarray(image)
-        if self._quiet_until_found:
-            # MediaPipe prints its last warning with the first face.
-            with quiet_mediapipe():
-                found = self._mesh.process(picture).multi_face_landmarks
-            self._quiet_until_found = not found
-        else:
-            found = self._mesh.process(picture).multi_face_landmarks
-        if not found:
-            return None
-        height, width = image.shape[:2]
-        points = np.array([(point.x, point.y, point.z) for point in found[0].landmark])
-        return points * (width, height, width)
+        faces = self._mesh.read(np.ascontiguousarray(image))
+        return faces[0] if len(faces) else None
 
 
 @dataclass(frozen=True, eq=False)

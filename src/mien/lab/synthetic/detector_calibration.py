@@ -5,10 +5,13 @@ Run as `python -m mien.lab.synthetic.detector_calibration anny`.
 It draws synthetic people with skin, hair, glasses and beards through many kinds of lenses, runs the detector on them,
 and fits the model of `mien.tracking.landmarks.DetectorResponse`. The result ships with mien (src/mien/tracking/data).
 Run this only after a change of a face model, its landmarks or the painter: 200 people take half an hour.
+
+`--detector litert --people 20` measures how the other detector differs on the same pictures, and adds that to the
+response of mediapipe. Fewer people suffice for it, because both see the same faces.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,6 +19,7 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.capture.backend import Detector
 from mien.capture.faces import LandmarkDetector
 from mien.errors import UserError
 from mien.face import FaceModel, load_face_model
@@ -23,7 +27,7 @@ from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.progress import say, track_progress
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking.landmarks import DetectorResponse, response_path, write_response
+from mien.tracking.landmarks import DetectorResponse, read_response, response_path, write_response
 
 _FIRST_SEED = 500
 """First seed, far from those of the reference captures, so that nobody is both calibrated on and measured on."""
@@ -41,6 +45,8 @@ _HABIT_RIDGE = 2.0
 """Regularisation of the response to turns and expressions towards zero, in pictures."""
 _ROUNDS = 6
 """Rounds that alternate between habits and people."""
+_NOISE = 1e-3
+"""Noise of a landmark that a tracker expects, in metres."""
 _COMPONENTS = 40
 _FOLDS = 5
 
@@ -57,14 +63,18 @@ class Sightings:
     """Regressors that offsets may depend on: two turns, then the expression."""
 
 
-def sight_person(seed: int, face_model: FaceModel) -> Sightings:
-    """Draw one person who turns the head and makes faces, and run the detector."""
+def sight_person(seed: int, face_model: FaceModel, detectors: Sequence[Detector]) -> list[Sightings]:
+    """Draw one person who turns the head and makes faces, and run each detector."""
     scene = SyntheticScene(_recipe(seed, face_model), seed)
+    images = [scene.frame(timestep).image for timestep in range(scene.recipe.timesteps)]
+    return [_sight(scene, images, face_model, detector) for detector in detectors]
+
+
+def _sight(scene: SyntheticScene, images: Sequence[np.ndarray], face_model: FaceModel, detector: Detector) -> Sightings:
     found = []
-    with LandmarkDetector(several_faces=False) as detector:
-        for timestep in range(scene.recipe.timesteps):
-            image = scene.frame(timestep).image
-            faces = [detector.detect(image) for _ in range(_SHOWINGS)][-1]
+    with LandmarkDetector(several_faces=False, detector=detector) as finder:
+        for timestep, image in enumerate(images):
+            faces = [finder.detect(image) for _ in range(_SHOWINGS)][-1]
             if len(faces):
                 found.append((timestep, torch.from_numpy(np.asarray(faces[0])).float()))
     if not found:
@@ -107,6 +117,34 @@ def fit_response(people: Sequence[Sightings], components: int = _COMPONENTS) -> 
         by_person=_principal_components(of_people, components).reshape(-1, *mean.shape).double(),
         rest_sigma=_unexplained(of_people, components),
     )
+
+
+def differing_response(
+    known: DetectorResponse, seen: Sequence[Sightings], seen_by_other: Sequence[Sightings]
+) -> DetectorResponse:
+    """Return the response of another detector, from a known one and from the sightings of both in the same pictures.
+
+    Means and the part by turns change. Expressions and people keep what was measured on more people: what few people
+    say about them did not help on others.
+
+    Raises:
+        UserError: the two detectors found too few people in the same pictures.
+    """
+    pairs = [
+        (own, other)
+        for own, other in zip(seen, seen_by_other, strict=True)
+        if own.habits.shape == other.habits.shape and torch.equal(own.habits, other.habits)
+    ]
+    apart = [Sightings(own.R_seen, other.across - own.across, own.habits[:, :2]) for own, other in pairs]
+    difference = fit_response(apart, components=1)
+    mean, basis = known.mean + difference.mean, known.by_person.flatten(1)
+    habits = torch.cat([known.by_turn + difference.by_turn, known.by_expression]).float()
+    own = torch.stack([_offsets(other, other.across - _explained(other, habits)) for _, other in pairs]).double()
+    of_people = (own - mean).flatten(1)
+    hessian = basis @ basis.T + _NOISE**2 * torch.eye(len(basis), dtype=basis.dtype)
+    missed = of_people - torch.linalg.solve(hessian, basis @ of_people.T).T @ basis
+    rest_sigma = max(float(missed.square().mean().sqrt()), known.rest_sigma)
+    return replace(known, mean=mean, by_turn=known.by_turn + difference.by_turn, rest_sigma=rest_sigma)
 
 
 def _recipe(seed: int, face_model: FaceModel) -> SyntheticRecipe:
@@ -155,27 +193,34 @@ def _unexplained(of_people: Float[Tensor, "n f"], count: int) -> float:
     squares, fold = [], torch.arange(len(of_people)) % _FOLDS
     for left_out in range(_FOLDS):
         basis, others = _principal_components(of_people[fold != left_out], count), of_people[fold == left_out]
-        # Lengths are in metres here. A tracker expects noise of a millimetre in a landmark.
-        hessian = basis @ basis.T + 1e-6 * torch.eye(len(basis))
+        hessian = basis @ basis.T + _NOISE**2 * torch.eye(len(basis))
         squares.append((others - torch.linalg.solve(hessian, basis @ others.T).T @ basis).square().flatten())
     return float(torch.cat(squares).mean().sqrt())
 
 
-def main(name: tyro.conf.Positional[str] = "anny", people: int = 200) -> None:
+def main(name: tyro.conf.Positional[str] = "anny", people: int = 200, detector: Detector = "mediapipe") -> None:
     """Measure where the landmark detector finds a face model's points, and write the result into the package's data.
 
     Args:
         name: The face model.
         people: Number of people to draw; each takes about 8 seconds.
+        detector: The detector. Any but mediapipe is measured against mediapipe, whose response must be there.
     """
     face_model = load_face_model(name)
     seeds = range(_FIRST_SEED, _FIRST_SEED + people)
-    seen = [sight_person(seed, face_model) for seed in track_progress(seeds, "Drawing and detecting", people)]
-    response = fit_response(seen)
-    write_response(response_path(name), face_model, response, people)
+    detectors = ("mediapipe",) if detector == "mediapipe" else ("mediapipe", detector)
+    rounds = track_progress(seeds, "Drawing and detecting", people)
+    seen = list(zip(*(sight_person(seed, face_model, detectors) for seed in rounds), strict=True))
+    response = (
+        fit_response(seen[0])
+        if detector == "mediapipe"
+        else differing_response(read_response(face_model, _MAX_OFFSET), seen[0], seen[1])
+    )
+    path = response_path(name, detector)
+    write_response(path, face_model, response, people, detector)
     deviation = 1e3 * float(response.by_person.square().sum(0).mean().sqrt())
     say(
-        f"{response_path(name)}: mean offset {1e3 * float(response.mean.norm(dim=1).mean()):.2f} mm; people differ by "
+        f"{path}: mean offset {1e3 * float(response.mean.norm(dim=1).mean()):.2f} mm; people differ by "
         f"{deviation:.2f} mm along each axis; components learned from other people still miss "
         f"{1e3 * response.rest_sigma:.2f} mm of it"
     )

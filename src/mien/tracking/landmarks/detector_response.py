@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.capture.backend import Detector
 from mien.face import FaceModel
 from mien.tracking.constants import TRACKING
 
@@ -66,17 +67,18 @@ def unknown_response(landmarks: int, expressions: int, sigma: float) -> Detector
     )
 
 
-def response_path(face_model_name: str) -> Path:
-    """Path of the response file that ships with mien for a face model. The file may not exist."""
-    return Path(str(resources.files("mien.tracking") / "data" / f"{face_model_name}_detector.npz"))
+def response_path(face_model_name: str, detector: Detector = "mediapipe") -> Path:
+    """Path of the response file that ships with mien for a face model and a detector. The file may not exist."""
+    ending = "detector" if detector == "mediapipe" else detector
+    return Path(str(resources.files("mien.tracking") / "data" / f"{face_model_name}_{ending}.npz"))
 
 
-def read_response(face_model: FaceModel, sigma: float) -> DetectorResponse:
-    """Read the response measured for this face model.
+def read_response(face_model: FaceModel, sigma: float, detector: Detector = "mediapipe") -> DetectorResponse:
+    """Read the response measured for this face model and detector.
 
     If it was never measured, or on another mesh, only `sigma` is known.
     """
-    path, expressions = response_path(face_model.name), len(face_model.expression_names)
+    path, expressions = response_path(face_model.name, detector), len(face_model.expression_names)
     landmarks = len(face_model.landmarks["mediapipe"].faces)
     if not path.is_file():
         return unknown_response(landmarks, expressions, sigma)
@@ -91,15 +93,18 @@ def read_response(face_model: FaceModel, sigma: float) -> DetectorResponse:
         return DetectorResponse(mean, by_turn, by_expression, by_person, scale * float(file["rest_sigma"]))
 
 
-def write_response(path: Path, face_model: FaceModel, response: DetectorResponse, people: int) -> None:
+def write_response(
+    path: Path, face_model: FaceModel, response: DetectorResponse, people: int, detector: Detector = "mediapipe"
+) -> None:
     """Write a response for `read_response`."""
     arrays = {
         name: (1e3 * getattr(response, name)).numpy().astype(np.float16)
         for name in ("mean", "by_turn", "by_expression", "by_person")
     }
     path.parent.mkdir(parents=True, exist_ok=True)
+    ending = "" if detector == "mediapipe" else f" --detector {detector}"
     np.savez_compressed(
         path, rest_sigma=1e3 * response.rest_sigma, people=people, topology_hash=face_model.topology_hash,
-        content_hash=face_model.content_hash, command=f"{_COMMAND} {face_model.name}",
+        content_hash=face_model.content_hash, command=f"{_COMMAND} {face_model.name}{ending}",
         **arrays,
     )  # fmt: skip
