@@ -76,7 +76,9 @@ def paired(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 means = {"mean": statistics.fmean(values), "median": statistics.median(values)}
                 found.append({"metric": metric, "method": method, "rows": len(values), **means})
         for one, other in itertools.combinations(by_method, 2):
-            both = [(by_method[one][name], by_method[other][name]) for name in by_method[one] if name in by_method[other]]
+            both = [
+                (by_method[one][name], by_method[other][name]) for name in by_method[one] if name in by_method[other]
+            ]
             pairs = [pair for first, second in both if len(pair := numbers((first, second), metric)) == 2]
             differences = [first - second for first, second in pairs]
             if differences:

@@ -1,7 +1,8 @@
 """One row: the claim on it, its steps, its state; and the process in which it runs.
 
 `run_row` runs in a process of its own, so that a row that needs too much memory fails alone. That process holds the
-row's lock and runs the steps itself: whatever kills it frees the lock and leaves nothing behind. `attempt` starts it and
+row's lock and runs the steps itself: whatever kills it frees the lock and leaves nothing behind. `attempt` starts it
+and
 waits for it, wherever an engine calls it. If `attempt` dies, the row's standard input ends, and the row stops.
 """
 

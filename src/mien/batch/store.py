@@ -41,9 +41,7 @@ class Returned:
     """Its thumbnails and its log: path in the batch's folder -> content."""
 
 
-def attempt_in_store(
-    store: str, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None
-) -> Returned:
+def attempt_in_store(store: str, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None) -> Returned:
     """Run a row in a temporary folder of this machine, with its workspace copied in from a store and out to it.
 
     Args:

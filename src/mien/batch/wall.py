@@ -17,7 +17,11 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
     """Write the page from the entries of the results."""
     shown = [_card(batch, row) for row in rows if row.get("run")]
     shown.sort(key=lambda card: card["figures"].get("psnr", float("-inf")))
-    missing = [{"name": row["name"], "status": row["status"], "error": row.get("error", "")} for row in rows if not row.get("run")]
+    missing = [
+        {"name": row["name"], "status": row["status"], "error": row.get("error", "")}
+        for row in rows
+        if not row.get("run")
+    ]
     failed = [row for row in missing if row["status"] == "failed"]
     text = render(
         "batch/templates/wall.html",
@@ -25,7 +29,9 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
         summary=f"{counted(len(shown), 'avatar')}, {len(missing)} rows without one ({len(failed)} failed)",
         cards=shown,
         failed=failed[:200],
-        sortings=[(name, _HEADINGS[name], HIGHER[name]) for name in HIGHER if any(name in card["figures"] for card in shown)],
+        sortings=[
+            (name, _HEADINGS[name], HIGHER[name]) for name in HIGHER if any(name in card["figures"] for card in shown)
+        ],
         comparison=[_compared(entry) for entry in paired(rows)],
     )
     write_atomically(batch.root / "index.html", lambda aside: aside.write_text(text, encoding="utf-8"))

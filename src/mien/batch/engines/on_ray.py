@@ -22,7 +22,9 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
     import ray
 
     address = options.address or os.environ.get("RAY_ADDRESS")
-    ray.init(address=address, log_to_driver=False, logging_level="warning", include_dashboard=False if not address else None)
+    ray.init(
+        address=address, log_to_driver=False, logging_level="warning", include_dashboard=False if not address else None
+    )
     task = ray.remote(work)
     running: dict[Any, Row] = {}
     waiting = list(reversed(rows))
