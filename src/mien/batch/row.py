@@ -81,7 +81,7 @@ def _claimed(batch: Batch, row: Row, do: Do) -> State:
         state = replace(state, status="done", runs=runs, stages=stages)
     except RowFailedError as error:
         state = replace(state, status="failed", error=printable(str(error)))
-    state = replace(state, seconds=round(time.time() - state.began, 2), peak_mb=round(peak_memory_mb()))
+    state = replace(state, seconds=round(time.time() - state.began, 2), peak_mb=float(round(peak_memory_mb())))
     batch.write_state(state)
     return state
 
