@@ -21,10 +21,10 @@ from test_batch import wait_for_begin
 
 
 @pytest.fixture
-def ray_address() -> Iterator[str]:
+def ray_address() -> Iterator[str | None]:
     """A cluster of two nodes on this host; the second is the last of the processes."""
     try:
-        from ray.cluster_utils import Cluster
+        from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         pytest.skip(NO_ENGINE)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "object_store_memory": 80 << 20})
@@ -70,7 +70,7 @@ EXPECTED = {f"row{index}": 20.0 + index for index in range(4)}
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(tmp_path: Path, ray_address: str):
+def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(tmp_path: Path, ray_address: str | None):
     def kill() -> None:
         row = wait_for_begin(tmp_path, "row1")
         parent = int(Path(f"/proc/{row}/stat").read_text().rpartition(")")[2].split()[1])

@@ -109,7 +109,7 @@ class Driver:
             state = replace(state, tries=before.tries + 1 if before is not None else 1)
         if self.store and state is not None:
             self.batch.write_state(state)
-        elif isinstance(outcome, Exception):
+        elif isinstance(outcome, Exception) and state is not None:
             try:
                 with hold(self.batch.state_file(row.name)):
                     if not self.batch.is_done(row):

@@ -69,8 +69,8 @@ def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
         content = read_figures(run_dir)
         scored = next((each for each in content["protocols"].values() if "psnr" in each), None)
         for part, prefix in ((None, ""), ("head", "head_")):
-            for metric in METRICS if scored is not None else ():
-                found[prefix + metric] = figure(scored, part, metric)
+            for metric in METRICS:
+                found[prefix + metric] = None if scored is None else figure(scored, part, metric)
         found |= {key: content["training"].get(key) for key in ("gaussians", "steps", "seconds")}
         found["training_seconds"] = found.pop("seconds")
     if (run_dir / "film.mp4").is_file():

@@ -20,7 +20,7 @@ def fetched(word: str, folder: Path) -> str:
     """The word, or the path of a copy in `folder` if it is a URL. A copy that is there is not fetched again."""
     if not is_url(word):
         return word
-    import fsspec
+    import fsspec  # pyright: ignore[reportMissingImports]
 
     target = folder / hashlib.sha256(word.encode()).hexdigest()[:16] / word.rstrip("/").rpartition("/")[2]
     if not target.exists():
@@ -50,7 +50,7 @@ def attempt_in_store(store: str, row: Row, program: Sequence[str] = PROGRAM, thr
         program: As for `attempt`.
         threads: As for `attempt`.
     """
-    import fsspec
+    import fsspec  # pyright: ignore[reportMissingImports]
 
     fs, base = fsspec.url_to_fs(store)
     place = f"{base.rstrip('/')}/{row.name}"

@@ -26,7 +26,7 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
     text = render(
         "batch/templates/wall.html",
         heading=batch.root.resolve().name,
-        summary=f"{counted(len(shown), 'avatar')}; {counted(len(failed), 'row')} failed, {len(missing) - len(failed)} not finished",
+        summary=f"{counted(len(shown), 'avatar')}; {counted(len(failed), 'row')} failed",
         cards=shown,
         failed=failed[:200],
         sortings=[

@@ -3,6 +3,7 @@
 Ray starts a row again if its node is lost. The batch's folder must be shared by all nodes, unless a store is given.
 """
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -19,11 +20,15 @@ _WAITING = 200
 def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
     """Run each row as a task. See `mien.batch.engines`."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]
+    from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
     address = options.address or os.environ.get("RAY_ADDRESS")
     ray.init(
-        address=address, log_to_driver=False, logging_level="warning", include_dashboard=False if not address else None
+        address=address,
+        log_to_driver=False,
+        logging_level=logging.WARNING,
+        include_dashboard=False if not address else None,
     )
     task = ray.remote(work)
     running: dict[Any, Row] = {}
@@ -44,7 +49,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
             row = running.pop(first)
             try:
                 yield row, ray.get(first)
-            except (ray.exceptions.RayError, OSError) as error:
+            except (RayError, OSError) as error:
                 yield row, error
     finally:
         ray.shutdown()

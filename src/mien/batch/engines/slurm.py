@@ -32,14 +32,14 @@ class _Task:
             self.work(row)
 
     def checkpoint(self, rows: Sequence[Row]) -> Any:
-        import submitit
+        import submitit  # pyright: ignore[reportMissingImports]
 
         return submitit.helpers.DelayedSubmission(self, rows)
 
 
 def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
     """Run the rows as a job array. See `mien.batch.engines`."""
-    import submitit
+    import submitit  # pyright: ignore[reportMissingImports]
 
     batch, folder = Batch(options.root), options.root / "slurm"
     noted = folder / "jobs.txt"
