@@ -6,6 +6,7 @@ file writes it. DIR/logs/NAME.log has what the row's commands printed, and DIR/r
 
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -14,12 +15,12 @@ from typing import Any
 from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
 from mien.files import expect_whole, read_json, write_atomically, write_json
-from mien.inside import inside, is_one_line, is_plain_name
+from mien.inside import inside, is_plain_name
 
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
 WORKSPACE = "{workspace}"
 """Stands for the row's workspace in the words of its steps."""
-_MAX_PLAN_BYTES = 256 << 20
+_MAX_PLAN_BYTES, _MAX_STATE_BYTES = 256 << 20, 1 << 20
 _AGAIN = "run `mien batch TABLE --out DIR` again"
 
 
@@ -116,6 +117,20 @@ class Batch:
         except UserError as error:
             return State(name, "failed", "", error=str(error)) if path.exists() else None
 
+    def read_states(self) -> dict[str, State]:
+        """The states of all rows, by name: quickly, without their checksums. Damaged ones count as failed."""
+        found = {}
+        for entry in os.scandir(self.root / "states") if (self.root / "states").is_dir() else ():
+            if entry.name.endswith(".json") and not entry.name.startswith("."):
+                name = entry.name.removesuffix(".json")
+                try:
+                    content = json.loads(read_bytes(Path(entry.path), _MAX_STATE_BYTES))
+                    content.pop("checksum", None)
+                    found[name] = _state_from(content)
+                except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+                    found[name] = State(name, "failed", "", error=f"{entry.path}: damaged ({error}); {_AGAIN}")
+        return found
+
     def write_state(self, state: State) -> None:
         """Write the state of a row. The caller holds its lock."""
         write_json(self.state_file(state.name), *STATE, asdict(state))
@@ -149,7 +164,7 @@ def with_fingerprint(row: Row, inputs: Sequence[Path]) -> Row:
 def _state_from(content: dict[str, Any]) -> State:
     kept = {name: value for name, value in content.items() if name not in ("format", "version")}
     state = State(**{**kept, "runs": tuple(kept["runs"])})
-    if not (is_plain_name(state.name) and is_one_line(state.error) and is_one_line(state.host)):
+    if not (state.name + state.error + state.host).isprintable():
         raise ValueError("name, error or host")
     if not all(isinstance(each, int | float) for each in (state.tries, state.began, state.seconds, state.peak_mb)):
         raise ValueError("tries or times")

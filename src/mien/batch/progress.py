@@ -18,7 +18,8 @@ _SHOWN = 40
 
 def batch_progress(batch: Batch) -> dict[str, Any]:
     """The state of all rows, and totals, in a form for json."""
-    rows = [_row(batch, row) for row in batch.read_plan()]
+    states = batch.read_states()
+    rows = [_row(batch, row, states.get(row.name)) for row in batch.read_plan()]
     counts = Counter(row["status"] for row in rows)
     done = [row for row in rows if row["status"] == "done"]
     left = len(rows) - len(done) - counts["failed"]
@@ -33,8 +34,7 @@ def batch_progress(batch: Batch) -> dict[str, Any]:
     return found
 
 
-def _row(batch: Batch, row: Row) -> dict[str, Any]:
-    state = batch.read_state(row.name)
+def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:
     if state is None or (state.fingerprint != row.fingerprint and state.status != "running"):
         return {"name": row.name, "status": "waiting"}
     found = {"name": row.name, "status": state.status, "tries": state.tries, "host": state.host}

@@ -22,9 +22,9 @@ ALIASES = {"lpips": "perceptual", "head_lpips": "head_perceptual"}
 
 def result_rows(batch: Batch) -> list[dict[str, Any]]:
     """One entry for each run of each row, with labels, figures, versions, machine and seconds of stages."""
-    found = []
+    found, states = [], batch.read_states()
     for row in batch.read_plan():
-        state = batch.read_state(row.name)
+        state = states.get(row.name)
         entry: dict[str, Any] = {"name": row.name, "status": state.status if state else "waiting"}
         entry |= row.labels
         for run in (state.runs if state else ()) or ({},):

@@ -10,6 +10,7 @@ from typing import Any
 
 from mien.batch.engines import EngineOptions, Work
 from mien.batch.plan import Row
+from mien.errors import UserError
 
 _LOST_NODES = 3
 """How often Ray starts a row again whose node or worker was lost."""
@@ -24,12 +25,12 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
     address = options.address or os.environ.get("RAY_ADDRESS")
-    ray.init(
-        address=address,
-        log_to_driver=False,
-        logging_level=logging.WARNING,
-        include_dashboard=False if not address else None,
-    )
+    started = {} if address else {"include_dashboard": False}
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, **started)
+    except Exception as error:  # Ray has no class of its own for this
+        why = " ".join(str(error).split())[:300]
+        raise UserError(f"Ray cannot be reached or started ({why}); see `ray status`, and --ray-address") from None
     task = ray.remote(work)
     running: dict[Any, Row] = {}
     waiting = list(reversed(rows))
