@@ -31,7 +31,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
     except Exception as error:  # Ray has no class of its own for this
         why = " ".join(str(error).split())[:300]
         raise UserError(f"Ray cannot be reached or started ({why}); see `ray status`, and --ray-address") from None
-    task = ray.remote(work)
+    task = ray.remote(_call)
     running: dict[Any, Row] = {}
     waiting = list(reversed(rows))
     try:
@@ -45,7 +45,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
                     max_retries=_LOST_NODES,
                     name=f"mien {row.name}",
                 )
-                running[asked.remote(row)] = row
+                running[asked.remote(work, row)] = row
             (first, *_), _ = ray.wait(list(running), num_returns=1)
             row = running.pop(first)
             try:
@@ -54,3 +54,8 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
                 yield row, error
     finally:
         ray.shutdown()
+
+
+def _call(work: Work, row: Row) -> Any:
+    """Do the work of a row on a node."""
+    return work(row)
