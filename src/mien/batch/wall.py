@@ -29,7 +29,7 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
         summary=f"{counted(len(shown), 'avatar')}; {counted(len(failed), 'row')} failed",
         cards=shown,
         failed=failed[:200],
-        sortings=[
+        orders=[
             (name, _HEADINGS[name], HIGHER[name]) for name in HIGHER if any(name in card["figures"] for card in shown)
         ],
         comparison=[_compared(entry) for entry in paired(rows)],
