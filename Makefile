@@ -11,7 +11,7 @@ UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs release elsewhere bench gpu lock clean
+.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs release elsewhere bench gpu batch-engines lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -150,6 +150,10 @@ lock: $(VENV)/.packages
 	for package in $(UV) $(GSPLAT) $(ZIGLANG); do echo "$$package" | $(BIN)/uv pip compile - --no-deps --universal --python-version 3.11 \
 	  --generate-hashes --no-emit-index-url --no-annotate --custom-compile-command "make lock" \
 	  -o "requirements/$${package%%==*}.txt" || exit 1; done
+
+# The engines of `mien batch` on clusters, which the base set-up leaves out.
+batch-engines: setup
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install -r requirements/batch.in
 
 # Everything of a release into dist/, with the times of its commit (release/make.py).
 release: setup

@@ -24,9 +24,11 @@ NO_VALIDATOR = "no gltf-validator in web/node_modules"
 NO_SPLAT_TRANSFORM = "no @playcanvas/splat-transform in web/node_modules"
 NO_MOUNT = "no right to mount a small disk"
 NO_NAMESPACE = "no right to make a network namespace"
+NO_ENGINE = "no engine of clusters"
 NO_TASKS_VISION = "no @mediapipe/tasks-vision in web/node_modules"
 
 _REMEDIES = {
+    NO_ENGINE: "run `make batch-engines`; for Slurm, start one with tests/slurm_here.sh and set SLURM_CONF",
     NO_GPU: "run `make gpu` on a machine with an NVIDIA GPU and the CUDA toolkit",
     NO_TEST_DATA: "set MIEN_TEST_DATA to the folder that holds it",
     NO_MOUNT: "run the tests as root, in a container that may mount",
@@ -46,7 +48,7 @@ _REMEDIES = {
 }
 
 
-_EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_MOUNT, NO_NAMESPACE, NO_INSTRUCTIONS)
+_EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_MOUNT, NO_NAMESPACE, NO_INSTRUCTIONS, NO_ENGINE)
 """Reasons that lie in the machine alone. Others mean an incomplete set-up; MIEN_STRICT makes them an error."""
 _AREAS = {
     "pages in a browser": (NO_CHROMIUM, NO_WEBGPU),

@@ -26,7 +26,7 @@ from mien.terminal import drop_output, open_closed_streams, printable, show, tel
 from mien.threads import asked_threads
 
 GROUPS = {
-    "Make an avatar": ("demo", "create", "capture", "track", "train", "import"),
+    "Make an avatar": ("demo", "create", "capture", "track", "train", "import", "batch"),
     "Use it": ("view", "render", "drive", "export"),
     "Research": ("evaluate", "analyze", "study", "bench", "face-models", "licenses", "plugins"),
 }
@@ -44,6 +44,7 @@ COMMANDS = {
     "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
     "export": "avatar -> .mien (runs without torch), .html, .glb, Gaussians in a pose, or GaussianAvatars' folder",
     "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
+    "batch": "a table of captures -> an avatar each, here, on Slurm or on Ray",
     "face-models": "list the face models and bake them ahead of time",
     "bench": "speed of this machine; quality on reference captures with known truth",
     "licenses": "what is installed, under which terms, and what that means",

@@ -23,6 +23,10 @@ EXTRA_OF = {
     "viser": "viewer",
     "pxr": "usd",
     "gsplat": "cuda",
+    "submitit": "batch",
+    "ray": "batch",
+    "fsspec": "batch",
+    "s3fs": "batch",
 }
 """Name of a module -> the extra that installs it."""
 PACKAGE_OF = {

@@ -65,6 +65,10 @@ class Overall:
         """Number of the current stage, from 1; 0 before the first."""
         return self._stages.index(self._pieces[self._at].stage) + 1 if self._at >= 0 else 0
 
+    def stage_name(self) -> str | None:
+        """Name of the current stage; None before the first."""
+        return self._pieces[self._at].stage if self._at >= 0 else None
+
     def words(self) -> str:
         """The stage and the remaining time, for people."""
         number = self.stage()

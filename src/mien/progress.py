@@ -59,6 +59,11 @@ def whole_command(overall: Overall) -> Iterator[None]:
         _whole.pop()
 
 
+def current_stage() -> str | None:
+    """The name of the stage that the whole command is in; None if no command has said what it will do."""
+    return _whole[-1].overall.stage_name() if _whole else None
+
+
 @runtime_checkable  # for beartype, which checks annotations during tests
 class Advance(Protocol):
     """A function that moves a progress bar on."""

@@ -129,8 +129,9 @@ class DrivingConstants:
     speech_shut_within: float = 0.14
     """Time within which sound is as loud before and after a drop at which lips shut, in seconds."""
     speech_shut_drop: tuple[float, float] = (4.0, 9.0)
-    """Drops of the loudness in dB from which on lips begin to shut, and at which they are shut. With both, 9 in 10 of
-    p, b and m of synthesised speech shut the lips (tests/test_driving_by_speech.py); without, 3 in 10."""
+    """Drops of the loudness in dB from which on lips begin to shut, and at which they are shut. Chosen on synthesised
+    speech, where 9 in 10 of p, b and m shut the lips with them, and 3 in 10 without (tests/test_driving_by_speech.py).
+    No real speech was compared."""
     speech_shut_hiss: float = 3.0
     """How much energy at high frequencies keeps lips open, as at s: from its inverse on, they are."""
     speech_sway: tuple[float, float, float] = (0.012, 0.02, 0.008)

@@ -1,0 +1,76 @@
+"""The engine `local`: processes on this machine that share its threads and its memory."""
+
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from mien.batch.engines import EngineOptions, Work
+from mien.batch.plan import Row
+from mien.errors import UserError
+
+_ASSUMED_MB = 8000.0
+"""Free memory of systems that do not tell it."""
+_SHARE = 0.9
+"""Share of the available memory that rows may take."""
+
+
+def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
+    """Run the rows here, as many at once as jobs and memory allow. See `mien.batch.engines`."""
+    memory = _Memory(_SHARE * free_memory_mb())
+
+    def one(row: Row) -> Any:
+        with memory.taken(row.memory_mb):
+            try:
+                return work(row)
+            except (UserError, OSError) as error:
+                return error
+
+    with ThreadPoolExecutor(jobs_here(rows, options)) as pool:
+        futures = {pool.submit(one, row): row for row in rows}
+        try:
+            for future in as_completed(futures):
+                yield futures.pop(future), future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def jobs_here(rows: Sequence[Row], options: EngineOptions) -> int:
+    """How many rows run at once: as asked, or as many as fit the cores (two threads each) and the memory."""
+    if options.jobs:
+        return options.jobs
+    largest = max((row.memory_mb for row in rows), default=1.0)
+    fitting = int(_SHARE * free_memory_mb() / max(largest, 1.0))
+    return max(1, min((os.cpu_count() or 1) // (options.threads or 2), fitting, len(rows)))
+
+
+def free_memory_mb() -> float:
+    """Memory of this machine that processes can still take, in megabytes."""
+    with suppress(OSError, ValueError, LookupError, StopIteration):
+        lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
+        kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))
+        return int(kilobytes) / 1e3
+    return _ASSUMED_MB
+
+
+class _Memory:
+    """Megabytes that rows share. A row that needs more than there are runs alone."""
+
+    def __init__(self, free: float) -> None:
+        self._free, self._taken = free, 0.0
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def taken(self, megabytes: float) -> Iterator[None]:
+        with self._changed:
+            self._changed.wait_for(lambda: not self._taken or self._taken + megabytes <= self._free)
+            self._taken += megabytes
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._taken -= megabytes
+                self._changed.notify_all()

@@ -1,0 +1,86 @@
+"""How far a batch is: its rows, totals, throughput and the expected end, for people and for programs."""
+
+import re
+import time
+from collections import Counter
+from typing import Any
+
+from mien.batch.plan import Batch, Row, State
+from mien.batch.row import repeat_command, tail
+from mien.locks import holder_of
+from mien.terminal import counted, printable
+
+_STAGE = re.compile(r"stage (\d+) of (\d+) \(([\w -]+)\)")
+_PART = re.compile(r": (\d+)/(\d+) in ")
+_SHOWN = 40
+"""Number of rows of each kind that the text lists."""
+
+
+def batch_progress(batch: Batch) -> dict[str, Any]:
+    """The state of all rows, and totals, in a form for json."""
+    states = batch.read_states()
+    rows = [_row(batch, row, states.get(row.name)) for row in batch.read_plan()]
+    counts = Counter(row["status"] for row in rows)
+    done = [row for row in rows if row["status"] == "done"]
+    left = len(rows) - len(done) - counts["failed"]
+    found: dict[str, Any] = {"format": "mien.batch-status", "version": 1, "rows": rows, "counts": dict(counts)}
+    found |= {"rows_per_hour": None, "seconds_left": None}
+    if done:
+        began = min(row["began"] for row in done)
+        span = max(max(row["began"] + row["seconds"] for row in done) - began, 1e-3)
+        found["rows_per_hour"] = round(len(done) / span * 3600, 2)
+        mean = sum(row["seconds"] for row in done) / len(done)
+        found["seconds_left"] = round(left * mean / max(counts["running"], 1)) if counts["running"] else None
+    return found
+
+
+def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:
+    if state is None or (state.fingerprint != row.fingerprint and state.status != "running"):
+        return {"name": row.name, "status": "waiting"}
+    found = {"name": row.name, "status": state.status, "tries": state.tries, "host": state.host}
+    found |= {"began": state.began, "seconds": state.seconds}
+    if state.status == "failed":
+        found |= {"error": state.error, "repeat": repeat_command(batch, row)}
+    if state.status == "running":
+        if holder_of(batch.state_file(row.name)) is None:
+            found["status"] = "interrupted"
+        else:
+            found |= {"seconds": round(time.time() - state.began), **_stage(batch, state)}
+    return found
+
+
+def _stage(batch: Batch, state: State) -> dict[str, Any]:
+    """The stage that a running row is in, and the percentage of its present part, from its log."""
+    text = tail(batch.log_file(state.name))
+    stages, parts = _STAGE.findall(text), _PART.findall(text)
+    found: dict[str, Any] = {"stage": f"{stages[-1][2]} ({stages[-1][0]} of {stages[-1][1]})" if stages else None}
+    return found | {"percent": round(100 * int(parts[-1][0]) / max(int(parts[-1][1]), 1)) if parts else None}
+
+
+def progress_text(found: dict[str, Any]) -> str:
+    """The same for people."""
+    lines = []
+    for status in ("running", "interrupted", "failed", "waiting"):
+        rows = [row for row in found["rows"] if row["status"] == status]
+        if status == "waiting":
+            break
+        for row in rows[:_SHOWN]:
+            lines.append(f"{row['name']}: {_words(row)}")
+            if "repeat" in row:
+                lines.append(f"    repeat it: {row['repeat']}")
+        if len(rows) > _SHOWN:
+            lines.append(f"... and {len(rows) - _SHOWN} more {status}; --json lists all")
+    counts, total = found["counts"], len(found["rows"])
+    lines.append(f"{counted(total, 'row')}: " + ", ".join(f"{count} {status}" for status, count in counts.items()))
+    if found["rows_per_hour"] is not None:
+        left = found["seconds_left"]
+        eta = f", about {left / 60:.0f} min left" if left else ""
+        lines.append(f"{found['rows_per_hour']:g} rows an hour{eta}")
+    return printable("\n".join(lines), lines=True)
+
+
+def _words(row: dict[str, Any]) -> str:
+    where = f"{row['status']} on {row['host']}, {row['seconds']:.0f} s, try {row['tries']}"
+    stage = f", {row['stage']}" if row.get("stage") else ""
+    percent = f", {row['percent']} %" if row.get("percent") is not None else ""
+    return f"{where}{stage}{percent}" + (f": {row['error']}" if row.get("error") else "")

@@ -1,0 +1,144 @@
+"""What came of a batch: one line for each run, comparisons of methods, and tables for papers."""
+
+import csv
+import io
+import itertools
+import json
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from mien.batch.plan import Batch
+from mien.errors import UserError
+from mien.evaluation.metrics_file import COLUMNS
+from mien.files import write_atomically
+
+HIGHER = {name: higher for name, _, _, higher in COLUMNS}
+DIGITS = {name: digits for name, _, digits, _ in COLUMNS}
+ALIASES = {"lpips": "perceptual", "head_lpips": "head_perceptual"}
+"""Short names of columns. The figure is ST-LPIPS."""
+
+
+def result_rows(batch: Batch) -> list[dict[str, Any]]:
+    """One entry for each run of each row, with labels, figures, versions, machine and seconds of stages."""
+    found, states = [], batch.read_states()
+    for row in batch.read_plan():
+        state = states.get(row.name)
+        entry: dict[str, Any] = {"name": row.name, "status": state.status if state else "waiting"}
+        entry |= row.labels
+        for run in (state.runs if state else ()) or ({},):
+            about: dict[str, Any] = {}
+            if state is not None:
+                about = {"tries": state.tries, "host": state.host.partition(",")[0], "mien": state.mien}
+                about |= {"row_seconds": state.seconds, "peak_mb": state.peak_mb, "error": state.error}
+                about |= {f"{stage}_stage_seconds": seconds for stage, seconds in state.stages.items()}
+            found.append({**entry, **run, **about})
+    return found
+
+
+def write_results(batch: Batch) -> list[dict[str, Any]]:
+    """Write results.json and results.csv, and return their entries."""
+    rows = result_rows(batch)
+    columns = list(dict.fromkeys(itertools.chain.from_iterable(rows)))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
+    content = {"format": "mien.batch-results", "version": 1, "rows": rows, "comparison": paired(rows)}
+    for name, whole in (("results.csv", text.getvalue()), ("results.json", json.dumps(content, indent=1))):
+        write_atomically(batch.root / name, lambda aside, whole=whole: aside.write_text(whole, encoding="utf-8"))
+    return rows
+
+
+def _cell(value: Any) -> Any:
+    """A value of a csv. Texts that a spreadsheet would run as a formula begin with an apostrophe."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@") else value
+
+
+def numbers(rows: Iterable[dict[str, Any]], column: str) -> list[float]:
+    """The numbers of a column; rows without one are left out."""
+    values = (row.get(column) for row in rows)
+    return [float(value) for value in values if isinstance(value, int | float) and math.isfinite(value)]
+
+
+def paired(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Means and medians of each method, and paired differences of two methods with 95 % confidence intervals."""
+    by_method: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        if row.get("method"):
+            by_method.setdefault(row["method"], {})[row["name"]] = row
+    found: list[dict[str, Any]] = []
+    for metric in (*HIGHER, *(f"head_{name}" for name in HIGHER)):
+        for method, own in by_method.items():
+            values = numbers(own.values(), metric)
+            if values:
+                means = {"mean": statistics.fmean(values), "median": statistics.median(values)}
+                found.append({"metric": metric, "method": method, "rows": len(values), **means})
+        for one, other in itertools.combinations(by_method, 2):
+            both = [
+                (by_method[one][name], by_method[other][name]) for name in by_method[one] if name in by_method[other]
+            ]
+            pairs = [pair for first, second in both if len(pair := numbers((first, second), metric)) == 2]
+            differences = [first - second for first, second in pairs]
+            if differences:
+                entry = {"metric": metric, "method": one, "minus": other, "rows": len(differences)}
+                found.append({**entry, "mean": statistics.fmean(differences), "interval": interval(differences)})
+    return found
+
+
+def interval(values: Sequence[float]) -> list[float] | None:
+    """The 95 % confidence interval of the mean by Student's t distribution; None for a single value."""
+    if len(values) < 2:
+        return None
+    from scipy import stats
+
+    half = stats.t.ppf(0.975, len(values) - 1) * statistics.stdev(values) / math.sqrt(len(values))
+    mean = statistics.fmean(values)
+    return [float(mean - half), float(mean + half)]
+
+
+def means_by(rows: Sequence[dict[str, Any]], by: str, columns: Sequence[str]) -> list[list[str]]:
+    """A table of means: a heading, then a line for each value of the column `by`.
+
+    Raises:
+        UserError: there is no such column, or it has no numbers.
+    """
+    known = dict.fromkeys(itertools.chain.from_iterable(rows))
+    for name in (by, *(ALIASES.get(column, column) for column in columns)):
+        if name not in known:
+            raise UserError(f"{name}: the results have no such column; there are: {', '.join(known)}")
+    finished = [row for row in rows if row.get("method")]
+    table = [[by, "n", *columns]]
+    for value in dict.fromkeys(str(row.get(by, "")) for row in finished):
+        own = [row for row in finished if str(row.get(by, "")) == value]
+        table.append([value, str(len(own)), *(_mean(own, ALIASES.get(column, column)) for column in columns)])
+    return table
+
+
+def _mean(rows: Sequence[dict[str, Any]], column: str) -> str:
+    values = numbers(rows, column)
+    digits = DIGITS.get(column.removeprefix("head_"), 1)
+    if not values:
+        return "-"
+    spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):.{digits}f}{spread}"
+
+
+def markdown_table(table: Sequence[Sequence[str]]) -> str:
+    """The table in Markdown."""
+    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in table]
+    return "\n".join([lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
+
+
+def latex_table(table: Sequence[Sequence[str]]) -> str:
+    """The table in LaTeX, for the package booktabs."""
+    lines = [" & ".join(map(_latex, line)) + r" \\" for line in table]
+    begin = [rf"\begin{{tabular}}{{l{'r' * (len(table[0]) - 1)}}}", r"\toprule", lines[0], r"\midrule"]
+    return "\n".join([*begin, *lines[1:], r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def _latex(cell: str) -> str:
+    special = {"\\": r"\textbackslash{}", "±": r"$\pm$", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    special |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
+    return "".join(special.get(letter, letter) for letter in cell)

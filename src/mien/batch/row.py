@@ -1,0 +1,185 @@
+"""One row: the claim on it, its steps, its state; and the process in which it runs.
+
+`run_row` runs in a process of its own, so that a row that needs too much memory fails alone. That process holds the
+row's lock and runs the steps itself: whatever kills it frees the lock and leaves nothing behind. `attempt` starts it
+and
+waits for it, wherever an engine calls it. If `attempt` dies, the row's standard input ends, and the row stops.
+"""
+
+import json
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import IO, Any
+
+import mien
+from mien.batch.plan import WORKSPACE, Batch, Row, State, row_from
+from mien.errors import CannotWriteError, UserError
+from mien.locks import BeingWrittenError, hold
+from mien.stops import orderly_stops
+from mien.system import peak_memory_mb
+from mien.terminal import printable, tell
+
+Do = Callable[[Batch, Row], tuple[tuple[dict[str, Any], ...], dict[str, float]]]
+"""Runs the steps of a row, and returns the figures of its runs and the seconds of its stages."""
+PROGRAM = (sys.executable, "-m", "mien.batch_row")
+"""The command of a row's process."""
+EXIT_BUSY = 75
+"""Exit code of a row's process if another process holds the row."""
+_PATIENCE_SECONDS, _STEP_SECONDS = 15.0, 0.5
+"""How long a row waits for its lock. The process that held it may be about to end, because its node was lost."""
+_TAIL_BYTES = 8192
+
+
+class RowFailedError(Exception):
+    """A step of a row has failed. The text is its error, in one line."""
+
+
+def run_row(batch: Batch, row: Row, do: Do, patience: float = 0.0) -> State | None:
+    """Claim a row and run it, unless it is done. Return its state, or None if another process holds the row.
+
+    Args:
+        batch: The batch.
+        row: The row.
+        do: Runs its steps.
+        patience: Seconds to wait for the claim.
+
+    Raises:
+        KeyboardInterrupt, SystemExit: the process is to stop. The row then counts as interrupted.
+    """
+    until = time.monotonic() + patience
+    while True:
+        try:
+            with hold(batch.state_file(row.name)):
+                return _claimed(batch, row, do)
+        except BeingWrittenError:
+            if time.monotonic() >= until:
+                return None
+            time.sleep(_STEP_SECONDS)
+
+
+def _claimed(batch: Batch, row: Row, do: Do) -> State:
+    before = batch.read_state(row.name)
+    if before is not None and before.status == "done" and before.fingerprint == row.fingerprint:
+        return before
+    same = before is not None and before.fingerprint == row.fingerprint
+    tries = before.tries + 1 if before is not None and same else 1
+    here = f"{socket.gethostname()}, process {os.getpid()}"
+    state = State(row.name, "running", row.fingerprint, tries, here, time.time(), mien=mien.__version__)
+    batch.write_state(state)
+    try:
+        runs, stages = do(batch, row)
+        state = replace(state, status="done", runs=runs, stages=stages)
+    except RowFailedError as error:
+        state = replace(state, status="failed", error=printable(str(error)))
+    state = replace(state, seconds=round(time.time() - state.began, 2), peak_mb=float(round(peak_memory_mb())))
+    batch.write_state(state)
+    return state
+
+
+def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None) -> State | None:
+    """Run a row in a process of its own and wait for it. Return its state, or None if another process holds the row.
+
+    Args:
+        root: Folder of the batch.
+        row: The row.
+        program: The command of the row's process. The batch's folder follows it.
+        threads: Number of threads of the row's process. None leaves MIEN_THREADS as it is.
+    """
+    batch = Batch(root)
+    log = batch.log_file(row.name)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    environment = dict(os.environ) | ({"MIEN_THREADS": str(threads)} if threads else {})
+    with log.open("ab") as out:
+        process = subprocess.Popen(
+            [*program, str(root)], stdin=subprocess.PIPE, stdout=out, stderr=out, env=environment, close_fds=True
+        )
+    assert process.stdin is not None
+    with suppress(OSError):  # it has ended already
+        process.stdin.write(json.dumps(asdict(row)).encode() + b"\n")
+        process.stdin.flush()
+    try:
+        code = process.wait()
+    finally:
+        with suppress(OSError):
+            process.stdin.close()
+        process.wait()
+    return None if code == EXIT_BUSY else _concluded(batch, row, code)
+
+
+def _concluded(batch: Batch, row: Row, code: int) -> State | None:
+    """The state after the row's process has ended. If it could not write one itself, this writes why."""
+    try:
+        with hold(batch.state_file(row.name)):
+            state = batch.read_state(row.name)
+            if state is None or state.status == "running" or (code and state.fingerprint != row.fingerprint):
+                state = state or State(row.name, "failed", row.fingerprint, began=time.time())
+                seconds = round(time.time() - state.began, 2)
+                state = replace(state, status="failed", seconds=seconds, error=_why(batch, row, code))
+                with suppress(CannotWriteError):  # the disk is full; the engine tells of the state all the same
+                    batch.write_state(state)
+            return state
+    except BeingWrittenError:
+        return None
+
+
+def _why(batch: Batch, row: Row, code: int) -> str:
+    if code < 0:
+        name = signal.Signals(-code).name
+        hint = f"; it may have needed more memory than the {row.memory_mb / 1000:.1f} GB that were counted"
+        return f"its process was ended by {name}{hint if -code == signal.SIGKILL else ''}; run the row again"
+    return last_error(batch.log_file(row.name)) or f"its process ended with exit code {code}; see its log"
+
+
+def last_error(log: Path) -> str:
+    """The last line in which mien reports an error, or the last line if there is none. Empty without a log."""
+    lines = [line for line in tail(log).splitlines() if line.strip()]
+    errors = [line.removeprefix("mien: ") for line in lines if line.startswith("mien: ")]
+    return printable((errors or lines or [""])[-1])[:500]
+
+
+def tail(log: Path) -> str:
+    """The end of a log."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+            return file.read().decode("utf-8", "replace")
+    except OSError:
+        return ""
+
+
+def row_process(root: Path, given: IO[str], do: Do) -> int:
+    """Be the process of the row that is given as the first line of `given`, and stop when `given` ends."""
+    row = row_from(json.loads(given.readline()))
+    threading.Thread(target=_stop_at_end, args=(given,), daemon=True).start()
+    try:
+        with orderly_stops():
+            state = run_row(Batch(root), row, do, _PATIENCE_SECONDS)
+    except UserError as error:
+        tell(f"mien: {error}")
+        return 2
+    return EXIT_BUSY if state is None else 0
+
+
+def _stop_at_end(given: IO[str]) -> None:
+    """Stop this process if the one that waits for it is gone: in good order, or by force if it does not follow."""
+    given.read()
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(10)
+    os._exit(143)
+
+
+def repeat_command(batch: Batch, row: Row) -> str:
+    """The commands that repeat a row here, for a shell."""
+    workspace = str(batch.workspace(row.name))
+    steps = [[word.replace(WORKSPACE, workspace) for word in step] for step in row.steps]
+    return " && ".join(shlex.join(["mien", *step]) for step in steps)

@@ -1,0 +1,70 @@
+"""Working sets on other machines: inputs by fsspec URLs, and workspaces that are copied in and out of a store."""
+
+import hashlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mien.batch.plan import Batch, Row, State
+from mien.batch.row import PROGRAM, attempt
+
+
+def is_url(word: str) -> bool:
+    """Whether a word is the URL of a file, such as s3://bucket/clip.mp4, and not a path or an option."""
+    scheme, mark, _ = word.partition("://")
+    return bool(mark) and scheme.isascii() and scheme.isalnum()
+
+
+def fetched(word: str, folder: Path) -> str:
+    """The word, or the path of a copy in `folder` if it is a URL. A copy that is there is not fetched again."""
+    if not is_url(word):
+        return word
+    import fsspec  # pyright: ignore[reportMissingImports]
+
+    target = folder / hashlib.sha256(word.encode()).hexdigest()[:16] / word.rstrip("/").rpartition("/")[2]
+    if not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        aside = target.with_name(f".{target.name}")
+        fs, path = fsspec.url_to_fs(word)
+        fs.get(path, str(aside), recursive=True)
+        aside.rename(target)
+    return str(target)
+
+
+@dataclass(frozen=True)
+class Returned:
+    """What a row that ran without the batch's folder sends back."""
+
+    state: State | None
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    """Its thumbnails and its log: path in the batch's folder -> content."""
+
+
+def attempt_in_store(store: str, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None) -> Returned:
+    """Run a row in a temporary folder of this machine, with its workspace copied in from a store and out to it.
+
+    Args:
+        store: URL of the folder of all workspaces, such as s3://bucket/people.
+        row: The row.
+        program: As for `attempt`.
+        threads: As for `attempt`.
+    """
+    import fsspec  # pyright: ignore[reportMissingImports]
+
+    fs, base = fsspec.url_to_fs(store)
+    place = f"{base.rstrip('/')}/{row.name}"
+    with tempfile.TemporaryDirectory(prefix="mien-batch-") as scratch:
+        batch = Batch(Path(scratch))
+        workspace = batch.workspace(row.name)
+        if fs.exists(place):
+            workspace.parent.mkdir(parents=True)
+            fs.get(place, str(workspace), recursive=True)
+        state = attempt(batch.root, row, program, threads)
+        if workspace.is_dir():
+            for path in sorted(path for path in workspace.rglob("*") if path.is_file()):
+                target = f"{place}/{path.relative_to(workspace).as_posix()}"
+                fs.makedirs(target.rpartition("/")[0], exist_ok=True)
+                fs.put_file(str(path), target)
+        kept = [*batch.root.glob("thumbs/*"), *batch.root.glob("logs/*")]
+        return Returned(state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept})

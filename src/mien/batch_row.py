@@ -1,0 +1,10 @@
+"""The process of one row of a batch: it runs the row's steps as the command line would."""
+
+import sys
+from pathlib import Path
+
+from mien.batch import do_with, row_process
+from mien.cli import main
+
+if __name__ == "__main__":
+    sys.exit(row_process(Path(sys.argv[1]), sys.stdin, do_with(main)))

@@ -1,0 +1,221 @@
+"""The table of a batch: captures as csv, json or a folder of videos, turned into rows with commands of mien."""
+
+import contextlib
+import csv
+import difflib
+import io
+import json
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from mien.avatar import DEFAULT_METHOD
+from mien.batch import WORKSPACE, Row, is_url, with_fingerprint
+from mien.bounded import parse_json, read_bytes
+from mien.capture import CaptureSettings
+from mien.commands import create
+from mien.commands.options import TrainOptions, check_method, with_settings
+from mien.errors import UserError
+from mien.inside import is_plain_name
+
+_MAX_TABLE_BYTES = 64 << 20
+_VIDEOS = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"})
+_OWN = ("name", "video", "videos", "dataset", "method", "methods", "memory-gb")
+"""Columns that are no options."""
+_PATHS = frozenset(
+    {"calibration", "config", "face-model", "capture.mattes", "capture.landmarks", "capture.clean-plate"}
+)
+"""Options that name a file. It may be given beside the table."""
+_GROUPS = ("capture", "tracking", "scoring", "method")
+_LEAST_MB, _FRAME_MB = 2000.0, 0.1
+"""Memory of a row in megabytes: at least, and for each frame. 10 minutes of video take less than 3 GiB."""
+
+
+def read_table(path: Path) -> list[Row]:
+    """The rows of a table.
+
+    Raises:
+        UserError: the table cannot be read, or a row names a file that is missing, or options that do not exist.
+    """
+    entries = list(_entries(path))
+    if not entries:
+        raise UserError(f"{path}: has no rows; give a table of captures, or a folder of videos")
+    rows, kinds = [], set[str]()
+    for number, entry in enumerate(entries, 1):
+        row = _row(path.parent if path.is_file() else path, entry, f"{path}, row {number}", kinds)
+        rows.append(row)
+    names = [row.name for row in rows]
+    twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
+    if twice is not None:
+        raise UserError(f"{path}: two rows have the name {twice!r}; give each row a name of its own")
+    return rows
+
+
+def _entries(path: Path) -> Iterator[dict[str, Any]]:
+    if path.is_dir():
+        for video in sorted(each for each in path.iterdir() if each.suffix.lower() in _VIDEOS):
+            yield {"video": video.name}
+        return
+    try:
+        text = read_bytes(path, _MAX_TABLE_BYTES).decode("utf-8-sig")
+        content = parse_json(text) if path.suffix.lower() == ".json" else list(csv.DictReader(io.StringIO(text)))
+    except FileNotFoundError:
+        raise UserError(
+            f"{path}: no such file or folder; give a csv or json of captures, or a folder of videos"
+        ) from None
+    except (OSError, ValueError, csv.Error) as error:
+        raise UserError(f"{path}: cannot be read as a table ({error}); give a csv or a json list of objects") from None
+    if isinstance(content, dict):
+        content = content.get("rows")
+    if not isinstance(content, list) or not all(isinstance(each, dict) for each in content):
+        raise UserError(f"{path}: is no list of rows; give a csv with a heading, or a json list of objects")
+    yield from content
+
+
+def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Row:
+    if None in entry:
+        raise UserError(f"{where}: has more cells than the heading has columns; put texts with commas in quotes")
+    cells = {str(key).strip().removeprefix("--").replace("_", "-"): _words(value) for key, value in entry.items()}
+    original = {str(key).strip().removeprefix("--").replace("_", "-"): str(key).strip() for key in entry}
+    cells = {key: words for key, words in cells.items() if words}
+    videos = cells.get("video", []) + cells.get("videos", [])
+    dataset = cells.get("dataset", [])
+    if bool(videos) == bool(dataset):
+        raise UserError(f"{where}: give it a video or a dataset, and not both")
+    inputs = [_input(folder, word, where) for word in videos or dataset]
+    name = "".join(cells.get("name", [])) or Path(inputs[0]).stem
+    if not is_plain_name(name) or name.startswith((".", "-")):
+        raise UserError(f"{where}: {name!r} cannot be the name of a folder; give another name")
+    methods = cells.get("method", []) + cells.get("methods", []) or [DEFAULT_METHOD]
+    for method in methods:
+        check_method(where, method)
+    known = _options()
+    options, labels = {}, {}
+    for key, words in cells.items():
+        if key in _OWN:
+            continue
+        if key in known or key.partition(".")[0] in _GROUPS and "." in key:
+            options[key] = [
+                _input(folder, word, where) if key in _PATHS and _is_file(folder, word) else word for word in words
+            ]
+            continue
+        near = difflib.get_close_matches(key, known, 1, 0.8)
+        if near:
+            raise UserError(
+                f"{where}: column {original[key]!r} is no option; did you mean {near[0]!r}? Labels need other names"
+            )
+        labels[original[key]] = ";".join(words)
+    steps = _steps(inputs, bool(dataset), methods, options)
+    _check(steps, where, kinds)
+    files = [Path(word) for words in (inputs, *options.values()) for word in words if not is_url(word)]
+    row = Row(name, tuple(map(tuple, steps)), labels, _memory(cells, inputs, where))
+    return with_fingerprint(row, [path for path in files if path.exists()])
+
+
+def _words(value: Any) -> list[str]:
+    """The words of a cell: separated by semicolons in csv, or a list in json."""
+    each = value if isinstance(value, list) else str("" if value is None else value).split(";")
+    return [text for one in each if (text := str(one).strip())]
+
+
+def _is_file(folder: Path, word: str) -> bool:
+    return (folder / word).exists()
+
+
+def _input(folder: Path, word: str, where: str) -> str:
+    if is_url(word):
+        return word
+    path = folder / word
+    if not path.exists():
+        raise UserError(f"{where}: {path}: no such file; correct the table (paths are relative to it)")
+    return str(path.resolve())
+
+
+def _options() -> list[str]:
+    """The options of `mien create` that a column may set, without settings of groups."""
+    own = {one.name for one in fields(create.Command)} - {
+        "videos",
+        "out",
+        "view",
+        "preview",
+        "options",
+        "run_name",
+        "name",
+    }
+    train = {one.name for one in fields(TrainOptions)} - {"method"}
+    return sorted(name.replace("_", "-") for name in (own | train) - {*_GROUPS})
+
+
+def _steps(inputs: list[str], dataset: bool, methods: Sequence[str], options: dict[str, list[str]]) -> list[list[str]]:
+    """The commands of a row: tracked once, trained by each method."""
+    training = {one.name.replace("_", "-") for one in fields(TrainOptions)}
+    whole = [word for key, words in options.items() for word in _typed(key, words)]
+    trained = [
+        word
+        for key, words in options.items()
+        if key in training or key.startswith("method.")
+        for word in _typed(key, words)
+    ]
+    if dataset:
+        steps = [["import", *inputs, "--out", WORKSPACE]]
+    else:
+        steps = [["create", *inputs, "--out", WORKSPACE, "--method", methods[0], *whole]]
+    for method in methods if dataset else methods[1:]:
+        steps.append(["train", WORKSPACE, "--method", method, *trained])
+        steps.append(["evaluate", WORKSPACE, "--run", method])
+    return steps
+
+
+def _typed(key: str, words: list[str]) -> list[str]:
+    """An option as it is typed. A cell with yes or true is a flag without a value; no or false leaves it out."""
+    if [word.lower() for word in words] in (["true"], ["yes"]):
+        return [f"--{key}"]
+    return [] if [word.lower() for word in words] in (["false"], ["no"]) else [f"--{key}", *words]
+
+
+def _check(steps: list[list[str]], where: str, kinds: set[str]) -> None:
+    """Check the options of the first command, once for each kind of row."""
+    import tyro
+
+    first = steps[0]
+    words = ["one.mp4" if Path(word).is_absolute() or is_url(word) else word for word in first]
+    kind = json.dumps(words)
+    if kind in kinds or first[0] != "create":
+        return
+    kinds.add(kind)
+    local = [word for word in first[1:] if word != WORKSPACE and not is_url(word)]
+    out = local.index("--out")
+    arguments = [*(local[:out] or ["one.mp4"]), "--out", "out", *local[out + 1 :]]
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
+            options = with_settings(create.Command, arguments)
+            command = tyro.cli(options, args=arguments, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone))
+        command.options.check()
+        command.capture.check()
+        command.tracking.check()
+    except SystemExit:
+        why = " ".join(line.strip("╭╮╰╯│─ ") for line in told.getvalue().splitlines())
+        raise UserError(
+            f"{where}: {' '.join(why.split())[:300]}; see {shlex.join(['mien', 'create', '--help-all'])}"
+        ) from None
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+
+
+def _memory(cells: dict[str, list[str]], inputs: list[str], where: str) -> float:
+    """Megabytes that a row needs: as its column says, or from the number of its frames."""
+    from mien.commands.stages.expected import count_captured
+
+    if "memory-gb" in cells:
+        try:
+            given = float("".join(cells["memory-gb"]))
+        except ValueError:
+            given = 0.0
+        if not 0 < given < 1e6:
+            raise UserError(f"{where}: memory_gb {';'.join(cells['memory-gb'])}: give a number of gigabytes above 0")
+        return 1000 * given
+    videos = [Path(word) for word in inputs if not is_url(word)]
+    return _LEAST_MB + _FRAME_MB * sum(count_captured(video, CaptureSettings()) for video in videos)

@@ -1,0 +1,57 @@
+"""The process of a row for trials of engines: it appends to a list of begins, waits, and fails where it is told to.
+
+Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`.
+"""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+from mien.batch import Batch, Row, row_process
+from mien.batch.row import RowFailedError
+
+PROGRAM = (sys.executable, str(Path(__file__).resolve()))
+
+
+def stub_row(name: str, *steps: tuple[str, str], memory_mb: float = 100.0) -> Row:
+    """A row of stub steps."""
+    return Row(name, steps, {"kind": "stub"}, memory_mb, fingerprint=str(hash(steps) & 0xFFFF))
+
+
+def do_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
+    """Run the stub steps. Begins and ends are appended to one file, so that overlaps and losses show."""
+    place = batch.root / "begins.txt"
+    note(place, f"begin {row.name} {os.getpid()}\n")
+    value = 0.0
+    for what, argument in row.steps:
+        if what == "sleep":
+            time.sleep(float(argument))
+        elif what == "fail" or (what == "once" and tries(place, row.name) == 1):
+            raise RowFailedError(argument)
+        elif what == "eat":
+            _ = bytearray(int(argument) << 20)
+        elif what == "value":
+            value = float(argument)
+    note(place, f"end {row.name} {os.getpid()}\n")
+    return ({"run": "stub", "method": "stub", "psnr": value},), {"sleep": 0.0}
+
+
+def note(path: Path, line: str) -> None:
+    """Append a line at once."""
+    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    os.write(handle, line.encode())
+    os.close(handle)
+
+
+def tries(path: Path, name: str) -> int:
+    """How often a row began."""
+    return path.read_text().split().count(name) if path.exists() else 0
+
+
+if __name__ == "__main__":
+    if "eat" in sys.argv:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+    sys.exit(row_process(Path(sys.argv[-1]), sys.stdin, do_stub))

@@ -1,0 +1,281 @@
+"""`mien batch`: tables become rows, rows run once, failures stay alone, and results tell what came of them."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from batch_stub import PROGRAM, do_stub, stub_row
+from mien.batch import (
+    Batch,
+    Driver,
+    EngineOptions,
+    Row,
+    batch_progress,
+    latex_table,
+    markdown_table,
+    means_by,
+    progress_text,
+    run_row,
+    shard_of,
+    write_results,
+    write_wall,
+)
+from mien.cli import main
+from mien.commands.stages.batch_table import read_table
+from mien.errors import UserError
+from mien.locks import hold
+
+
+def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
+    return Driver(batch, engine, EngineOptions(batch.root, jobs, 1), retry, store, PROGRAM)
+
+
+def run_stubs(batch: Batch, rows: list[Row], **options: object) -> dict[str, str]:
+    """Run stub rows, and return the status of each."""
+    batch.write_plan(rows)
+    driver(batch, **options).run(rows)  # type: ignore[arg-type]
+    return {row["name"]: row["status"] for row in batch_progress(batch)["rows"]}
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    for name in ("ann", "bob"):
+        (tmp_path / f"{name}.mp4").write_bytes(b"a video")
+    path = tmp_path / "people.csv"
+    path.write_text(
+        "name,video,methods,steps,hold_out,age\n,ann.mp4,gaussian_avatars;headgas,60,,30\nrobert,bob.mp4,,,,41\n"
+    )
+    return path
+
+
+def test_rows_are_tracked_once_and_trained_by_each_method(table: Path):
+    ann, bob = read_table(table)
+    assert ann.name == "ann"
+    assert bob.name == "robert"
+    assert ann.labels == {"age": "30"}
+    first, *others = ann.steps
+    video = str(table.parent / "ann.mp4")
+    assert first == ("create", video, "--out", "{workspace}", "--method", "gaussian_avatars", "--steps", "60")
+    assert others == [
+        ("train", "{workspace}", "--method", "headgas", "--steps", "60"),
+        ("evaluate", "{workspace}", "--run", "headgas"),
+    ]
+    assert bob.steps == (
+        ("create", str(table.parent / "bob.mp4"), "--out", "{workspace}", "--method", "gaussian_avatars"),
+    )
+
+
+def test_a_changed_video_or_setting_changes_the_fingerprint(table: Path):
+    before = [row.fingerprint for row in read_table(table)]
+    (table.parent / "bob.mp4").write_bytes(b"another video")
+    assert [row.fingerprint == old for row, old in zip(read_table(table), before, strict=True)] == [True, False]
+
+
+def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
+    path = table.with_name("people.json")
+    path.write_text(json.dumps([{"video": ["ann.mp4", "bob.mp4"], "name": "both", "capture.size": 256}]))
+    (row,) = read_table(path)
+    assert row.steps[0][1:3] == (str(table.parent / "ann.mp4"), str(table.parent / "bob.mp4"))
+    assert row.steps[0][-2:] == ("--capture.size", "256")
+    assert [row.name for row in read_table(table.parent)] == ["ann", "bob"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("video,stepz\nann.mp4,3", "did you mean 'steps'"),
+        ("video\ngone.mp4", "gone.mp4: no such file"),
+        ("video,method\nann.mp4,nerf", "nerf"),
+        ("video,steps\nann.mp4,-3", "row 1: "),
+        ("video,steps\nann.mp4,many", "many"),
+        ("video,name\nann.mp4,x\nbob.mp4,x", "two rows have the name 'x'"),
+        ("video,name\nann.mp4,../x", "cannot be the name of a folder"),
+        ("name\nann", "give it a video or a dataset"),
+        ("video\nann.mp4,3", "more cells than the heading"),
+        ("video,memory_gb\nann.mp4,lots", "gigabytes above 0"),
+        ("", "has no rows"),
+    ],
+)
+def test_mistakes_in_a_table_are_named_before_any_work(table: Path, text: str, words: str):
+    table.write_text(text + "\n")
+    with pytest.raises(UserError, match=".") as caught:
+        read_table(table)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_shards_share_all_rows_out():
+    rows = [Row(str(index), ()) for index in range(10)]
+    shards = [shard_of(rows, f"{index}/3") for index in (1, 2, 3)]
+    assert sorted(row.name for shard in shards for row in shard) == [str(index) for index in range(10)]
+    for wrong in ("0/3", "4/3", "1", "a/b", "-1/3"):
+        with pytest.raises(UserError, match="--shard"):
+            shard_of(rows, wrong)
+
+
+def test_a_failing_row_stops_no_other_and_is_tried_again(tmp_path: Path):
+    batch = Batch(tmp_path)
+    rows = [stub_row("bad", ("fail", "no face")), stub_row("good", ("sleep", "0"))]
+    rows.append(stub_row("second", ("once", "a hiccup"), ("value", "20")))
+    assert run_stubs(batch, rows) == {"bad": "failed", "good": "done", "second": "done"}
+    begins = (tmp_path / "begins.txt").read_text()
+    assert [begins.count(f"begin {name} ") for name in ("bad", "good", "second")] == [2, 1, 2]
+    found = {row["name"]: row for row in batch_progress(batch)["rows"]}
+    assert found["bad"]["error"] == "no face"
+    assert found["bad"]["tries"] == 2
+    text = progress_text(batch_progress(batch))
+    assert "bad: failed on " in text
+    assert "repeat it: mien fail 'no face'" in text
+    driver(batch).run(rows)  # what is done is skipped
+    assert (tmp_path / "begins.txt").read_text().count("begin good ") == 1
+
+
+def test_a_row_whose_process_is_killed_fails_alone_or_is_tried_again(tmp_path: Path):
+    batch = Batch(tmp_path)
+    rows = [stub_row("victim", ("sleep", "1.5"), ("value", "21")), stub_row("other", ("sleep", "0.1"))]
+    batch.write_plan(rows)
+    script = (
+        "import sys; from pathlib import Path; from test_batch import driver; from mien.batch import Batch; "
+        "b = Batch(Path(sys.argv[1])); driver(b).run(b.read_plan())"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    running = subprocess.Popen(command, cwd=Path(__file__).parent, stderr=subprocess.DEVNULL)
+    os.kill(wait_for_begin(tmp_path, "victim"), signal.SIGKILL)
+    assert running.wait(60) == 0
+    state = batch.read_state("victim")
+    assert state is not None
+    assert (state.status, state.tries, state.runs[0]["psnr"]) == ("done", 2, 21.0)
+
+
+def test_rows_stop_when_their_driver_is_killed_and_the_same_command_continues(tmp_path: Path):
+    batch = Batch(tmp_path)
+    rows = [stub_row("long", ("sleep", "30"))]
+    batch.write_plan(rows)
+    script = (
+        "import sys; from pathlib import Path; from test_batch import driver; from mien.batch import Batch; "
+        "b = Batch(Path(sys.argv[1])); driver(b).run(b.read_plan())"
+    )
+    running = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], cwd=Path(__file__).parent, stderr=subprocess.DEVNULL
+    )
+    pid = wait_for_begin(tmp_path, "long")
+    assert batch_progress(batch)["rows"][0]["status"] == "running"
+    running.kill()
+    running.wait()
+    until = time.monotonic() + 10
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{pid}").exists()
+    assert batch_progress(batch)["rows"][0]["status"] == "interrupted"
+    again = [stub_row("long", ("sleep", "0"))]
+    assert run_stubs(batch, again) == {"long": "done"}
+
+
+def wait_for_begin(root: Path, name: str) -> int:
+    """The process that began a row."""
+    place, until = root / "begins.txt", time.monotonic() + 30
+    while time.monotonic() < until:
+        for line in place.read_text().splitlines() if place.exists() else ():
+            if line.startswith(f"begin {name} "):
+                return int(line.split()[2])
+        time.sleep(0.05)
+    raise AssertionError(f"{name} never began")
+
+
+def test_a_row_that_another_command_holds_is_left_to_it(tmp_path: Path):
+    batch, row = Batch(tmp_path), stub_row("held", ("sleep", "0"))
+    with hold(batch.state_file("held")):
+        assert run_row(batch, row, do_stub) is None
+    assert not (tmp_path / "begins.txt").exists()
+    state = run_row(batch, row, do_stub)
+    assert state is not None
+    assert state.status == "done"
+
+
+def test_memory_is_counted_before_rows_run_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("mien.batch.engines.local.free_memory_mb", lambda: 1000.0)
+    rows = [stub_row(f"big{index}", ("sleep", "0.3"), memory_mb=700.0) for index in range(3)]
+    rows.append(stub_row("huge", ("sleep", "0.1"), memory_mb=5000.0))
+    assert set(run_stubs(Batch(tmp_path), rows, jobs=4).values()) == {"done"}
+    running, most = 0, 0
+    for line in (tmp_path / "begins.txt").read_text().splitlines():
+        running += 1 if line.startswith("begin") else -1
+        most = max(most, running)
+    assert most == 1
+
+
+def test_workspaces_go_through_a_store(tmp_path: Path):
+    pytest.importorskip("fsspec")
+    batch = Batch(tmp_path / "batch")
+    rows = [stub_row("away", ("value", "22"))]
+    assert run_stubs(batch, rows, store=f"file://{tmp_path / 'store'}") == {"away": "done"}
+    assert (batch.log_file("away")).is_file()
+    assert not (batch.root / "begins.txt").exists()  # it ran elsewhere
+
+
+def scored(batch: Batch) -> list[dict[str, object]]:
+    """A batch of three people and two methods, with figures."""
+    rows = []
+    for person, light in (("ann", "sun"), ("bob", "lamp"), ("eve", "sun")):
+        rows.append(Row(person, (), {"light": light}))
+    batch.write_plan(rows)
+    from mien.batch import State
+
+    for index, row in enumerate(rows[:2]):
+        runs = tuple(
+            {"run": m, "method": m, "psnr": 30.0 + index + gain, "perceptual": 0.1}
+            for m, gain in (("a", 0.0), ("b", 1.0 + index))
+        )
+        batch.write_state(State(row.name, "done", "", runs=runs, stages={"training": 3.0}))
+    batch.write_state(State("eve", "failed", "", error="=cmd: <b>no face</b>"))
+    return write_results(batch)
+
+
+def test_results_have_all_figures_and_paired_differences(tmp_path: Path):
+    batch = Batch(tmp_path)
+    rows = scored(batch)
+    with (tmp_path / "results.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [(row["name"], row["run"], row["psnr"]) for row in table[:2]] == [("ann", "a", "30.0"), ("ann", "b", "31.0")]
+    assert table[-1]["error"] == "'=cmd: <b>no face</b>"
+    content = json.loads((tmp_path / "results.json").read_text())
+    difference = next(each for each in content["comparison"] if each.get("minus") == "b" and each["metric"] == "psnr")
+    assert difference["mean"] == -1.5
+    # t(0.975, 1) = 12.7062, standard error 0.5
+    assert difference["interval"] == pytest.approx([-7.8531, 4.8531], abs=1e-4)
+    table = means_by(rows, "method", ["psnr", "lpips"])
+    assert table == [
+        ["method", "n", "psnr", "lpips"],
+        ["a", "2", "30.50 ± 0.71", "0.100 ± 0.000"],
+        ["b", "2", "32.00 ± 1.41", "0.100 ± 0.000"],
+    ]
+    assert markdown_table(table).splitlines()[1] == "|---|---|---|---|"
+    assert r"30.50 $\pm$ 0.71" in latex_table(table)
+    with pytest.raises(UserError, match="no such column"):
+        means_by(rows, "gone", ["psnr"])
+
+
+def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
+    batch = Batch(tmp_path)
+    write_wall(batch, scored(batch))
+    page = (tmp_path / "index.html").read_text()
+    assert page.index('data-psnr="30.0"') < page.index('data-psnr="31.0"') < page.index('data-psnr="33.0"')
+    assert "&lt;b&gt;no face" in page
+    assert "<b>no face" not in page
+
+
+def test_status_and_table_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    scored(Batch(tmp_path))
+    assert main(["batch", "status", str(tmp_path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["counts"] == {"done": 2, "failed": 1}
+    assert main(["batch", "table", str(tmp_path), "--rows", "light", "--columns", "psnr"]) == 0
+    assert "| sun | 2 |" in capsys.readouterr().out
+    assert main(["batch", "status", str(tmp_path / "gone")]) == 2
+    assert "is not the folder of a batch" in capsys.readouterr().err
