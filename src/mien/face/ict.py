@@ -6,6 +6,7 @@ tongue as the expressions move them, and the lids follow the eyes, as in the def
 the eyes, lashes, and the inner layer of the eyeballs are left out.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,8 +107,7 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
     parts = {name: _among(kept, *ends) for name, ends in _EYEBALLS.items()}
     centers = np.stack([(template[eye].min(0) + template[eye].max(0)) / 2 for eye in parts.values()])
     origin = centers.mean(0) - np.array([0.0, 0.0, EYE_BACK])
-    template = template - origin
-    centers = centers - origin
+    template, centers = template - origin, centers - origin
     if centers[0, 0] <= 0 or not find_outside(template, faces).any():
         raise UserError(f"{path}: its vertices do not have the order of ICT-FaceKit; download it again")
     raw = _by_arkit({key: _METERS * delta[kept] for key, delta in ict.expression.items()})
@@ -120,11 +120,7 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
     hinge, rotations, translations = jaw_motion(template, raw, lower & parts["teeth"])
     joints = np.stack([np.zeros(3), np.array([0.0, *_NECK_PIVOT]), hinge, *centers])
     identity = _METERS * ict.identity[:, kept]
-    rotation_basis = np.zeros((len(names), len(JOINTS), 3))
-    translation_basis = np.zeros_like(rotation_basis)
-    for each in JAW_EXPRESSIONS:
-        rotation_basis[names.index(each), JOINTS.index("jaw")] = rotations[each]
-        translation_basis[names.index(each), JOINTS.index("jaw")] = translations[each]
+    rotation_basis, translation_basis = (_of_the_jaw(names, motions) for motions in (rotations, translations))
     correctives = lid_correctives(template, raw, parts)
     deltas = np.stack(list(raw.values()))
     deltas[:, inside | parts["left_eye"] | parts["right_eye"]] = 0
@@ -156,6 +152,14 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
         pose_basis=_rounded(correctives),
         landmarks={},
     )
+
+
+def _of_the_jaw(names: tuple[str, ...], motions: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The motions of all joints by each expression, [e, j, 3], of which only the jaw's are not 0."""
+    basis = np.zeros((len(names), len(JOINTS), 3))
+    for each in JAW_EXPRESSIONS:
+        basis[names.index(each), JOINTS.index("jaw")] = motions[each]
+    return basis
 
 
 def _read_packed(path: Path) -> IctFile:
