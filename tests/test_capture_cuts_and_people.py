@@ -80,11 +80,11 @@ def test_interrupted_parts_go_on_to_the_same_bytes(shots, tmp_path, monkeypatch)
 
     original, calls = from_video.process_part, []
 
-    def stop_at_the_second(*arguments):
+    def stop_at_the_second(*arguments, **options):
         calls.append(arguments[1].name)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return original(*arguments)
+        return original(*arguments, **options)
 
     monkeypatch.setattr(from_video, "process_part", stop_at_the_second)
     with pytest.raises(KeyboardInterrupt):

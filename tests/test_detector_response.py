@@ -46,7 +46,7 @@ def test_a_file_is_read_as_it_was_written(tmp_path, monkeypatch):
     response = _some_response(len(model.expression_names))
     path = tmp_path / "small_detector.npz"
     write_response(path, model, response, 5)
-    monkeypatch.setattr("mien.tracking.landmarks.detector_response.response_path", lambda name: path)
+    monkeypatch.setattr("mien.tracking.landmarks.detector_response.response_path", lambda *which: path)
     read = read_response(model, 0.003)
     for name in ("mean", "by_turn", "by_expression", "by_person"):
         torch.testing.assert_close(getattr(read, name), getattr(response, name), atol=3e-6, rtol=0)

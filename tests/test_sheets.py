@@ -18,7 +18,7 @@ from mien.commands.stages.sheets import (
     turntable_tiles,
 )
 from mien.driving import ARKIT_NAMES
-from mien.face import load_face_model
+from mien.face import FaceModel, load_face_model
 from mien.render.camera_paths import orbit
 from mien.runtime import Filmed
 from small_face_model import make_small_face_model
@@ -113,8 +113,8 @@ def test_a_driver_who_goes_far_is_softened_unless_asked(
 
     looked_up, read = [], driving.read_tracked_driver
 
-    def far(folders: list[Path]) -> driving.Driver:
-        driver = read(folders)
+    def far(folders: list[Path], face_model: FaceModel) -> driving.Driver:
+        driver = read(folders, face_model)
         turned = driver.face.head_rotation + torch.tensor([-1.0, 0.0, 0.0])
         return replace(driver, face=replace(driver.face, head_rotation=turned))
 

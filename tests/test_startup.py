@@ -79,7 +79,7 @@ drive gone --by a.csv --out b.mp4
 drive w --by gone --out b.mp4
 drive w --by a.csv --out b.gif
 drive w --by a.csv --out b.mp4 --fps 0
-drive w --by a.csv
+drive w --by a.csv --port 99999
 drive w --by camera:/dev/video99
 drive w --by camera: --out b.mp4
 drive w --by camera --port 99999

@@ -2,8 +2,7 @@
 
 `run_row` runs in a process of its own, so that a row that needs too much memory fails alone. That process holds the
 row's lock and runs the steps itself: whatever kills it frees the lock and leaves nothing behind. `attempt` starts it
-and
-waits for it, wherever an engine calls it. If `attempt` dies, the row's standard input ends, and the row stops.
+and waits for it, wherever an engine calls it. If `attempt` dies, the row's standard input ends, and the row stops.
 """
 
 import json
@@ -26,7 +25,7 @@ from mien.batch.plan import WORKSPACE, Batch, Row, State, row_from
 from mien.errors import CannotWriteError, UserError
 from mien.locks import BeingWrittenError, hold
 from mien.stops import orderly_stops
-from mien.system import peak_memory_mb
+from mien.system import end_this_process, peak_memory_mb
 from mien.terminal import printable, tell
 
 Do = Callable[[Batch, Row], tuple[tuple[dict[str, Any], ...], dict[str, float]]]
@@ -136,7 +135,7 @@ def _why(batch: Batch, row: Row, code: int) -> str:
     if code < 0:
         name = signal.Signals(-code).name
         hint = f"; it may have needed more memory than the {row.memory_mb / 1000:.1f} GB that were counted"
-        return f"its process was ended by {name}{hint if -code == signal.SIGKILL else ''}; run the row again"
+        return f"its process was ended by {name}{hint if name == 'SIGKILL' else ''}; run the row again"
     return last_error(batch.log_file(row.name)) or f"its process ended with exit code {code}; see its log"
 
 
@@ -173,7 +172,7 @@ def row_process(root: Path, given: IO[str], do: Do) -> int:
 def _stop_at_end(given: IO[str]) -> None:
     """Stop this process if the one that waits for it is gone: in good order, or by force if it does not follow."""
     given.read()
-    os.kill(os.getpid(), signal.SIGTERM)
+    end_this_process()
     time.sleep(10)
     os._exit(143)
 

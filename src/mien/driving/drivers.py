@@ -89,8 +89,8 @@ def read_tracked_driver(folders: Items[Path], face_model: FaceModel | None = Non
             it as it was tracked.
 
     Raises:
-        UserError: no frame was tracked, the sequences were tracked with several face models, a file is damaged, or a
-            pause in a video is too long.
+        UserError: no frame was tracked, the sequences were tracked with several face models or with one that is not
+            installed, a file is damaged, or a pause in a video is too long.
     """
     sequences = [read_sequence(folder) for folder in folders]
     shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}
@@ -117,8 +117,13 @@ def read_tracked_driver(folders: Items[Path], face_model: FaceModel | None = Non
     face = concatenate(faces)
     tracked_by = sequences[0].tracking.face_model
     if face_model is not None and tracked_by != face_model.name:
+        try:
+            own = load_face_model(tracked_by)
+        except UserError as error:
+            other = f"was tracked with another face model than that of the avatar, {face_model.name!r}"
+            raise UserError(f"{names}: {other}, and {error}") from None
         say(f"{names}: tracked with {tracked_by}; its expressions are transferred to {face_model.name}")
-        transferred = fit_expression_map(load_face_model(tracked_by), face_model)
+        transferred = fit_expression_map(own, face_model)
         face, at_rest, found = transferred(face), transferred(at_rest), transferred(found)
 
     def picture(index: int) -> UInt8[np.ndarray, "h w 3"]:

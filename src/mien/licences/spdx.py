@@ -27,6 +27,10 @@ _LICENCES = {
     "gsplat": "Apache-2.0",
     "viser": "MIT",
     "zstandard": "BSD-3-Clause",
+    "submitit": "MIT",
+    "ray": "Apache-2.0",
+    "fsspec": "BSD-3-Clause",
+    "s3fs": "BSD-3-Clause",
 }
 """Licences of what mien asks for, beside those of `PACKAGES`."""
 
