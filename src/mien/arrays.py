@@ -70,7 +70,8 @@ def unpacked(*tensors: Tensor | None) -> list[Any]:
 def clear_rows(chosen: Bool[Tensor, " n"], tensors: Sequence[Tensor]) -> None:
     """Set the chosen rows of all tensors [n, ...] to 0, in place. Native for float32 on a CPU, where torch is slow."""
     if is_native(*tensors, chosen) and all(tensor.is_contiguous() for tensor in tensors):
-        _native.clear_rows(*unpacked(chosen.view(torch.uint8)), unpacked(*tensors))
+        (bytes_of_chosen,) = unpacked(chosen.view(torch.uint8))
+        _native.clear_rows(bytes_of_chosen, unpacked(*tensors))
         return
     for tensor in tensors:
         tensor.masked_fill_(chosen.view(-1, *[1] * (tensor.ndim - 1)), 0)

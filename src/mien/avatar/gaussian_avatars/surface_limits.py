@@ -61,11 +61,12 @@ def keep_on_surface(
     arrays = [store[name].detach() for name in names]
     colors = store[_COLORS].detach()[:, 0] if pulls is not None else arrays[0]
     if is_native(*arrays, colors, limits) and all(own.is_contiguous() for own in (*arrays, colors)):
-        triangle, table = store["face_index"].long().contiguous(), limits.contiguous()
-        means, quats, log_scales = unpacked(*arrays)
         own = None if pulls is None else pulls.contiguous()
-        tail = unpacked(own, colors)
-        _native.keep_on_surface(*unpacked(triangle, table), math.log(ratio), means, quats, log_scales, *tail)
+        means, quats, log_scales = unpacked(*arrays)
+        triangle, table, pull, color = unpacked(
+            store["face_index"].long().contiguous(), limits.contiguous(), own, colors
+        )
+        _native.keep_on_surface(triangle, table, math.log(ratio), means, quats, log_scales, pull, color)
         return
     keep_on_surface_reference(store, limits, ratio)
     if pulls is not None:
