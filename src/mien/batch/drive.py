@@ -41,8 +41,8 @@ class Driver:
     """How often a failed row is tried again."""
     store: str = ""
     """URL of the store of workspaces. Empty if all nodes share the batch's folder."""
-    program: tuple[str, ...] = PROGRAM
-    """The command of a row's process."""
+    program: tuple[str, ...] = ()
+    """The command of a row's process. Empty means this Python with `-m mien.batch_row`."""
     work: Work | None = None
     """What runs a row in place of `attempt`: for trials of the engines."""
 
@@ -93,8 +93,8 @@ class Driver:
 
             threads = max(1, thread_count() // jobs_here(rows, self.options))
         if self.store:
-            return partial(_attempt_in_store, self.store, self.program, threads)
-        return partial(_attempt, str(self.options.root.resolve()), self.program, threads)
+            return partial(_attempt_in_store, self.store, self.program or PROGRAM, threads)
+        return partial(_attempt, str(self.options.root.resolve()), self.program or PROGRAM, threads)
 
     def _keep(self, row: Row, outcome: Any) -> bool:
         """Keep what a row sent back, and return whether the row is done."""

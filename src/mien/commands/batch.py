@@ -104,7 +104,7 @@ class Command:
         return self.what[0] if self.what and self.what[0] in ("status", "table") else None
 
     def _run_rows(self) -> None:
-        from mien.batch import PROGRAM, Driver, batch_progress, progress_text, write_results, write_wall
+        from mien.batch import Driver, batch_progress, progress_text, write_results, write_wall
         from mien.commands.stages.batch_table import read_table
         from mien.progress import say
 
@@ -114,7 +114,7 @@ class Command:
         if labels:
             say(f"labels, which come back in the results: {', '.join(labels)}")
         batch.write_plan(rows)
-        program = tuple(shlex.split(self.program)) or PROGRAM
+        program = tuple(shlex.split(self.program))
         options = EngineOptions(
             self.out, self.jobs, self.threads, self.gpus, self.time, self.partition, self.ray_address
         )
