@@ -44,7 +44,7 @@ class Driver:
     program: tuple[str, ...] = ()
     """The command of a row's process. Empty means this Python with `-m mien.batch_row`."""
     work: Work | None = None
-    """What runs a row in place of `attempt`: for trials of the engines."""
+    """A function that runs a row in place of `attempt`, for trials of the engines."""
 
     def run(self, rows: Sequence[Row]) -> None:
         """Run the rows until each is done, has failed too often, or is run by another command."""

@@ -41,7 +41,7 @@ class Row:
 
 @dataclass(frozen=True)
 class State:
-    """What became of a row. `status` is that of its last try."""
+    """The state of a row. `status` is that of its last try."""
 
     name: str
     status: str

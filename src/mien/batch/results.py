@@ -1,4 +1,4 @@
-"""What came of a batch: one line for each run, comparisons of methods, and tables for papers."""
+"""The results of a batch: one line for each run, comparisons of methods, and tables for papers."""
 
 import csv
 import io

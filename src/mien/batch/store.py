@@ -34,7 +34,7 @@ def fetched(word: str, folder: Path) -> str:
 
 @dataclass(frozen=True)
 class Returned:
-    """What a row that ran without the batch's folder sends back."""
+    """The state and the files that a row sends back if it ran without the batch's folder."""
 
     state: State | None
     files: Mapping[str, bytes] = field(default_factory=dict)

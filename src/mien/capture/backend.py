@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from typing import Any, Literal
 
 DetectorChoice = Literal["auto", "mediapipe", "litert"]
-"""What a user may choose. auto: mediapipe where it is installed, and otherwise litert."""
+"""The choices of a user. auto is mediapipe where it is installed, and otherwise litert."""
 Detector = Literal["mediapipe", "litert"]
 MODULE_OF: dict[Detector, str] = {"mediapipe": "mediapipe", "litert": "ai_edge_litert"}
 

@@ -107,7 +107,7 @@ class GaussianSurface(BoundSurface):
             pull_colors(self._store, pulls)
 
     def _tables_of(self, prior: SurfacePrior) -> tuple[Float[Tensor, "f 5"] | None, Float[Tensor, "f 4"] | None]:
-        """What `keep_to` needs of each triangle: limits, and pulls of colours. Kept until the prior changes."""
+        """Return the limits and the pulls of colours of all triangles. They are kept until the prior changes."""
         if self._tables is None or self._tables[0] is not prior:
             limits = pulls = None
             if self._config.surface.enabled or prior.filled_in is not None:

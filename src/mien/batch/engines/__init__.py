@@ -16,7 +16,7 @@ Work = Callable[[Row], Any]
 
 @dataclass(frozen=True)
 class EngineOptions:
-    """What engines are told."""
+    """Options of all engines."""
 
     root: Path
     """Folder of the batch."""

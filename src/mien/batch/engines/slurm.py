@@ -22,7 +22,7 @@ _DEFAULT_MINUTES, _SLACK, _LEAST_MINUTES = 24 * 60, 3.0, 10
 
 
 class _Task:
-    """What a task of the array does. Submitit calls `checkpoint` before a preemption, and requeues what it returns."""
+    """The work of one task of the array. Submitit calls `checkpoint` before a preemption, and requeues what it returns."""
 
     def __init__(self, work: Work) -> None:
         self.work = work
@@ -63,7 +63,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
 
 
 def _parameters(batch: Batch, rows: Sequence[Row], options: EngineOptions, size: int) -> dict[str, Any]:
-    """What is asked of Slurm for each task of the array."""
+    """The resources of each task of the array, as Slurm is asked for them."""
     finished = [state.seconds for row in batch.read_plan() if (state := batch.read_state(row.name)) and state.runs]
     minutes = max(_LEAST_MINUTES, math.ceil(_SLACK * max(finished) / 60)) if finished else _DEFAULT_MINUTES
     found: dict[str, Any] = {
