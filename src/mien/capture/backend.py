@@ -1,4 +1,4 @@
-"""Which library runs the networks that find faces, landmarks and people: mediapipe or ai-edge-litert."""
+"""Choice of the library that runs the networks for faces, landmarks and people: mediapipe or ai-edge-litert."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec

@@ -22,7 +22,7 @@ _DEFAULT_MINUTES, _SLACK, _LEAST_MINUTES = 24 * 60, 3.0, 10
 
 
 class _Task:
-    """The work of one task of the array. Submitit calls `checkpoint` before a preemption, and requeues what it returns."""
+    """The work of a task of the array. Submitit calls `checkpoint` before a preemption, and requeues its result."""
 
     def __init__(self, work: Work) -> None:
         self.work = work
