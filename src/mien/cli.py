@@ -26,7 +26,7 @@ from mien.terminal import drop_output, open_closed_streams, printable, show, tel
 from mien.threads import asked_threads
 
 GROUPS = {
-    "Make an avatar": ("demo", "create", "capture", "track", "train", "import", "batch"),
+    "Make an avatar": ("demo", "create", "capture", "track", "align", "train", "import", "batch"),
     "Use it": ("view", "render", "drive", "export"),
     "Research": ("evaluate", "analyze", "study", "bench", "face-models", "licenses", "plugins"),
 }
@@ -35,6 +35,7 @@ COMMANDS = {
     "create": "video -> avatar, page, film and report: all stages in one command",
     "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
     "track": "capture -> face parameters, cameras, overlay video",
+    "align": "trackings -> sharper ones: every frame fitted to a quick avatar",
     "train": "captures + trackings -> an avatar, by the method of your choice",
     "evaluate": "avatar -> metrics.json and report.html on held-out frames",
     "analyze": "avatar -> the figures of its method's paper, measured: growth, speed, ablations",

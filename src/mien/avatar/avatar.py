@@ -6,6 +6,7 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import final
 
@@ -172,6 +173,19 @@ def move_avatar(avatar: Avatar, like: Tensor) -> None:
         return
     avatar.to(like)
     avatar.face_model, avatar.subject = avatar.face_model.to(like), avatar.subject.to(like)
+
+
+@contextmanager
+def frozen(avatar: Avatar) -> Iterator[None]:
+    """Let gradients reach the face alone, and leave none in the avatar."""
+    trained = [tensor for tensor in avatar.parameters() if tensor.requires_grad]
+    for tensor in trained:
+        tensor.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for tensor in trained:
+            tensor.requires_grad_(True)
 
 
 def neutral_of(face: FaceParams) -> FaceParams:

@@ -13,7 +13,7 @@ from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.overall import Overall
 from mien.tracking import ScoringSettings, TrackingSettings
-from mien.training import NAMED_SPLIT, OWN_SPLIT, TrainSettings
+from mien.training import NAMED_SPLIT, OWN_SPLIT, AlignmentSettings, TrainSettings
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -48,6 +48,7 @@ class Command:
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
     scoring: ScoringSettings = field(default_factory=ScoringSettings)
 
     def check(self) -> None:
@@ -73,6 +74,7 @@ class Command:
         run_name(self.run_name or self.options.method)
         self.capture.check()
         self.tracking.check()
+        self.alignment.check()
         check_new_workspace(self.out)
 
     def run(self) -> None:
@@ -115,13 +117,22 @@ class Command:
         else:
             frames = [sum(frames)]  # the cameras of one sequence
         scored = count_scored(frames, names, settings)
-        return Overall(expected_pieces(frames, scored, self.tracking, settings, self.overlay))
+        several = self.calibration is not None
+        alignment = self.alignment if self._aligns(several) else None
+        return Overall(expected_pieces(frames, scored, self.tracking, settings, self.overlay, alignment))
+
+    def _aligns(self, several_cameras: bool) -> bool:
+        """Whether new trackings are aligned."""
+        auto = not several_cameras and self.options.preset != "paper"
+        auto = auto and self.options.settings().steps >= self.alignment.template_steps
+        return self.alignment.when == "always" or (self.alignment.when == "auto" and auto)
 
     def _run_stages(self, workspace: Workspace, run: str, method: MethodConfig, settings: TrainSettings) -> None:
+        from mien.commands.stages.aligning import is_trained_on, one_camera, run_alignment_stage
         from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
         from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.commands.stages.names import sequence_names
-        from mien.commands.stages.tracking import run_tracking_stage
+        from mien.commands.stages.tracking import run_tracking_stage, show_trackings
         from mien.commands.stages.training import run_training_stage
         from mien.training import check_held_out
 
@@ -141,8 +152,13 @@ class Command:
             preview=self.preview,
             hold_out=settings.held_out_sequences if self.track_apart else (),
             scoring=self.scoring,
+            show=False,
         )
         together = [name for name in captured if name in trackings]
+        # A run that goes on keeps its tracking.
+        if self._aligns(not one_camera(workspace, together)) and not is_trained_on(workspace, run, together):
+            run_alignment_stage(workspace, together, self.alignment, settings, keep=True)
+        show_trackings(workspace, list(trackings), self.overlay)
         run_training_stage(workspace, together, run, method, settings, self.view)
         if settings.holds_out:
             run_evaluation_stage(workspace, run, again=False)

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 _COMMON = {
     "capture": ("size", "crop", "start", "end", "turn", "stride", "fps", "cuts", "clean_plate", "mattes"),
     "tracking": ("focal", "same_camera", "schedule"),
+    "alignment": ("when",),
     "scoring": (),
 }
 """Common fields of each group of settings, by the prefix of the group's options."""

@@ -5,12 +5,9 @@ expression and pose are tuned by the colour loss alone. The figure shows what th
 right. It uses the pixels that are scored, so it is no figure of a prediction, and never the headline.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import torch
 
-from mien.avatar import Avatar, FaceTuning, Progress
+from mien.avatar import FaceTuning, Progress, frozen
 from mien.evaluation.experiment import Experiment, target_image
 from mien.face import FaceParams
 from mien.render import rasterize
@@ -66,7 +63,7 @@ def fit_face(experiment: Experiment, frames: list[Frame], steps: int) -> FacePar
     targets = [(experiment.camera(frame), target_image(experiment, frame)) for frame in frames]
     track = FaceTrack(experiment.face(frames[0]), _RATES, bounds=avatar.face_model.expression_bounds)
     adam = Adam()
-    with torch.enable_grad(), _frozen(avatar):
+    with torch.enable_grad(), frozen(avatar):
         for step in range(steps):
             gaussians = avatar.pose(track.face(0)).gaussians.timestep(0)
             white = torch.ones(3).to(gaussians.means)
@@ -78,16 +75,3 @@ def fit_face(experiment: Experiment, frames: list[Frame], steps: int) -> FacePar
             adam.step(track.parameter_groups(0), Progress(step, steps))
             track.confine(0)
     return track.face(0).detach()
-
-
-@contextmanager
-def _frozen(avatar: Avatar) -> Iterator[None]:
-    """Let gradients reach the face alone, and leave none in the avatar."""
-    trained = [tensor for tensor in avatar.parameters() if tensor.requires_grad]
-    for tensor in trained:
-        tensor.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for tensor in trained:
-            tensor.requires_grad_(True)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.training.alignment import align
+    from mien.training.alignment_settings import AlignmentSettings
     from mien.training.footage import (
         NAMED_SPLIT,
         OWN_SPLIT,
@@ -50,6 +52,7 @@ else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
+    "AlignmentSettings",
     "MAIN_SETTINGS",
     "NAMED_SPLIT",
     "OWN_SPLIT",
@@ -60,6 +63,7 @@ __all__ = [
     "Sequence",
     "Split",
     "TrainSettings",
+    "align",
     "check_data",
     "check_held_out",
     "check_run",

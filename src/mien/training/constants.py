@@ -10,6 +10,13 @@ from dataclasses import dataclass
 class TrainingConstants:
     """The constants of this room, by the file that uses them. `benchmarks/ablate.py` measures what one is worth."""
 
+    # alignment.py
+    aligned_together: int = 4
+    """Number of timesteps that are aligned in one pass. Not varied."""
+    aligned_shift: float = 0.3
+    """Learning rate of the head's position in metres, as a share of that of its rotation in radians: the ratio with
+    which training corrects the tracking. Not varied."""
+
     # camera_colors.py
     camera_colors_last_rate: float = 0.1
     """Learning rate of the cameras' colours at the last step, as a share of that at the first. Not varied."""

@@ -8,11 +8,12 @@ from mien.capture.video import probe_video
 from mien.errors import UserError
 from mien.overall import Piece
 from mien.tracking import TrackingSettings, overlay_stride
-from mien.training import TrainSettings
+from mien.training import AlignmentSettings, TrainSettings
 
 _FIND, _CAPTURE, _LANDMARKS, _PIXELS, _SCORING, _OVERLAY = 0.005, 0.036, 0.062, 0.07, 0.015, 0.055
 _SHARED_PIXELS = 10.0
 _STEP = 0.042
+_TEMPLATE_STEP, _ALIGN = 0.03, 0.012
 _SCORE, _PERCEPTUAL, _VIDEO = 0.35, 2.0, 0.05
 """Seconds per frame, per step and per scored frame: medians over clips of 216 to 587 frames of 512x512, two cores."""
 _PERCEPTUAL_FRAMES = 24
@@ -36,7 +37,12 @@ def count_captured(source: Path, settings: CaptureSettings) -> int:
 
 
 def expected_pieces(
-    frames: Sequence[int], scored: int, tracking: TrackingSettings, settings: TrainSettings, overlay: str
+    frames: Sequence[int],
+    scored: int,
+    tracking: TrackingSettings,
+    settings: TrainSettings,
+    overlay: str,
+    alignment: AlignmentSettings | None = None,
 ) -> list[Piece]:
     """The pieces of `mien create` in their order, with expected times.
 
@@ -46,6 +52,7 @@ def expected_pieces(
         tracking: Settings of the tracking.
         settings: Settings of the training.
         overlay: Frames in the overlay: auto, all or none.
+        alignment: Settings of the alignment. None if there is none.
     """
     pieces, total = [], sum(frames)
     for count in frames:
@@ -53,8 +60,11 @@ def expected_pieces(
     pieces.append(Piece("tracking", "Tracking", _LANDMARKS * total))
     if tracking.schedule == "fast":
         pieces.append(Piece("tracking", "Fitting to pixels", _SHARED_PIXELS + _PIXELS * total))
+    pieces += [Piece("tracking", "Scoring masks", _SCORING * count) for count in frames]
+    if alignment is not None:
+        pieces.append(Piece("alignment", "template: training", _TEMPLATE_STEP * alignment.template_steps))
+        pieces.append(Piece("alignment", "aligning", _ALIGN * alignment.iterations * total))
     for count in frames:
-        pieces.append(Piece("tracking", "Scoring masks", _SCORING * count))
         if overlay != "none":
             every = overlay_stride(count) if overlay == "auto" else 1
             pieces.append(Piece("tracking", "Overlay", _OVERLAY * count / every))

@@ -12,7 +12,7 @@ from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import count_frames
 from mien.commands.stages.face_models import face_model_of
 from mien.errors import UserError
-from mien.face import FaceModel
+from mien.face import FaceModel, load_face_model
 from mien.face.checks import check_face_params
 from mien.inside import remove_tree
 from mien.locks import hold
@@ -59,13 +59,16 @@ def run_tracking_stage(
     preview: bool = False,
     hold_out: Collection[str] = (),
     scoring: ScoringSettings = DEFAULT_SCORING,
+    *,
+    show: bool = True,
 ) -> dict[str, Tracking]:
     """Track all sequences of a workspace together, with one identity; return the trackings by name.
 
     Current trackings are read back. The face model is a name or a file (`face_model_of`). Writes overlays and, only
-    once, the scoring masks. Sequences with too few faces are left out, unless that would leave none. Held-out sequences
-    have no part in what the sequences share (`track_subject`). No other process may write a sequence meanwhile, unless
-    everything is current and nothing is written.
+    once, the scoring masks. Without `show`, reports and overlays are left to `show_trackings`. Sequences with too few
+    faces are left out, unless that would leave none. Held-out sequences have no part in what the sequences share
+    (`track_subject`). No other process may write a sequence meanwhile, unless everything is current and nothing is
+    written.
 
     Raises:
         BeingWrittenError: another process is writing one of the sequences.
@@ -77,7 +80,11 @@ def run_tracking_stage(
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
     check_apart(names, hold_out)
     check_masks(workspace, names, scoring)
-    finished = None if again else _finished_trackings(workspace, names, face_model, settings, overlay, hold_out)
+    finished = (
+        None
+        if again
+        else _finished_trackings(workspace, names, face_model, settings, overlay if show else None, hold_out)
+    )
     if finished is not None:
         say(f"{', '.join(finished)}: the tracking is current, nothing to do")
         return finished
@@ -88,8 +95,24 @@ def run_tracking_stage(
             trackings = _track(workspace, names, face_model, settings, fingerprint, preview, hold_out)
         else:
             say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
-        _write_what_follows(workspace, trackings, face_model, overlay, scoring)
+        _write_masks(workspace, trackings, face_model, scoring)
+        if show:
+            for name, tracking in trackings.items():
+                _show_tracking(workspace.sequence_dir(name), tracking, face_model, overlay)
     return trackings
+
+
+def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overlay) -> None:
+    """Write reports and overlays of some tracked sequences, as far as they are missing or outdated.
+
+    Raises:
+        BeingWrittenError: another process is writing one of the sequences.
+    """
+    with hold(*(workspace.sequence_dir(name) for name in names)):
+        for name in names:
+            folder = workspace.sequence_dir(name)
+            tracking = read_tracking(folder / "tracking")
+            _show_tracking(folder, tracking, load_face_model(tracking.face_model), overlay)
 
 
 def check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
@@ -121,10 +144,10 @@ def _finished_trackings(
     names: list[str],
     face_model: FaceModel,
     settings: TrackingSettings,
-    overlay: Overlay,
+    overlay: Overlay | None,
     hold_out: Collection[str],
 ) -> dict[str, Tracking] | None:
-    """The trackings, if all results of the stage exist and are current."""
+    """The trackings, if all results of the stage exist and are current. Without `overlay`, reports do not count."""
     try:
         fingerprint = _tracking_fingerprint(workspace, names, face_model, settings, hold_out)
         trackings = _current_trackings(workspace, names, fingerprint, face_model, tell=False)
@@ -132,21 +155,17 @@ def _finished_trackings(
             folder = workspace.sequence_dir(name)
             if not scoring_exists(folder / "scoring", read_capture_hash(folder / "capture")):
                 return None
-            if not all(_is_shown(folder, tracking, overlay)):
+            if overlay is not None and not all(_is_shown(folder, tracking, overlay)):
                 return None
     except UserError:  # reported when the results are written again
         return None
     return trackings
 
 
-def _write_what_follows(
-    workspace: Workspace,
-    trackings: Mapping[str, Tracking],
-    face_model: FaceModel,
-    overlay: Overlay,
-    scoring: ScoringSettings,
+def _write_masks(
+    workspace: Workspace, trackings: Mapping[str, Tracking], face_model: FaceModel, scoring: ScoringSettings
 ) -> None:
-    """Write scoring masks, reports and overlays that are missing or outdated."""
+    """Write scoring masks that are missing or outdated."""
     for name, tracking in trackings.items():
         folder = workspace.sequence_dir(name)
         capture_hash = read_capture_hash(folder / "capture")
@@ -157,7 +176,6 @@ def _write_what_follows(
             check_tracking_of(capture, tracking, folder / "tracking")
             made = make_scoring(capture, tracking, face_model, scratch=folder, settings=scoring)
             write_scoring(folder / "scoring", made, capture_hash)
-        _show_tracking(folder, tracking, face_model, overlay)
 
 
 def _tracking_fingerprint(

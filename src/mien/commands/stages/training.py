@@ -61,6 +61,23 @@ def fill_in_own_split(workspace: Workspace, settings: TrainSettings, names: list
     return settings
 
 
+def read_together(workspace: Workspace, names: list[str]) -> tuple[list[Sequence], FaceModel]:
+    """Read sequences that were tracked together, and the face model that fits them.
+
+    Raises:
+        UserError: a part is missing, damaged or being written, or they were tracked apart.
+    """
+    folders = [workspace.sequence_dir(name) for name in names]
+
+    def read() -> tuple[list[Sequence], FaceModel]:
+        loaded = [read_sequence(folder) for folder in folders]
+        face_model = load_face_model(loaded[0].tracking.face_model)
+        check_trackings(loaded, face_model)
+        return loaded, face_model
+
+    return read_beside_writers(read, [folder / "tracking" for folder in folders], folders)
+
+
 def run_training_stage(
     workspace: Workspace,
     sequences: list[str],
@@ -75,15 +92,7 @@ def run_training_stage(
     """
     run_dir = workspace.run_dir(run)
     check_untouched(run_dir)
-    folders = [workspace.sequence_dir(name) for name in sequences]
-
-    def read_together() -> tuple[list[Sequence], FaceModel]:
-        read = [read_sequence(folder) for folder in folders]
-        face_model = load_face_model(read[0].tracking.face_model)
-        check_trackings(read, face_model)
-        return read, face_model
-
-    loaded, face_model = read_beside_writers(read_together, [folder / "tracking" for folder in folders], folders)
+    loaded, face_model = read_together(workspace, sequences)
     _tell_covered(loaded, settings)
     with ExitStack() as closing:
         live = LiveView(run, loaded[0].tracking.cameras[0]) if view else None

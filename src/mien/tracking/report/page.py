@@ -30,6 +30,9 @@ _CHECK_ALL = (
     "check that K is in pixels of the whole picture, that viewmat goes from world to camera with OpenCV axes and "
     "metres, the distortion of the lenses, and the offsets"
 )
+_ALIGNED = (
+    "Then every frame was aligned to a quick avatar (`mien align`). Its residuals below are those before the alignment."
+)
 _BY_PIXELS = "The face was fitted to landmarks, then to pixels (schedule `{}`), which correct the detector's errors."
 _WAYS = {
     "landmarks": "The face was fitted to landmarks alone (schedule `landmarks`). Pixels were not used.",
@@ -94,6 +97,8 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
                                  f"alone determined them: {name_runs(alone)}."))  # fmt: skip
         else:
             found.append(("", f"Pixels were used in all {with_face} frames with a face."))
+    if tracking.settings.get("aligned"):
+        found.append(("", _ALIGNED))
     for part, covered in report["covered_frames"].items():
         are = "are" if part == "eyes" else "is"
         found.append(("odd", f"Something (a hand?) covers the {part} in {len(covered)} of {with_face} frames with a "

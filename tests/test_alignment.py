@@ -1,0 +1,173 @@
+"""Frames aligned to a quick avatar: they come nearer to the truth, and what is held out reaches no avatar."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from evaluation_case import make_experiment
+from mien.cli import main
+from mien.commands.create import Command as Create
+from mien.commands.options import TrainOptions
+from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.metrics import l1
+from mien.face import FaceParams
+from mien.tracking import read_tracking
+from mien.training import AlignmentSettings, TrainSettings, align
+from mien.training.alignment import align_faces
+from toy_scene import toy_face_model, toy_sequence
+from toy_workspace import write_toy_workspace
+
+QUICK = AlignmentSettings(template_steps=6, template_gaussians=400, resolution=32, iterations=2)
+OPTIONS = (
+    "--alignment.template-steps", "6", "--alignment.resolution", "32", "--alignment.iterations", "2",
+    "--alignment.template-gaussians", "400", "--split", "tail",
+)  # fmt: skip
+
+
+def astray(face: FaceParams) -> FaceParams:
+    """Return face parameters that are a little wrong, differently at each timestep."""
+    wrong = torch.Generator().manual_seed(1)
+    return replace(
+        face,
+        expression=(face.expression + 0.05 * torch.randn(face.expression.shape, generator=wrong)).clamp(0, 1),
+        head_rotation=face.head_rotation + 0.02 * torch.randn(face.head_rotation.shape, generator=wrong),
+        head_translation=face.head_translation + 0.002 * torch.randn(face.head_translation.shape, generator=wrong),
+    )
+
+
+def aligned(experiment: Experiment, start: FaceParams, **changes: int) -> FaceParams:
+    settings = replace(AlignmentSettings(resolution=72, iterations=20), **changes)
+    return align_faces(experiment.avatar, experiment.sequences, [start], settings)[0]
+
+
+def test_faces_come_nearer_to_the_truth_and_the_avatar_stays() -> None:
+    experiment = make_experiment(10)
+    truth, before = experiment.faces[0], {n: t.clone() for n, t in experiment.avatar.state_dict().items()}
+    start = astray(truth)
+    found = aligned(experiment, start)
+    for name in ("head_rotation", "head_translation", "expression"):
+        was, now = ((getattr(one, name) - getattr(truth, name)).norm() for one in (start, found))
+        assert now < 0.9 * was, name
+    for frame in experiment.held_out_frames:
+        target = target_image(experiment, frame)
+        was, now = (l1(avatar_image(experiment, frame, one[frame.timestep]), target) for one in (start, found))
+        assert now < 0.6 * was
+    assert all(tensor.equal(before[name]) for name, tensor in experiment.avatar.state_dict().items())
+    assert all(tensor.grad is None and tensor.requires_grad for tensor in experiment.avatar.parameters())
+    assert found.identity.equal(start.identity)
+
+
+def test_a_frame_does_not_depend_on_those_beside_it() -> None:
+    """Frames share a pass for speed alone. Only the mean of the corrections joins them at the end."""
+    experiment = make_experiment(6)
+    start = astray(experiment.faces[0])
+    images = experiment.sequences[0].capture.images
+    found = aligned(experiment, start, iterations=3).expression
+    images[5] = 255 - images[5]
+    assert aligned(experiment, start, iterations=3).expression[:5].equal(found[:5])
+
+
+def test_what_a_hand_covers_gets_the_corrections_of_its_neighbours() -> None:
+    experiment = make_experiment(6)
+    (sequence,) = experiment.sequences
+    covered = torch.zeros(6, 1, 3, dtype=torch.bool)
+    covered[2, 0, 0] = True
+    sequence = replace(sequence, tracking=replace(sequence.tracking, covered=covered))
+    start = astray(experiment.faces[0])
+    found = aligned(replace(experiment, sequences=(sequence,)), start)
+    change = found.expression - start.expression
+    assert torch.allclose(change[2], (change[1] + change[3]) / 2, atol=1e-6)
+
+
+def test_held_out_frames_do_not_reach_the_template(tmp_path: Path) -> None:
+    found = []
+    for wrong in (False, True):
+        face_model, sequence = toy_sequence(5, 32)
+        if wrong:
+            sequence.capture.images[4] = np.random.default_rng(0).integers(0, 255, sequence.capture.images[4].shape)
+        training = TrainSettings(split="tail")
+        (face,) = align([sequence], face_model, QUICK, training, tmp_path / str(wrong))
+        found.append(face)
+    clean, absurd = found
+    assert absurd.expression[:4].equal(clean.expression[:4])
+    assert not absurd.expression[4].equal(clean.expression[4])
+
+
+@pytest.fixture
+def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for stage in ("training", "tracking"):
+        monkeypatch.setattr(f"mien.commands.stages.{stage}.load_face_model", lambda name: toy_face_model())
+    write_toy_workspace(tmp_path / "W")
+    # What shows a tracking needs landmarks, which toys have not.
+    monkeypatch.setattr("mien.commands.stages.tracking._show_tracking", lambda *given: None)
+    return tmp_path / "W"
+
+
+def _face(workspace: Path) -> torch.Tensor:
+    return read_tracking(workspace / "sequences/clip/tracking").face.expression.clone()  # not a map of the file
+
+
+def test_the_command_aligns_once_and_always_from_the_tracking(
+    workspace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = _face(workspace)
+    assert main(["align", str(workspace), *OPTIONS]) == 0
+    told, once = capsys.readouterr().err, _face(workspace)
+    assert not once.equal(before)
+    assert "clip: aligned; heads turned by" in told
+    assert "Trained on the tracking before its alignment: toy." in told
+    assert not list(workspace.glob("sequences/.alignment-*"))
+    assert main(["align", str(workspace), *OPTIONS]) == 0
+    assert "the tracking is aligned, nothing to do" in capsys.readouterr().err
+    assert main(["align", str(workspace), *OPTIONS, "--alignment.iterations", "3"]) == 0
+    assert not _face(workspace).equal(once)
+    assert main(["align", str(workspace), *OPTIONS]) == 0
+    assert _face(workspace).equal(once)
+
+
+def test_a_lost_original_is_one_line(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["align", str(workspace), *OPTIONS]) == 0
+    (workspace / "sequences/clip/tracking/before_alignment.safetensors").unlink()
+    capsys.readouterr()
+    assert main(["align", str(workspace), *OPTIONS, "--seed", "1"]) == 2
+    assert "before_alignment.safetensors" in (told := capsys.readouterr().err)
+    assert "mien track --again" in told
+    shutil.rmtree(workspace / "sequences/clip/tracking")
+    assert main(["align", str(workspace), *OPTIONS]) == 2
+    assert "run `mien track" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        (("--alignment.iterations", "0"), "--alignment.iterations 0: give a number from 1 to 100000"),
+        (("--alignment.rate", "-1"), "--alignment.rate -1"),
+        (("--alignment.when", "never"), "leave it out, as this command aligns"),
+        (("--split", "dataset"), "--split dataset: give one of blocks, tail, none"),
+        (("--hold-out", "other"), "other"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    workspace: Path, capsys: pytest.CaptureFixture[str], option: tuple[str, ...], told: str
+) -> None:
+    assert main(["align", str(workspace), *option]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_create_aligns_one_camera_and_no_paper() -> None:
+    def aligns(several: bool = False, when: str = "auto", **options: object) -> bool:
+        settings = AlignmentSettings(when=when)  # type: ignore[arg-type]
+        command = Create((Path("a.mp4"),), Path("out"), alignment=settings, options=TrainOptions(**options))  # type: ignore[arg-type]
+        return command._aligns(several)
+
+    assert aligns()
+    assert aligns(preset="draft")
+    assert not aligns(several=True)
+    assert aligns(several=True, when="always")
+    assert not aligns(preset="paper")
+    assert not aligns(steps=100)
+    assert not aligns(when="never")
