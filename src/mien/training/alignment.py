@@ -70,7 +70,7 @@ def align(
         UserError: as `mien.training.trainer.train`.
     """
     config = overlay(
-        PRESETS["standard"].config(DEFAULT_METHOD),
+        PRESETS["draft"].config(DEFAULT_METHOD),
         {"density": {"max_gaussians": settings.template_gaussians}},
         "template",
         DEFAULT_METHOD,

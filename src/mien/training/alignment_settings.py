@@ -15,7 +15,7 @@ class AlignmentSettings:
     """Whether frames are aligned. Auto: if one camera filmed, the preset is not paper, and the run is not shorter than
     the training of the quick avatar. Several cameras agree on the face already, and the papers train on the tracking
     alone."""
-    template_steps: Annotated[int, COUNT] = 1_600
+    template_steps: Annotated[int, COUNT] = 3_000
     """Number of training steps of the quick avatar."""
     template_gaussians: Annotated[int, COUNT] = 20_000
     """Largest number of Gaussians of the quick avatar."""
