@@ -138,6 +138,8 @@ class Quality:
     method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
     steps: int = 0
     """Number of optimiser steps. 0 means each capture's own number."""
+    align: bool = True
+    """Align frames of one camera before training, as `mien create` does (--no-align: train on the tracking)."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -153,7 +155,7 @@ class Quality:
         """Run every capture through all stages, then print the table."""
         from mien.commands.stages.quality import run_quality_stage
 
-        run_quality_stage(self.out, self.captures, self.method, self.steps, as_json=self.as_json)
+        run_quality_stage(self.out, self.captures, self.method, self.steps, aligned=self.align, as_json=self.as_json)
 
 
 @dataclass(frozen=True)

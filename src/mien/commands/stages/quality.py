@@ -13,6 +13,7 @@ import torch
 
 from mien.avatar import method_named
 from mien.capture import CaptureSettings, read_capture, read_capture_hash
+from mien.commands.stages.aligning import one_camera, run_alignment_stage
 from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.evaluating import run_evaluation_stage, run_sequences
 from mien.commands.stages.tracking import run_tracking_stage
@@ -42,7 +43,7 @@ from mien.progress import say
 from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.terminal import show
 from mien.tracking import Tracking, TrackingSettings, make_scoring, read_tracking, write_scoring, write_tracking
-from mien.training import PRESETS, TrainSettings, read_training_summary
+from mien.training import PRESETS, AlignmentSettings, TrainSettings, read_training_summary
 from mien.training.footage import Frame
 from mien.workspace import Workspace
 
@@ -54,7 +55,9 @@ _SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
 _UNSEEN = ScoreSettings(perceptual_frames=2)
 
 
-def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
+def run_quality_stage(
+    out: Path, captures: tuple[str, ...], method: str, steps: int, *, aligned: bool, as_json: bool
+) -> None:
     """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png.
 
     Raises:
@@ -63,7 +66,7 @@ def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: 
     references = [reference_named(name) for name in captures or _default_captures()]
     method_named(method)
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
-        rows = _walk(references, out, method, steps)
+        rows = _walk(references, out, method, steps, aligned)
     show(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
@@ -72,10 +75,10 @@ def _default_captures() -> list[str]:
     return [name for name, reference in REFERENCES.items() if reference.by_default]
 
 
-def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int) -> list[QualityRow]:
+def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int, aligned: bool) -> list[QualityRow]:
     rows, strips = [], []
     for reference in references:
-        row, strip = run_reference(reference, out, method, steps or reference.steps)
+        row, strip = run_reference(reference, out, method, steps or reference.steps, aligned)
         rows.append(row)
         strips.append(strip)
         content = {"rows": [row.as_json() for row in rows]}
@@ -85,14 +88,23 @@ def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int
     return rows
 
 
-def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
-    """Run all stages on one reference capture and skip those with current results; return its row and its pictures."""
+def run_reference(
+    reference: ReferenceCapture, out: Path, method: str, steps: int, aligned: bool = True
+) -> tuple[QualityRow, np.ndarray]:
+    """Run all stages on one reference capture and skip those with current results; return its row and its pictures.
+
+    With `aligned`, frames of one camera are aligned as `mien create` does.
+    """
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     times = StageTimes(workspace.root / _TIMES)
     say(f"== {reference.name}: {reference.description}")
     key, trackings = draw_and_track(reference, drawn, workspace, times)
     run = f"{method}-{steps}"
     settings = reference_settings(reference, replace(PRESETS["standard"].settings_of(method), steps=steps))
+    alignment = AlignmentSettings()
+    if aligned and steps >= alignment.template_steps and one_camera(workspace, list(trackings)):
+        with times.measured("align"):
+            run_alignment_stage(workspace, list(trackings), alignment, settings, keep=True)
     with times.measured("train"):
         run_training_stage(workspace, list(trackings), run, PRESETS["standard"].config(method), settings)
     with times.measured("evaluate"):
