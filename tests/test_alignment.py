@@ -17,7 +17,7 @@ from mien.evaluation.metrics import l1
 from mien.face import FaceParams
 from mien.tracking import read_tracking
 from mien.training import AlignmentSettings, TrainSettings, align
-from mien.training.alignment import align_faces
+from mien.training.alignment import align_faces, steadier
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 
@@ -55,7 +55,7 @@ def test_faces_come_nearer_to_the_truth_and_the_avatar_stays() -> None:
     for frame in experiment.held_out_frames:
         target = target_image(experiment, frame)
         was, now = (l1(avatar_image(experiment, frame, one[frame.timestep]), target) for one in (start, found))
-        assert now < 0.6 * was
+        assert now < 0.75 * was
     assert all(tensor.equal(before[name]) for name, tensor in experiment.avatar.state_dict().items())
     assert all(tensor.grad is None and tensor.requires_grad for tensor in experiment.avatar.parameters())
     assert found.identity.equal(start.identity)
@@ -81,6 +81,21 @@ def test_what_a_hand_covers_gets_the_corrections_of_its_neighbours() -> None:
     found = aligned(replace(experiment, sequences=(sequence,)), start)
     change = found.expression - start.expression
     assert torch.allclose(change[2], (change[1] + change[3]) / 2, atol=1e-6)
+
+
+def test_corrections_of_the_pose_are_averaged_over_time() -> None:
+    """What changes slowly stays, and what trembles goes."""
+    tracked = make_experiment(12).faces[0]
+    tracked = replace(tracked, head_rotation=tracked.head_rotation[:1].repeat(12, 1))
+    slow = torch.linspace(0, 0.01, 12)[:, None] * torch.tensor([1.0, -1.0, 0.5])
+    trembling = torch.tensor([1.0, -1.0]).repeat(6)[:, None] * torch.tensor([0.002, 0.001, 0.003])
+    moved = replace(tracked, head_translation=tracked.head_translation + slow, expression=tracked.expression / 2)
+    shaken = replace(moved, head_translation=moved.head_translation + trembling)
+    for one in (moved, shaken):
+        found = steadier(tracked, one)
+        assert torch.allclose(found.head_translation[1:-1], moved.head_translation[1:-1], atol=2e-4)
+        assert torch.allclose(found.T_world_head[:, :3, :3], tracked.T_world_head[:, :3, :3], atol=1e-6)
+        assert found.expression.equal(moved.expression)
 
 
 def test_held_out_frames_do_not_reach_the_template(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ class Command:
     preview: bool = False
     """Show the fit of the face while it runs, in DIR/tracking_preview.html (for a browser)."""
     overlay: Literal["auto", "all", "none"] = "auto"
-    """Frames in overlay.mp4: all, every n-th if a clip has over 3,000 (auto), or none."""
+    """Frames in overlay.mp4: all, every n-th, at most 120 (auto), or none."""
     view: bool = False
     """Show the avatar in a browser while it trains."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)

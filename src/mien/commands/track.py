@@ -31,7 +31,7 @@ class Command:
     """Show the fit while it runs, in DIR/tracking_preview.html. Open that page in a browser; it is updated every few
     seconds."""
     overlay: Literal["auto", "all", "none"] = "auto"
-    """Frames in overlay.mp4: all, every n-th if a clip has over 3,000 (auto), or none."""
+    """Frames in overlay.mp4: all, every n-th, at most 120 (auto), or none."""
     settings: Annotated[TrackingSettings, tyro.conf.arg(name="tracking")] = field(default_factory=TrackingSettings)
     scoring: ScoringSettings = field(default_factory=ScoringSettings)
 

@@ -19,11 +19,12 @@ from mien.config import overlay
 from mien.face import FaceModel, FaceParams, concatenate
 from mien.progress import progress_bar
 from mien.render.rasterize import rasterize_each
+from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.constants import TRAINING
-from mien.training.face_track import FaceTrack
+from mien.training.face_track import FaceTrack, pose_corrections
 from mien.training.footage import Sequence, Targets
 from mien.training.photometric import photometric_loss
 from mien.training.run import read_face_track
@@ -92,7 +93,23 @@ def align(
     template = train(sequences, face_model, config, how, folder, titled)
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     starts = _split(read_face_track(folder, face_model), lengths)
-    return align_faces(template, sequences, starts, settings, training.held_out_cameras, progress)
+    aligned = align_faces(template, sequences, starts, settings, training.held_out_cameras, progress)
+    return [steadier(sequence.tracking.face, face) for sequence, face in zip(sequences, aligned, strict=True)]
+
+
+def steadier(tracked: FaceParams, aligned: FaceParams) -> FaceParams:
+    """The aligned face parameters of a sequence, with corrections of the head's pose that are averaged over time.
+
+    Each frame is aligned on its own, which makes heads tremble. A tracking's errors change slowly, so its corrections
+    are averaged over three timesteps. Expressions stay, since averaging them costs detail.
+    """
+    corrections = pose_corrections(tracked, aligned)
+    padded = torch.cat([corrections[:1], corrections, corrections[-1:]])
+    corrections = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
+    rotations = tracked.T_world_head[:, :3, :3]
+    turned = axis_angle_from_matrix(rotations @ matrix_from_axis_angle(corrections[:, :3]))
+    shifted = tracked.head_translation + (rotations @ corrections[:, 3:, None])[:, :, 0]
+    return replace(aligned, head_rotation=turned, head_translation=shifted)
 
 
 def align_faces(

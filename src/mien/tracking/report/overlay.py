@@ -33,7 +33,8 @@ _GREEN, _RED, _BLUE = (60, 255, 60), (255, 60, 40), (60, 160, 255)
 _SUBPIXEL_BITS = 4
 _GRID_WIDTH = 1920
 """Largest width of a grid of pictures, in pixels."""
-_MAX_PICTURES = 3000
+_MAX_PICTURES = 120
+"""Number of pictures that take about five seconds on two cores."""
 _CRF, _PRESET = 21, "veryfast"
 """Quality that is enough for viewing. Writing takes a quarter of the time of `write_video`'s defaults."""
 
@@ -48,7 +49,7 @@ def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: 
 
 
 def overlay_stride(timesteps: int) -> int:
-    """Stride between the timesteps that an overlay shows, at least 1. A long clip has at most 3,000 pictures."""
+    """Stride between the timesteps that an overlay shows, at least 1, so that there are at most 120 pictures."""
     return max(1, math.ceil(timesteps / _MAX_PICTURES))
 
 
