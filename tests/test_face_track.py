@@ -9,6 +9,7 @@ from mien.avatar import FaceTuning, Moments, ParameterGroup, Progress, Rate
 from mien.face import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training.adam import Adam
+from mien.training.constants import TRAINING
 from mien.training.face_track import (
     FaceTrack,
     mean_pose_correction,
@@ -198,6 +199,17 @@ def test_corrections_may_follow_turns_that_several_cameras_see(count: int) -> No
     cameras = tuple(sequence.tracking.cameras) * count
     seen = replace(sequence, tracking=replace(sequence.tracking, cameras=cameras))
     assert tuning_for(FaceTuning(keep_turns=True), [sequence, seen]).keep_turns == (count == 1)
+
+
+def test_aligned_faces_are_corrected_more_slowly() -> None:
+    _, sequence = toy_sequence(2, 16)
+    aligned = replace(sequence, tracking=replace(sequence.tracking, settings={"aligned": {"iterations": 2}}))
+    tuning = FaceTuning(expression=Rate(1e-3, 1e-4), head_translation=Rate(3e-4, begin=0.5))
+    assert tuning_for(tuning, [sequence, aligned]) == tuning
+    slower = tuning_for(tuning, [aligned])
+    share = TRAINING.aligned_tuning
+    assert slower.expression == Rate(share * 1e-3, share * 1e-4)
+    assert slower.head_translation == Rate(share * 3e-4, begin=0.5)
 
 
 def test_what_tells_sequences_apart_does_not_count_as_a_turn() -> None:

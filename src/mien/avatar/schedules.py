@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from mien.ranges import FRACTION, Range
@@ -53,6 +53,10 @@ class Rate:
     """The rate at the last step. If it is not given, the rate is constant."""
     begin: Annotated[float, FRACTION] = 0.0
     """The fraction of the run up to which the rate is 0."""
+
+    def scaled(self, share: float) -> "Rate":
+        """A share of this rate at all times."""
+        return replace(self, start=share * self.start, end=None if self.end is None else share * self.end)
 
     def at(self, progress: Progress) -> float:
         """The rate at a step."""

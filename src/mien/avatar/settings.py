@@ -118,6 +118,11 @@ class FaceTuning:
     """Whether expression coefficients stay within the face model's bounds. Those that were tracked beyond a bound may
     stay there."""
 
+    def slowed(self, share: float) -> "FaceTuning":
+        """These settings with a share of all learning rates."""
+        names = ("expression", "joints", "head_rotation", "head_translation")
+        return replace(self, **{name: getattr(self, name).scaled(share) for name in names})
+
 
 @dataclass(frozen=True)
 class DensityRules:

@@ -62,6 +62,11 @@ class Tracking:
     settings: dict = field(default_factory=dict)
     """Settings of the tracking, for the report."""
 
+    @property
+    def aligned(self) -> bool:
+        """Whether the faces were aligned to a quick avatar (`mien align`)."""
+        return bool(self.settings.get("aligned"))
+
     def covered_pictures(self) -> Bool[Tensor, "t c"]:
         """The pictures in which something covers a part of the face."""
         if self.covered is None:

@@ -17,6 +17,9 @@ class TrainingConstants:
     """Learning rate of the head's position in metres, as a share of that of its rotation in radians: the ratio with
     which training corrects the tracking. Not varied."""
 
+    aligned_tuning: float = 0.2
+    """Share of the learning rates of faces in a training on aligned faces. Measured: the log, 11-27."""
+
     # camera_colors.py
     camera_colors_last_rate: float = 0.1
     """Learning rate of the cameras' colours at the last step, as a share of that at the first. Not varied."""

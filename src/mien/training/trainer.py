@@ -274,9 +274,16 @@ def _first_avatar(config: MethodConfig, face_model: FaceModel, face: FaceParams,
 
 
 def tuning_for(tuning: FaceTuning, sequences: Items[Sequence]) -> FaceTuning:
-    """The settings for these sequences: several cameras see how far a head turns, so corrections may follow turns."""
-    several = any(len(sequence.tracking.cameras) > 1 for sequence in sequences)
-    return replace(tuning, keep_turns=False) if several else tuning
+    """The settings for these sequences.
+
+    Several cameras see how far a head turns, so corrections may follow turns. Aligned faces are nearly right, so
+    corrections are slower.
+    """
+    if any(len(sequence.tracking.cameras) > 1 for sequence in sequences):
+        tuning = replace(tuning, keep_turns=False)
+    if all(sequence.tracking.aligned for sequence in sequences):
+        tuning = tuning.slowed(TRAINING.aligned_tuning)
+    return tuning
 
 
 def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> str:

@@ -97,7 +97,7 @@ def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]
                                  f"alone determined them: {name_runs(alone)}."))  # fmt: skip
         else:
             found.append(("", f"Pixels were used in all {with_face} frames with a face."))
-    if tracking.settings.get("aligned"):
+    if tracking.aligned:
         found.append(("", _ALIGNED))
     for part, covered in report["covered_frames"].items():
         are = "are" if part == "eyes" else "is"
