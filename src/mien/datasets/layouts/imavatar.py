@@ -23,7 +23,7 @@ def write(folder: Path, filmed: Filmed) -> Written:
     arrays, shifts, told = _flame(folder, filmed)
     rows = {timestep: index for index, timestep in enumerate(filmed.timesteps)}
     poses = np.concatenate([arrays[name] for name in _POSES], axis=1)
-    subject = folder / "subject" / "subject"
+    subject = folder / folder.name
     for clip, timesteps in (("train", filmed.trained), ("test", filmed.held_out)):
         frames = []
         for number, timestep in enumerate(track_progress(timesteps, f"write {clip}", len(timesteps)), 1):
@@ -45,7 +45,7 @@ def write(folder: Path, filmed: Filmed) -> Written:
             write_plain_json(subject / clip / "flame_params.json", content)
     names = {(timestep, 0): str(number) for number, timestep in enumerate(filmed.held_out, 1)}
     told = (
-        "subject/subject/train is trained on; subject/subject/test is held out.",
+        f"{folder.name}/train is trained on; {folder.name}/test is held out. The subject's name is that of the folder.",
         "Parameters are those of the face model above. They are right for IMavatar only if it is FLAME 2020.",
         "world_mat has another translation in each frame, because the head moves.",
         "Loaders replace every 'image' in a path by 'mask', so no folder above may have 'image' in its name.",

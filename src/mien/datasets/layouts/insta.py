@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -43,7 +44,7 @@ def write(folder: Path, filmed: Filmed) -> Written:
         write_png(folder / "images" / f"{number:05d}.png", pixels)
         vertices = filmed.face_model(rest[number])[0]
         _write_obj(folder / "meshes" / f"{number:05d}.obj", vertices, filmed.face_model.faces)
-        write_png(folder / "depth" / f"{number:05d}.png", _depth(filmed, face[number]))
+        _write_depth(folder / "depth" / f"{number:05d}.png", filmed, face[number])
         values = padded(rest.expression[number].double().numpy(), _EXPRESSIONS)
         place = folder / "flame" / "exp" / f"{number:05d}.txt"
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -140,12 +141,13 @@ def _open(filmed: Filmed, rest: FaceParams) -> FaceParams:
     return replace(rest, expression=expression, joints=joints)
 
 
-def _depth(filmed: Filmed, face: FaceParams) -> np.ndarray:
-    """Depth of the mesh in whole millimetres; 0 beside it."""
-    view = filmed.camera
-    front = replace(view, viewmat=torch.from_numpy(FRONT).float())
+def _write_depth(path: Path, filmed: Filmed, face: FaceParams) -> None:
+    """Write the depth of the mesh as a picture of 16 bits, in whole millimetres; 0 beside the mesh."""
+    front = replace(filmed.camera, viewmat=torch.from_numpy(FRONT).float())
     depth = rasterize_mesh(filmed.face_model(face)[0], filmed.face_model.faces, front).depth.numpy()
-    return np.where(np.isfinite(depth), np.clip(depth * _MILLIMETRES, 0, 65535).round(), 0).astype(np.uint16)
+    whole = np.where(np.isfinite(depth), np.clip(depth * _MILLIMETRES, 0, 65535).round(), 0).astype(np.uint16)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", whole)[1].tobytes())
 
 
 def _write_obj(path: Path, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> None:

@@ -31,20 +31,22 @@ def write_layout(folder: Path, filmed: Filmed, layout: Layout) -> str:
     """
     check_new_folder(folder)
     _check_fit(filmed, layout)
-    aside = folder.absolute().with_name(f".{folder.absolute().name}.partial")
+    place = folder.absolute()
+    partial = place.with_name(f".{place.name}.partial")
+    aside = partial / place.name  # one level deeper, because a layout has the folder's name in it once more
     try:
-        remove_tree(aside)
+        remove_tree(partial)
         aside.mkdir(parents=True)
         written = layout.write(aside, filmed)
         _write_truth(aside / SCORING / "truth", filmed, written)
         (aside / README).write_text(_readme(filmed, layout, written), encoding="utf-8")
-        replace_folder(folder.absolute(), aside)
+        replace_folder(place, aside)
     except OSError as error:
         raise cannot_write(folder, error) from None
     except UserError as error:
         raise UserError(str(error).replace(str(aside), str(folder))) from None
     finally:
-        remove_tree(aside)
+        remove_tree(partial)
     cameras = len(filmed.sequence.capture.camera_ids)
     seen = f", {cameras} cameras" if cameras > 1 else ""
     return f"{counted(len(filmed.trained), 'training frame')}, {len(filmed.held_out)} held out{seen}; see {README}"
