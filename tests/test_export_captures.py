@@ -1,4 +1,4 @@
-"""Captures in the layouts of INSTA, IMavatar, NeRFace and NeRSemble: importers read them back, and others' formulas fit.
+"""Captures in the layouts of INSTA, IMavatar, NeRFace and NeRSemble: importers read them, and others' formulas fit.
 
 The checks of conventions form every matrix from the description of the layout, and call nothing of mien's writers.
 """
@@ -80,6 +80,7 @@ def test_insta_by_its_own_conventions(single: Sequence, scene: Scene, tmp_path: 
         assert values.shape == (100,)
         assert np.abs(values - scene.expr[timestep]).max() < 1e-6
         depth = cv2.imread(str(folder / frame["depth_path"]), cv2.IMREAD_UNCHANGED)
+        assert depth is not None
         assert ((depth > 0) == (single.capture.mattes[timestep, 0] > 127)).mean() > 0.99
         assert 0.7e3 < np.median(depth[depth > 0]) < 1.2e3
 

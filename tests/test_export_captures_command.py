@@ -53,7 +53,7 @@ def test_pictures_of_others_are_scored_against_the_truth(single: Sequence, scene
         found = sorted((folder / "scoring/truth").glob("*.png"))
         assert [file.stem for file in found] == expected
         for file, timestep in zip(found, HELD_OUT, strict=True):
-            picture = cv2.imread(str(file))[..., ::-1]
+            picture = cv2.cvtColor(cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
             inside, outside = (single.scoring[timestep, 0] == level for level in (255, 0))
             assert np.array_equal(picture[inside], single.capture.images[timestep, 0][inside])
             assert (picture[outside] == 255).all()
@@ -88,6 +88,8 @@ def test_what_a_layout_cannot_hold_is_told_or_refused(both: Sequence, single: Se
     (tmp_path / "full" / "a").touch()
     with pytest.raises(UserError, match="full: is not empty"):
         export(tmp_path / "full", "nersemble", filmed(both, scene))
+    with pytest.raises(UserError, match=f"{tmp_path}/my_images: programs of this layout replace every 'image'"):
+        export(tmp_path / "my_images", "imavatar", filmed(single, scene))
     other = replace(single, tracking=replace(single.tracking, face=anny.neutral(TIMESTEPS), face_model="anny"))
     content = filmed_frames(other, anny, TrainSettings(), "person")
     with pytest.raises(UserError, match=r"clip: is tracked on 'anny', and .* pose FLAME themselves; track it with"):

@@ -9,6 +9,7 @@ from mien.datasets.flame_poses import face_of_flame
 from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, padded
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
+from mien.errors import UserError
 from mien.export import flame_params_of
 from mien.picture_files import write_png
 from mien.progress import track_progress
@@ -19,7 +20,15 @@ _POSES = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 
 
 def write(folder: Path, filmed: Filmed) -> Written:
-    """Write the files of a subject of IMavatar."""
+    """Write the files of a subject of IMavatar.
+
+    Raises:
+        UserError: the folder has a name that its loaders stumble over.
+    """
+    if "image" in folder.name:
+        raise UserError(
+            f"{folder}: programs of this layout replace every 'image' in a path by 'mask'; give --out another name"
+        )
     arrays, shifts, told = _flame(folder, filmed)
     rows = {timestep: index for index, timestep in enumerate(filmed.timesteps)}
     poses = np.concatenate([arrays[name] for name in _POSES], axis=1)

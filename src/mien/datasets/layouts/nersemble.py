@@ -77,8 +77,8 @@ def _track(folder: Path, filmed: Filmed, parts: dict[str, tuple[int, ...]]) -> t
         file = folder / "sequences" / part / "tracking" / TRACKING
         file.parent.mkdir(parents=True, exist_ok=True)
         content = io.BytesIO()
-        np.savez(content, **{name: array.astype(np.float32) for name, array in own.items()},
-                 frames=np.arange(len(timesteps)))  # pyright: ignore  # fmt: skip
+        whole = {**{name: array.astype(np.float32) for name, array in own.items()}, "frames": np.arange(len(timesteps))}
+        np.savez(content, **whole)  # pyright: ignore
         file.write_bytes(content.getvalue())
     return told
 
