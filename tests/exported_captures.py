@@ -42,7 +42,7 @@ def with_two_cameras(scene: Scene) -> Sequence:
         cameras[name] = Camera(torch.from_numpy(UNEQUAL).float(), viewmat, SIDE, SIDE)
     found = tracked_sequence(Path("drawn"), "clip", images, mattes, cameras, scene.model, face, 25.0)
     scoring = mattes.copy()
-    scoring[:, :, 75:] = 0
+    scoring[:, :, 86:] = 0
     return Sequence("clip", found.capture, found.tracking, scoring)
 
 
