@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -23,6 +22,7 @@ from exported_captures import (
 )
 from mien.cli import main
 from mien.datasets.layouts import filmed_frames
+from mien.datasets.pictures import read_picture
 from mien.errors import UserError
 from mien.evaluation.image_folders import ImageFolders, score_folders
 from mien.training import Sequence, TrainSettings
@@ -53,7 +53,7 @@ def test_pictures_of_others_are_scored_against_the_truth(single: Sequence, scene
         found = sorted((folder / "scoring/truth").glob("*.png"))
         assert [file.stem for file in found] == expected
         for file, timestep in zip(found, HELD_OUT, strict=True):
-            picture = cv2.cvtColor(cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+            picture, _ = read_picture(file)
             inside, outside = (single.scoring[timestep, 0] == level for level in (255, 0))
             assert np.array_equal(picture[inside], single.capture.images[timestep, 0][inside])
             assert (picture[outside] == 255).all()
