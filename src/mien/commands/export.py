@@ -1,5 +1,6 @@
-"""`mien export`: avatars as files for other programs."""
+"""`mien export`: avatars as files for other programs, and captures in the layouts of other laboratories."""
 
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ import tyro
 
 from mien.commands.help_text import Described
 from mien.commands.options import check_driver, check_neutral
+from mien.datasets.layouts import LAYOUTS, Layout, MatteKind, find_layout
 from mien.errors import UserError
 from mien.formats import Format, Holds, endings, find_format, format_of, formats, numbered
 from mien.workspace import open_workspace
@@ -16,6 +18,8 @@ from mien.workspace import open_workspace
 if TYPE_CHECKING:
     from mien.formats import Options
 
+CaptureSplit = Literal["blocks", "tail", "none", "dataset"]
+"""What may be held out of a capture without a run."""
 _REFUSED = {
     "webgpu": "only an .html page draws with WebGPU; leave --webgpu out",
     "sh": "only a .ply has a degree to choose; leave --sh out",
@@ -41,15 +45,16 @@ def _about_out() -> str:
         f"The file to write. A whole avatar is {_any_of(held['avatar'])}; Gaussians in a pose are "
         f"{_any_of(held['pose'] + held['sequence'])}. With --series, {_any_of(held['pose'])} files get numbers: "
         f"NAME_000000.ply; {_any_of(held['sequence'])} files have all frames. With --format "
-        f"{_any_of(_folders())}, a folder."
+        f"{_any_of([*_folders(), *_layouts()])}, a folder; that of a capture has to be new."
     )
 
 
 def _about_format() -> str:
     return (
-        f"Name of the format: {_any_of(each.name for each in formats())} (default: by the ending of --out). "
-        "gaussian-avatars is a folder with point_cloud.ply, whose Gaussians are bound to triangles, and "
-        "flame_param.npz with all timesteps of the run's training."
+        f"Name of the format of an avatar: {_any_of(each.name for each in formats())} (default: by the ending of "
+        "--out). gaussian-avatars is a folder with point_cloud.ply, whose Gaussians are bound to triangles, and "
+        "flame_param.npz with all timesteps of the run's training. Or the layout of a capture, which is a tracked "
+        f"sequence and not an avatar, for programs that train elsewhere: {_any_of(_layouts())} (docs/datasets.md)."
     )
 
 
@@ -62,15 +67,23 @@ def _folders() -> list[str]:
     return [each.name for each in formats() if each.holds == "folder"]
 
 
+def _layouts() -> list[str]:
+    return [each.name for each in LAYOUTS]
+
+
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar: .mien (all of it), .html and .packed (for pages), .glb (for engines), a pose, or a folder."""
+    """Write an avatar: .mien (all of it), .html and .packed (for pages), .glb (for engines), a pose, or a folder.
+
+    With --format insta, imavatar, nerface or nersemble, write a tracked capture instead, for programs that train
+    elsewhere.
+    """
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), Described(_about_workspace)]
     out: Annotated[Path, Described(_about_out)]
     format: Annotated[str | None, Described(_about_format)] = None
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
-    """Name of the run (default: the only one)."""
+    """Name of the run (default: the only one). For a capture: hold out what this run holds out."""
     set: tuple[str, ...] = ()
     """Expressions and whole faces by name, and joint angles in radians, for example --set smile=0.6 jawOpen=0.3
     eyeLookUpLeft=0.5 left_eye_y=0.2 (default: the person's neutral). An unknown name lists all of them."""
@@ -103,12 +116,30 @@ class Command:
     show a picture of the avatar, which is written beside the page."""
     sharp_cut: bool = False
     """For .html and .packed: the head ends sharply at the neck, as in training (default: it fades over 3 cm)."""
+    sequence: str | None = None
+    """For a capture: the sequence that is written (default: the only one)."""
+    split: CaptureSplit | None = None
+    """For a capture without --run: the split, as for `mien train` (default: that of the dataset that it was imported
+    from, or blocks)."""
+    mattes: MatteKind | None = None
+    """For a capture: mattes of the head above the cut at the neck, which mien trains on and scores, or of the whole
+    person (default: head)."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.files import check_writable
 
+        layout = find_layout(self.format)
+        if layout is not None:
+            self._check_capture(layout)
+            return
         kind = self._kind()
+        for option, value in (("sequence", self.sequence), ("split", self.split), ("mattes", self.mattes)):
+            if value is not None:
+                raise UserError(
+                    f"--{option} {value}: is for captures (--format {_any_of(_layouts())}), and {kind.name} holds an "
+                    "avatar; leave it out"
+                )
         self._check_options(kind)
         if self._is_file():
             self._check_file(kind)
@@ -133,7 +164,11 @@ class Command:
         check_writable(self._first_path(kind), folder=kind.holds == "folder")
 
     def run(self) -> None:
-        """Pose the avatar and write the files."""
+        """Pose the avatar and write the files, or write the capture."""
+        layout = find_layout(self.format)
+        if layout is not None:
+            self._export_capture(layout)
+            return
         kind = self._kind()
         if self._is_file():
             from mien.commands.stages.converting import convert
@@ -146,6 +181,43 @@ class Command:
         series = None if self.series is None else Series(self.series, self.neutral, self.every)
         content = RunContent(workspace, workspace.pick_run(self.run_name), self.set, series)
         export(content, self.out, kind, self._options())
+
+    def _check_capture(self, layout: Layout) -> None:
+        """Check the options and paths of a capture."""
+        from mien.datasets.layouts import check_new_folder
+
+        given = {
+            "--set": self.set, "--series": self.series, "--neutral": self.neutral, "--every": self.every != 1,
+            "--sh": self.sh is not None, "--spz-version": self.spz_version, "--webgpu": self.webgpu,
+            "--webcam": self.webcam, "--webcam-model": self.webcam_model, "--title": self.title,
+            "--address": self.address, "--sharp-cut": self.sharp_cut,
+        }  # fmt: skip
+        other = next((option for option, value in given.items() if value), None)
+        if other is not None:
+            raise UserError(f"{other}: is for avatars, and --format {layout.name} writes a capture; leave {other} out")
+        if self.run_name is not None and self.split is not None:
+            raise UserError(f"--split {self.split}: --run {self.run_name} has a split of its own; give only one")
+        if self._is_file():
+            raise UserError(f"{self.workspace}: holds an avatar, and --format {layout.name} writes a capture; give the "
+                            "folder of a workspace")  # fmt: skip
+        workspace = open_workspace(self.workspace)
+        if self.run_name is not None:
+            workspace.pick_run(self.run_name)
+        name = workspace.pick_sequence(self.sequence)
+        if name not in workspace.tracked_names():
+            raise UserError(
+                f"{self.workspace}: the sequence {name} is not tracked, and a capture is written with its tracking; "
+                f"run {shlex.join(['mien', 'track', str(self.workspace)])}"
+            )
+        check_new_folder(self.out)
+
+    def _export_capture(self, layout: Layout) -> None:
+        from mien.commands.stages.exporting_capture import export_capture, settings_of
+
+        workspace = open_workspace(self.workspace)
+        sequence = workspace.pick_sequence(self.sequence)
+        settings = settings_of(workspace, sequence, self.run_name, self.split)
+        export_capture(workspace, sequence, layout, self.out, settings, self.mattes or "head")
 
     def _is_file(self) -> bool:
         """Whether the avatar comes from a file."""
@@ -166,7 +238,10 @@ class Command:
         kind = find_format(self.format)
         if kind is None:
             names = ", ".join(each.name for each in formats())
-            raise UserError(f"--format {self.format}: there is no such format; choose one of {names}")
+            raise UserError(
+                f"--format {self.format}: there is no such format; choose one of {names} for an avatar, or "
+                f"{_any_of(_layouts())} for a capture"
+            )
         if kind.holds == "folder":
             if format_of(self.out) is not None:
                 raise UserError(f"{self.out}: --format {kind.name} writes a folder; give a name without an ending")

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _FPS = 25.0
 _TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500}
 """Number of frames at the end that the authors hold out."""
+_TEST = "transforms_test.json"
 _FOLDERS = ("images", "input", "matted")
 """Folders with pictures, of which the first one is used."""
 
@@ -54,8 +55,10 @@ class _Layout:
     name: str
     root: Path
     frames: tuple[_Frame, ...]
-    test: int
-    """Number of frames at the end that are held out."""
+    test: tuple[int, ...]
+    """Indices of the frames that are held out."""
+    split: str
+    """The source of the split, in words."""
     unpaired: int
     """Number of pictures without a checkpoint, which are left out."""
 
@@ -97,9 +100,18 @@ def _layout(path: Path) -> _Layout:
             int(place.stem) if place.stem.isascii() and place.stem.isdigit() else number: place
             for number, place in enumerate(listed)
         }
-        return _paired("INSTA", path, path, pictures, {}, saved)
+        return _with_test(path / _TEST, _paired("INSTA", path, path, pictures, {}, saved))
     folder = next((path / name for name in _FOLDERS if (path / name).is_dir()), path / _FOLDERS[0])
     return _paired("INSTA", path, path, numbered_files(folder, ".png"), {}, saved)
+
+
+def _with_test(file: Path, layout: _Layout) -> _Layout:
+    """The layout with the split of transforms_test.json, if it is there."""
+    if not file.exists():
+        return layout
+    held = {inner(file, layout.root, frame.get("file_path")) for frame in frames_of(file, read_object(file))}
+    test = tuple(index for index, frame in enumerate(layout.frames) if frame.picture in held)
+    return replace(layout, test=test, split=f"{counted(len(test), 'frame')} of {_TEST} are held out")
 
 
 def _paired(
@@ -113,8 +125,9 @@ def _paired(
     for place in (*pictures.values(), *mattes.values(), *saved.values()):
         is_file_inside(root, place)
     frames = tuple(_Frame(pictures[number], mattes.get(number), saved.get(number)) for number in both)
-    test = _TEST_FRAMES[kind] if len(frames) > _TEST_FRAMES[kind] else 0
-    return _Layout(kind, folder.name, root, frames, test, len(pictures) - len(both))
+    last = _TEST_FRAMES[kind] if len(frames) > _TEST_FRAMES[kind] else 0
+    test, split = tuple(range(len(frames) - last, len(frames))), f"the last {last} frames are held out ({kind})"
+    return _Layout(kind, folder.name, root, frames, test, split, len(pictures) - len(both))
 
 
 def _survey(path: Path) -> Findings:
@@ -125,7 +138,7 @@ def _survey(path: Path) -> Findings:
         missing += ["the lids of the tracker, which FLAME has no place for"]
     if layout.unpaired:
         missing.append(f"checkpoints of {counted(layout.unpaired, 'picture')}, which are left out")
-    split = f"the last {layout.test} frames are held out ({layout.kind})" if layout.test else None
+    split = layout.split if layout.test else None
     if not layout.test:
         missing.append(f"a split: {counted(len(layout.frames), 'frame')} are too few for {layout.kind}'s")
     clips = (Clip(layout.name, len(layout.frames)),)
@@ -153,12 +166,9 @@ def _pictures(layout: _Layout) -> "tuple[np.ndarray, np.ndarray]":
 
 
 def _with_split(sequence: ReadSequence, layout: _Layout) -> ReadSequence:
-    from mien.training import OwnSplit
+    from mien.training import OwnSplit, ranges_of
 
-    if not layout.test:
-        return sequence
-    count = len(layout.frames)
-    return replace(sequence, own_split=OwnSplit(((count - layout.test, count),)))
+    return replace(sequence, own_split=OwnSplit(ranges_of(list(layout.test)))) if layout.test else sequence
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:

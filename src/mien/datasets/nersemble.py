@@ -52,7 +52,8 @@ def _names(path: Path) -> list[str]:
 def read_cameras(file: Path, size: tuple[int, int]) -> "dict[str, Camera]":
     """Return each camera by its serial number, for pictures of this width and height.
 
-    World-to-camera matrices are OpenCV's, in metres. Intrinsics are one matrix for all cameras, or one for each.
+    World-to-camera matrices are OpenCV's, in metres. Intrinsics are one matrix for all cameras, or one for each. Files
+    that `mien export` wrote name the `image_size` that they are for; for others it is found by the principal point.
 
     Raises:
         UserError: the file is damaged, or a camera is impossible.
@@ -66,12 +67,14 @@ def read_cameras(file: Path, size: tuple[int, int]) -> "dict[str, Camera]":
     if not isinstance(poses, dict) or not poses or not all(is_plain_name(serial) for serial in poses):
         raise UserError(f"{file}: has no 'world_2_cam' with a matrix for each camera; {REMEDY}")
     shared, cameras = content.get("intrinsics"), {}
+    own = numbers(file, content, "image_size", (2,)) if "image_size" in content else None
     for serial in poses:
         viewmat = rotation_part(file, serial, numbers(file, poses, serial, (4, 4)))
         given = numbers(file, shared, serial, (3, 3)) if isinstance(shared, dict) else numbers(
             file, content, "intrinsics", (3, 3)
         )  # fmt: skip
-        cameras[serial] = camera_of(scaled_intrinsics(given, size), np.asarray(viewmat), size)
+        K = scaled_intrinsics(given, size) if own is None else np.diag([*(np.array(size) / own), 1.0]) @ given
+        cameras[serial] = camera_of(K, np.asarray(viewmat), size)
     return cameras
 
 

@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mien.face import FaceModel
+    from mien.training import OwnSplit
 
 _VERSION = "FLAME 2023 (flame2023.pkl)"
-_TRACKING = "flame2023_tracking_v2.npz"
+TRACKING = "flame2023_tracking_v2.npz"
+TEST_ENDING = "-test"
+"""End of the names of sequences that `mien export` writes of held-out frames. The benchmark itself has none."""
 _FPS_MONO, _FPS_VIEWS = 24.3, 73.0
 TEST_SEQUENCES = ("FREE", "EMO-1-shout+laugh", "SEN-09-frown_events_bad", "SEN-10-port_strong_smokey")
 """Sequences of the monocular task that are to be rendered. They have tracking only."""
@@ -39,7 +42,7 @@ def _sequences(path: Path) -> list[Path]:
 def _recognises(path: Path) -> str | None:
     if not (path / "calibration" / "camera_params.json").is_file() or not _sequences(path):
         return None
-    mono = any((folder / "tracking" / _TRACKING).is_file() for folder in _sequences(path))
+    mono = any((folder / "tracking" / TRACKING).is_file() for folder in _sequences(path))
     return f"a person of the NeRSemble benchmark ({'one camera, with tracking' if mono else 'novel views'})"
 
 
@@ -53,9 +56,9 @@ def _videos(folder: Path, root: Path) -> dict[str, Path]:
 
 def _survey(path: Path) -> Findings:
     folders = _sequences(path)
-    mono = [folder for folder in folders if (folder / "tracking" / _TRACKING).is_file()]
+    mono = [folder for folder in folders if (folder / "tracking" / TRACKING).is_file()]
     clips = tuple(Clip(folder.name, None, len(_videos(folder, path))) for folder in folders)
-    hidden = [folder.parent.parent.name for folder in sorted(path.glob(f"sequences/*/tracking/{_TRACKING}"))
+    hidden = [folder.parent.parent.name for folder in sorted(path.glob(f"sequences/*/tracking/{TRACKING}"))
               if folder.parent.parent not in folders]  # fmt: skip
     missing = [] if mono else ["a tracking: use `mien track`"]
     if hidden:
@@ -144,6 +147,15 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
     return serials, *collect(counts[serials[0]], len(serials), size, read, f"read {folder.name}")
 
 
+def _own_split(folder: Path, timesteps: int) -> "OwnSplit | None":
+    """The split of a folder that `mien export` wrote, whose held-out frames are a sequence of their own."""
+    from mien.training import OwnSplit
+
+    if folder.name.endswith(TEST_ENDING):
+        return OwnSplit(((0, timesteps),))
+    return OwnSplit() if folder.with_name(f"{folder.name}{TEST_ENDING}").is_dir() else None
+
+
 def _count(video: Path) -> int:
     from mien.capture.video import count_frames
 
@@ -157,13 +169,13 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     from mien.datasets.overlay import check_overlay
     from mien.datasets.sequences import tracked_sequence
 
-    folders = [folder for folder in _sequences(path) if (folder / "tracking" / _TRACKING).is_file()]
+    folders = [folder for folder in _sequences(path) if (folder / "tracking" / TRACKING).is_file()]
     if not folders:
         yield from _read_pictures(path)
         return
     model = needed_flame(path, face_model, _VERSION)
     for folder in folders:
-        file = folder / "tracking" / _TRACKING
+        file = folder / "tracking" / TRACKING
         is_file_inside(path, file)
         flame, turns, shifts, scale = flame_from_benchmark(file)
         serials, images, mattes = _pictures(folder, path)
@@ -179,7 +191,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
         face = in_front(face, np.repeat(viewmat[None], len(face), 0))
         camera = {serials[0]: camera_of(known[serials[0]].K.double().numpy(), FRONT, size)}
         sequence = tracked_sequence(file, folder.name, images[:, :1], mattes[:, :1], camera, model, face, _FPS_MONO)
-        yield check_overlay(file, sequence, _VERSION)
+        yield replace(check_overlay(file, sequence, _VERSION), own_split=_own_split(folder, len(face)))
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
@@ -195,7 +207,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         sequence = filmed_sequence(
             folder, folder.name, images, mattes, {serial: known[serial] for serial in serials}, fps
         )
-        yield replace(sequence, own_split=None)
+        yield replace(sequence, own_split=_own_split(folder, len(images)))
 
 
 NERSEMBLE_BENCHMARK = Dataset(

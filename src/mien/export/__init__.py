@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.export.flame_params import face_of_flame_params
+    from mien.export.flame_params import face_of_flame_params, flame_params_of
     from mien.export.gaussian_avatars_folder import (
         GaussianAvatarsFolder,
         read_gaussian_avatars_folder,
@@ -37,6 +37,7 @@ __all__ = [
     "WrittenPage",
     "face_of_flame_params",
     "find_webcam_files",
+    "flame_params_of",
     "in_world",
     "pack",
     "read_gaussian_avatars_folder",

@@ -45,6 +45,24 @@ def write_flame_params(path: Path, face_model: FaceModel, face: FaceParams) -> N
     Raises:
         UserError: the model has free joints that the file cannot hold.
     """
+    arrays = flame_params_of(path, face_model, face)
+    content = io.BytesIO()
+    np.savez(content, **{name: array.astype(np.float32) for name, array in arrays.items()})  # pyright: ignore
+    write_atomically(path, lambda temporary: temporary.write_bytes(content.getvalue()))
+
+
+@torch.no_grad()
+def flame_params_of(path: Path, face_model: FaceModel, face: FaceParams) -> dict[str, np.ndarray]:
+    """Return the arrays of flame_param.npz for t timesteps, the inverse of `face_of_flame_params`.
+
+    Args:
+        path: The file or folder that they are for, for messages.
+        face_model: The face model of the parameters.
+        face: The subject at t timesteps.
+
+    Raises:
+        UserError: the model has free joints that the file cannot hold.
+    """
     free = face_model.free_joint_names
     others = set(free) - {name for names in _POSES.values() for name in names}
     if others:
@@ -63,13 +81,10 @@ def write_flame_params(path: Path, face_model: FaceModel, face: FaceParams) -> N
         poses["neck_pose"] = -poses["neck_pose"]
     offsets = face.vertex_offsets
     offsets = torch.zeros_like(face_model.template) if offsets is None else offsets
-    arrays = {
+    return {
         "shape": face.identity.numpy(), "expr": face.expression.numpy(), "rotation": rotation.numpy(),
         "translation": translation.numpy(), "static_offset": offsets[None].numpy(), **poses,
     }  # fmt: skip
-    content = io.BytesIO()
-    np.savez(content, **{name: array.astype(np.float32) for name, array in arrays.items()})  # pyright: ignore
-    write_atomically(path, lambda temporary: temporary.write_bytes(content.getvalue()))
 
 
 @torch.no_grad()

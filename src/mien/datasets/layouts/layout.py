@@ -1,0 +1,62 @@
+"""A layout: how a tracked capture is written as the files of another laboratory.
+
+This file needs no torch, because the command line lists the layouts and checks options against them.
+"""
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from mien.errors import UserError
+
+if TYPE_CHECKING:
+    from mien.datasets.layouts.filmed import Filmed
+
+MatteKind = Literal["head", "person"]
+"""Mattes that are written: the head above mien's cut at the neck, which mien trains on and scores, or the person."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a writer tells of the files that it wrote."""
+
+    names: "dict[tuple[int, int], str]"
+    """Name of the held-out pictures in the layout, without their ending, by timestep and camera."""
+    told: tuple[str, ...]
+    """What the files hold, and what is lost, each as a sentence for README.txt."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A layout of files. Its writer is the function `write` of the file in this folder that has its name."""
+
+    name: str
+    """Name for `mien export --format`."""
+    about: str
+    """The programs that read it, in a few words."""
+    one_camera: bool = True
+    """Whether it holds one camera only."""
+    needs_flame: bool = False
+    """Whether its programs pose FLAME themselves, so that no other face model helps them."""
+
+    def write(self, folder: Path, filmed: "Filmed") -> Written:
+        """Write a capture into a new folder.
+
+        Raises:
+            UserError: the capture does not fit, in one line.
+        """
+        return import_module(f"mien.datasets.layouts.{self.name}").write(folder, filmed)
+
+
+def check_new_folder(folder: Path) -> None:
+    """Check that a folder can be made, and that nothing is in it.
+
+    Raises:
+        UserError: something is there, or it cannot be written.
+    """
+    from mien.files import check_writable
+
+    check_writable(folder, folder=True)
+    if folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder}: is not empty, and a capture is written into a new folder; give another --out")
