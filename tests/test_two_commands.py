@@ -66,6 +66,7 @@ def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, l
             ["capture", video, "--out", str(root), "--name", "clip", *studio.capture_options, "--capture.end", "9"],
         ),
         "track": (clip, ["track", str(root), "--face-model", "toy", "--again"]),
+        "align": (clip, ["align", str(root), "--split", "tail"]),
         "train": (runs / "new", ["train", str(root), "--run", "new", "--steps", "3"]),
         "create": (runs / "new", ["create", video, "--out", str(root), "--run", "new", *studio.create_options]),
         "evaluate": (runs / "alone", ["evaluate", str(root), "--run", "alone"]),

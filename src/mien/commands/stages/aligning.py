@@ -53,7 +53,8 @@ def run_alignment_stage(
         keep: Whether trackings that are aligned with other settings stay, too, so that older runs can still be scored.
 
     Raises:
-        UserError: as `mien.training.align`, or a tracking changed meanwhile.
+        BeingWrittenError: another process is writing one of the sequences.
+        UserError: as `mien.training.align`, or a tracking was changed in this moment.
     """
     loaded, face_model = read_together(workspace, names)
     fingerprint = _fingerprint(loaded, settings, training)
@@ -70,22 +71,17 @@ def run_alignment_stage(
         return
     before = [replace(sequence, tracking=_before(sequence)) for sequence in loaded]
     folder = workspace.root / "sequences" / f".alignment-{fingerprint}"
-    for other in workspace.root.glob("sequences/.alignment-*"):
-        if other != folder and other.is_dir():
-            remove_tree(other)  # kept for another tracking or other settings
-    faces = align(before, face_model, settings, training, folder)
     with hold(*(workspace.sequence_dir(name) for name in names)):
-        for sequence, own, face in zip(loaded, before, faces, strict=True):
+        for sequence in loaded:
             _check_unchanged(sequence)
-            aligned = {"fingerprint": fingerprint, **_choices(settings, training)}
-            write_tensors(_folder(sequence) / _BEFORE, own.tracking.face.tensors())
-            write_tracking(
-                _folder(sequence),
-                replace(own.tracking, face=face, settings={**own.tracking.settings, _KEY: aligned}),
-            )
-            turn, shift = _moved(own.tracking.face, face)
-            say(f"{sequence.name}: aligned; heads turned by {turn:.2f} degrees and moved by {shift:.1f} mm (medians)")
-    remove_tree(folder)
+        for other in workspace.root.glob("sequences/.alignment-*"):
+            if other != folder and other.is_dir():
+                remove_tree(other)  # kept for another tracking or other settings
+        faces = align(before, face_model, settings, training, folder)
+        aligned = {"fingerprint": fingerprint, **_choices(settings, training)}
+        for sequence, face in zip(before, faces, strict=True):
+            _write(sequence, face, aligned)
+        remove_tree(folder)
     _tell_outdated(workspace, names)
 
 
@@ -126,10 +122,18 @@ def _before(sequence: Sequence) -> Tracking:
     return replace(tracking, face=face, settings={k: v for k, v in tracking.settings.items() if k != _KEY})
 
 
+def _write(before: Sequence, face: FaceParams, aligned: dict[str, Any]) -> None:
+    tracking, path = before.tracking, _folder(before)
+    write_tensors(path / _BEFORE, tracking.face.tensors())
+    write_tracking(path, replace(tracking, face=face, settings={**tracking.settings, _KEY: aligned}))
+    turn, shift = _moved(tracking.face, face)
+    say(f"{before.name}: aligned; heads turned by {turn:.2f} degrees and moved by {shift:.1f} mm (medians)")
+
+
 def _check_unchanged(sequence: Sequence) -> None:
     now = read_tracking(_folder(sequence)).face.tensors()
     if not all(now[name].equal(tensor) for name, tensor in sequence.tracking.face.tensors().items()):
-        raise UserError(f"{_folder(sequence)}: was tracked again while it was aligned; run the same command again")
+        raise UserError(f"{_folder(sequence)}: was tracked again in this moment; run the same command again")
 
 
 def _moved(before: FaceParams, after: FaceParams) -> tuple[float, float]:

@@ -106,11 +106,12 @@ def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overla
     """Write reports and overlays of some tracked sequences, as far as they are missing or outdated.
 
     Raises:
-        BeingWrittenError: another process is writing one of the sequences.
+        BeingWrittenError: something is to be written, and another process is writing that sequence.
     """
-    with hold(*(workspace.sequence_dir(name) for name in names)):
-        for name in names:
-            folder = workspace.sequence_dir(name)
+    folders = [workspace.sequence_dir(name) for name in names]
+    lacking = [folder for folder in folders if not all(_is_shown(folder, read_tracking(folder / "tracking"), overlay))]
+    with hold(*lacking):
+        for folder in lacking:
             tracking = read_tracking(folder / "tracking")
             _show_tracking(folder, tracking, load_face_model(tracking.face_model), overlay)
 
