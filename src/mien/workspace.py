@@ -1,6 +1,7 @@
 """Paths on disk: a workspace is a folder for one subject, with `sequences/NAME/` and `runs/NAME/` in it."""
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,6 +42,19 @@ class Workspace:
         return [
             name for name in self.sequence_names() if (self.sequence_dir(name) / "tracking/tracking.json").is_file()
         ]
+
+    def pick_tracked(self, names: Sequence[str], held_out: Sequence[str]) -> list[str]:
+        """All tracked sequences, or, if names are given, these and the held-out ones.
+
+        Raises:
+            UserError: nothing is tracked, or there is no sequence of a name.
+        """
+        if names:
+            return [self.pick_sequence(name) for name in dict.fromkeys((*names, *held_out))]
+        tracked = self.tracked_names()
+        if not tracked:
+            raise UserError(f"{self.root}: no tracked sequences; run `mien track {self.root}`")
+        return tracked
 
     def run_names(self) -> list[str]:
         """Names of the runs, sorted."""

@@ -9,7 +9,7 @@ import tyro
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
 from mien.training import AlignmentSettings, Split, TrainSettings, check_held_out
-from mien.workspace import Workspace, open_workspace
+from mien.workspace import open_workspace
 
 _SPLITS = ("blocks", "tail", "none")
 
@@ -47,7 +47,7 @@ class Command:
             raise UserError(f"--split {self.split}: give one of {', '.join(_SPLITS)}")
         check_device(self.device)
         workspace = open_workspace(self.workspace)
-        check_held_out(self._names(workspace), self._training())
+        check_held_out(workspace.pick_tracked(self.sequences, self.hold_out), self._training())
 
     def run(self) -> None:
         """Align, and write overlays and reports."""
@@ -55,7 +55,7 @@ class Command:
         from mien.commands.stages.tracking import show_trackings
 
         workspace = open_workspace(self.workspace)
-        names = self._names(workspace)
+        names = workspace.pick_tracked(self.sequences, self.hold_out)
         run_alignment_stage(workspace, names, self.alignment, self._training())
         show_trackings(workspace, names, "auto")
 
@@ -69,11 +69,3 @@ class Command:
         )
         settings.check()
         return settings
-
-    def _names(self, workspace: Workspace) -> list[str]:
-        if not self.sequences:
-            names = workspace.tracked_names()
-            if not names:
-                raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
-            return names
-        return [workspace.pick_sequence(name) for name in dict.fromkeys((*self.sequences, *self.hold_out))]

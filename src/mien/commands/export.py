@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mien.formats import Options
 
 CaptureSplit = Literal["blocks", "tail", "none", "dataset"]
-"""What may be held out of a capture without a run."""
+"""Names of what may be held out of a capture without a run."""
 _REFUSED = {
     "webgpu": "only an .html page draws with WebGPU; leave --webgpu out",
     "sh": "only a .ply has a degree to choose; leave --sh out",

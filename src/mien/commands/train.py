@@ -7,9 +7,8 @@ from typing import Annotated
 import tyro
 
 from mien.commands.options import TrainOptions, check_viewer
-from mien.errors import UserError
 from mien.training import NAMED_SPLIT, OWN_SPLIT, NamedSplit, check_held_out, split_by_name, with_named_split
-from mien.workspace import Workspace, open_workspace
+from mien.workspace import open_workspace
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Command:
             check_viewer()
         workspace, settings = open_workspace(self.workspace), self.options.settings()
         run_name(self.run_name or self.options.method)
-        names = self._names(workspace)
+        names = workspace.pick_tracked(self.sequences, self.options.hold_out)
         if settings.split == NAMED_SPLIT:
             split = self._named_split(names)
             names, settings = list(split.sequences), with_named_split(settings, split)
@@ -50,7 +49,7 @@ class Command:
         workspace = open_workspace(self.workspace)
         method, settings = self.options.method_config(), self.options.settings()
         run = run_name(self.run_name or self.options.method)
-        names = self._names(workspace)
+        names = workspace.pick_tracked(self.sequences, self.options.hold_out)
         if settings.split == NAMED_SPLIT:
             split = self._named_split(names)
             names, settings = list(split.sequences), fill_in_named_split(workspace, settings, split)
@@ -62,11 +61,3 @@ class Command:
 
     def _named_split(self, names: list[str]) -> NamedSplit:
         return split_by_name(names, self.workspace.resolve().name, self.options.subject)
-
-    def _names(self, workspace: Workspace) -> list[str]:
-        if not self.sequences:
-            names = workspace.tracked_names()
-            if not names:
-                raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
-            return names
-        return [workspace.pick_sequence(name) for name in dict.fromkeys((*self.sequences, *self.options.hold_out))]

@@ -144,7 +144,7 @@ def _moved(before: FaceParams, after: FaceParams) -> tuple[float, float]:
 
 
 def _choices(settings: AlignmentSettings, training: TrainSettings) -> dict[str, Any]:
-    """What the result depends on, beside the tracking, as json."""
+    """Return, as json, what the result depends on beside the tracking."""
     own = {name: value for name, value in asdict(settings).items() if name != "when"}
     return own | {"seed": training.seed} | {name: _plain(getattr(training, name)) for name in _HELD_OUT}
 

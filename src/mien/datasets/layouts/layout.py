@@ -19,12 +19,12 @@ MatteKind = Literal["head", "person"]
 
 @dataclass(frozen=True)
 class Written:
-    """What a writer tells of the files that it wrote."""
+    """The report of a writer on the files that it wrote."""
 
     names: "dict[tuple[int, int], str]"
     """Name of the held-out pictures in the layout, without their ending, by timestep and camera."""
     told: tuple[str, ...]
-    """What the files hold, and what is lost, each as a sentence for README.txt."""
+    """Sentences for README.txt that say what the files hold and what is lost."""
 
 
 @dataclass(frozen=True)

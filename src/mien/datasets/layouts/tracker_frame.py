@@ -12,7 +12,7 @@ import torch
 from mien.rotation import matrix_from_axis_angle
 
 _NEW, _OLD = b"cnumpy._core.", b"cnumpy.core."
-"""Where pickles look for numpy's arrays: numpy 2 finds both, and the old numpy of those programs only the latter."""
+"""Pickles look for numpy's arrays here: numpy 2 finds both, and the old numpy of those programs only the latter."""
 
 
 def write_tracker_frame(
