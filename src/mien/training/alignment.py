@@ -19,12 +19,11 @@ from mien.config import overlay
 from mien.face import FaceModel, FaceParams, concatenate
 from mien.progress import progress_bar
 from mien.render.rasterize import rasterize_each
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.constants import TRAINING
-from mien.training.face_track import FaceTrack, pose_corrections
+from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
 from mien.training.footage import Sequence, Targets
 from mien.training.photometric import photometric_loss
 from mien.training.run import read_face_track
@@ -106,10 +105,8 @@ def steadier(tracked: FaceParams, aligned: FaceParams) -> FaceParams:
     corrections = pose_corrections(tracked, aligned)
     padded = torch.cat([corrections[:1], corrections, corrections[-1:]])
     corrections = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
-    rotations = tracked.T_world_head[:, :3, :3]
-    turned = axis_angle_from_matrix(rotations @ matrix_from_axis_angle(corrections[:, :3]))
-    shifted = tracked.head_translation + (rotations @ corrections[:, 3:, None])[:, :, 0]
-    return replace(aligned, head_rotation=turned, head_translation=shifted)
+    poses = corrected_poses(tracked, corrections)
+    return replace(aligned, head_rotation=poses.head_rotation, head_translation=poses.head_translation)
 
 
 def align_faces(

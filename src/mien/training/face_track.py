@@ -105,10 +105,9 @@ class FaceTrack:
             corrections = without_turns(corrections, self._away[seen], self._sequence[seen])
         if tuning.keep_mean_pose:
             corrections = corrections - corrections.mean(0)
-        turns, shifts = corrections[:, :3], corrections[:, 3:]
-        upright = start.T_world_head[:, :3, :3]
-        self._fields["head_rotation"][seen] = axis_angle_from_matrix(upright @ matrix_from_axis_angle(turns))
-        self._fields["head_translation"][seen] = start.head_translation + (upright @ shifts[:, :, None])[:, :, 0]
+        steady = corrected_poses(start, corrections)
+        self._fields["head_rotation"][seen] = steady.head_rotation
+        self._fields["head_translation"][seen] = steady.head_translation
 
     def _row(self, index: int) -> "_Row":
         # Cached, because a dozen views would otherwise be made in every step. The track's tensors are never replaced.
@@ -179,6 +178,14 @@ def pose_corrections(tracked: FaceParams, tuned: FaceParams) -> Float[Tensor, "t
     from_tracked = tracked.T_world_head[:, :3, :3].mT
     shift = from_tracked @ (tuned.head_translation - tracked.head_translation)[:, :, None]
     return torch.cat([axis_angle_from_matrix(from_tracked @ tuned.T_world_head[:, :3, :3]), shift[:, :, 0]], 1)
+
+
+def corrected_poses(tracked: FaceParams, corrections: Float[Tensor, "t 6"]) -> FaceParams:
+    """The tracked faces with these changes of head poses: the inverse of `pose_corrections`."""
+    upright = tracked.T_world_head[:, :3, :3]
+    turned = axis_angle_from_matrix(upright @ matrix_from_axis_angle(corrections[:, :3]))
+    shifted = tracked.head_translation + (upright @ corrections[:, 3:, None])[:, :, 0]
+    return replace(tracked, head_rotation=turned, head_translation=shifted)
 
 
 def mean_pose_correction(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
