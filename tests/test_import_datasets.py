@@ -150,6 +150,6 @@ def test_the_protocol_of_a_dataset_scores_its_mattes_and_its_frames(
     assert main(line) == 0
     (entry,) = json.loads((root / "runs/toy/metrics.json").read_text())["protocols"].values()
     assert entry["per_frame"]["timestep"] == [1, 2]
-    assert (entry["split"], entry["dataset"], entry["edges"]) == ("dataset", "insta", "filmed")
+    assert (entry["split"], entry["dataset_protocol"], entry["edges"]) == ("dataset", "insta", "filmed")
     assert entry["mask"] == "the dataset's mattes, whole, over white"
     assert entry["scored_on"]["clip"]["mask"] == "matte"

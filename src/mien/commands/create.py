@@ -13,7 +13,7 @@ from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.overall import Overall
 from mien.tracking import ScoringSettings, TrackingSettings
-from mien.training import NAMED_SPLIT, OWN_SPLIT, AlignmentSettings, TrainSettings
+from mien.training import BENCHMARK_SPLIT, NAMED_SPLIT, OWN_SPLIT, AlignmentSettings, TrainSettings
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -58,10 +58,11 @@ class Command:
         self.options.check()
         if self.view:
             check_viewer()
-        if self.options.settings().split == NAMED_SPLIT:
+        if (split := self.options.settings().split) in (NAMED_SPLIT, BENCHMARK_SPLIT):
+            count = "ten sequences" if split == NAMED_SPLIT else "several sequences"
             raise UserError(
-                f"--split {NAMED_SPLIT}: needs ten sequences of calibrated cameras, and this command makes one; use "
-                f"`mien capture --calibration` for each, then `mien track` and `mien train --split {NAMED_SPLIT}`"
+                f"--split {split}: needs {count} of calibrated cameras, and this command makes one; use "
+                f"`mien capture --calibration` for each, then `mien track` and `mien train --split {split}`"
             )
         if self.options.settings().split == OWN_SPLIT:
             raise UserError(f"--split {OWN_SPLIT}: is the split of an imported dataset; use it with `mien train`")

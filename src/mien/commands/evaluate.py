@@ -12,8 +12,10 @@ from mien.errors import UserError
 from mien.terminal import show
 from mien.workspace import open_workspace
 
-Protocol = Literal["vhap", "insta", "imavatar", "nerface", "nerf-blendshape"]
-"""Datasets that name a split."""
+Protocol = Literal["insta", "imavatar", "nersemble", "nersemble-benchmark", "vhap", "nerface", "nerf-blendshape"]
+"""Names of `mien.evaluation.dataset_protocols`, without its imports."""
+_FRAMES = 24
+"""Number of frames on which ST-LPIPS is computed by default."""
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json")]
 
 
@@ -39,8 +41,9 @@ class Command:
     """Also write every scored picture and its truth as png, so that other programs can be scored on them."""
     perceptual: bool = True
     """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
-    perceptual_frames: int = 24
-    """Largest number of frames, evenly spread, on which ST-LPIPS is computed. 0 means all frames."""
+    perceptual_frames: int | None = None
+    """Largest number of frames, evenly spread, on which ST-LPIPS and LPIPS are computed. 0 means all frames (default:
+    24; with --protocol and --lpips-weights all, as papers do)."""
     lpips_weights: Path | None = None
     """Torchvision's alexnet-owt-7be5be79.pth or vgg16-397923af.pth, to compute exact LPIPS as well, as papers report
     it. It needs the package lpips."""
@@ -48,8 +51,9 @@ class Command:
     """Truth at soft edges of the matte: colours of the person alone (cleaned), or pictures as they were filmed, which
     hold some of the background there (filmed), for figures beside those of other programs."""
     protocol: Protocol | None = None
-    """Score as the authors of an imported dataset do: whole pictures over white, their mattes, their held-out frames.
-    The run has to be trained with --split dataset. It implies --edges filmed."""
+    """Score as the authors of an imported dataset do: whole pictures over white, their mattes, their held-out frames,
+    their window of SSIM (docs/datasets.md). The run has to be trained with their split: --split dataset,
+    gaussian-avatars or nersemble-benchmark. It implies --edges filmed."""
     fit_faces: bool = False
     """Also score the avatar with expression and pose fitted to each held-out frame by its colours: a third figure
     beside those as tracked and corrected, never the headline. It takes longer."""
@@ -74,7 +78,7 @@ class Command:
 
     def check(self) -> None:
         """Check without heavy libraries which of the three tasks is asked for, and that its input exists."""
-        if self.perceptual_frames < 0:
+        if self.perceptual_frames is not None and self.perceptual_frames < 0:
             raise UserError(f"--perceptual-frames {self.perceptual_frames}: give a positive number, or 0 for all")
         if self.lpips_weights is not None and not self.lpips_weights.is_file():
             raise UserError(f"--lpips-weights {self.lpips_weights}: no such file; give torchvision's file of AlexNet")
@@ -110,13 +114,14 @@ class Command:
         from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.evaluation import EvaluationSettings
 
+        whole = self.protocol is not None and self.lpips_weights is not None
         settings = EvaluationSettings(
             perceptual=self.perceptual,
-            perceptual_frames=self.perceptual_frames,
+            perceptual_frames=self._frames(0 if whole else _FRAMES),
             pictures=self.pictures,
             lpips_weights=self.lpips_weights,
             edges="filmed" if self.protocol is not None else self.edges,
-            dataset=self.protocol,
+            protocol=self.protocol,
             fit_faces=self.fit_faces,
             fit_steps=self.fit_steps,
         )
@@ -124,6 +129,9 @@ class Command:
         metrics = run_evaluation_stage(workspace, workspace.pick_run(self.run_name), settings, self.drivers)
         if self.as_json:
             _print_json(metrics)
+
+    def _frames(self, default: int) -> int:
+        return default if self.perceptual_frames is None else self.perceptual_frames
 
     def _compare(self) -> None:
         from mien.commands.stages.evaluating import run_comparison
@@ -151,7 +159,7 @@ class Command:
 
         folders = ImageFolders(images, truth, self.mattes, self.crops, self.background)
         scores = score_folders(
-            folders, ScoreSettings(self.perceptual, self.perceptual_frames, lpips_weights=self.lpips_weights)
+            folders, ScoreSettings(self.perceptual, self._frames(_FRAMES), lpips_weights=self.lpips_weights)
         )
         if self.out is not None:
             write_scores(self.out, scores)

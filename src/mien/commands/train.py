@@ -7,7 +7,15 @@ from typing import Annotated
 import tyro
 
 from mien.commands.options import TrainOptions, check_viewer
-from mien.training import NAMED_SPLIT, OWN_SPLIT, NamedSplit, check_held_out, split_by_name, with_named_split
+from mien.training import (
+    BENCHMARK_SPLIT,
+    NAMED_SPLIT,
+    OWN_SPLIT,
+    NamedSplit,
+    check_held_out,
+    split_by_name,
+    with_named_split,
+)
 from mien.workspace import open_workspace
 
 
@@ -43,7 +51,12 @@ class Command:
     def run(self) -> None:
         """Train the run to its end."""
         from mien.commands.stages.names import run_name
-        from mien.commands.stages.training import fill_in_named_split, fill_in_own_split, run_training_stage
+        from mien.commands.stages.training import (
+            fill_in_benchmark_split,
+            fill_in_named_split,
+            fill_in_own_split,
+            run_training_stage,
+        )
         from mien.training import check_run
 
         workspace = open_workspace(self.workspace)
@@ -53,6 +66,8 @@ class Command:
         if settings.split == NAMED_SPLIT:
             split = self._named_split(names)
             names, settings = list(split.sequences), fill_in_named_split(workspace, settings, split)
+        if settings.split == BENCHMARK_SPLIT:
+            settings = fill_in_benchmark_split(workspace, settings, names)
         if settings.split == OWN_SPLIT:
             settings = fill_in_own_split(workspace, settings, names)
         check_run(workspace.run_dir(run), method, settings, names)

@@ -8,6 +8,7 @@ from typing import Any
 
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
+from mien.evaluation.dataset_protocols import check_lpips, dataset_protocol
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, living, write_film
 from mien.evaluation.load import load_experiments
@@ -60,7 +61,9 @@ def _evaluate(
     run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings, driver_dirs: Items[Path]
 ) -> dict[str, Any]:
     summary = read_training_summary(run_dir)
-    experiments = load_experiments(run_dir, sequence_dirs, settings.edges, settings.dataset)
+    if settings.protocol is not None:
+        check_lpips(dataset_protocol(settings.protocol), settings)
+    experiments = load_experiments(run_dir, sequence_dirs, settings.edges, settings.protocol)
     if not experiments and not driver_dirs:
         raise UserError(
             f"{run_dir}: no frame was held out, so nothing can be scored; train with `--split blocks` or "
@@ -114,7 +117,7 @@ def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: Evaluation
         known = read_metrics(run_dir).get("fingerprints")
     except UserError:
         return False
-    experiments = load_experiments(run_dir, sequence_dirs, settings.edges, settings.dataset)
+    experiments = load_experiments(run_dir, sequence_dirs, settings.edges, settings.protocol)
     expected = {name: _fingerprint(run_dir, name, each, settings) for name, each in experiments.items()}
     return bool(expected) and known == expected and (run_dir / "report.html").is_file()
 
@@ -134,8 +137,8 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
         file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,
         settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone, settings.edges,
     ]  # fmt: skip
-    if settings.dataset is not None:
-        content.append(settings.dataset)
+    if settings.protocol is not None:
+        content.append(settings.protocol)
     if settings.lpips_weights is not None:
         content.append(load_lpips(settings.lpips_weights).backbone)
     if settings.fit_faces:

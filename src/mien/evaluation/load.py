@@ -10,16 +10,17 @@ from mien.avatar import load_avatar
 from mien.capture import read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
+from mien.evaluation.dataset_protocols import counted_frames, dataset_protocol, scores_whole_mattes
 from mien.evaluation.experiment import Edges, Experiment, FaceSource
 from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_run_config
-from mien.training.footage import OWN_SPLIT, Frame, held_out_of, imported_from, sequence_of, training_frames
+from mien.training.footage import Frame, held_out_of, sequence_of, training_frames
 
 
 def load_experiments(
-    run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "cleaned", dataset: str | None = None
+    run_dir: Path, sequence_dirs: Items[Path], edges: Edges = "cleaned", protocol: str | None = None
 ) -> dict[str, Experiment]:
     """The experiments of a run, by protocol. The result is empty if nothing was held out.
 
@@ -28,11 +29,11 @@ def load_experiments(
     - `novel_view`: held-out cameras, at timesteps that were trained with other cameras.
 
     The first two include all cameras, also held-out ones. `edges` says what the truth is at soft edges.
-    With the name of a `dataset`, its own mattes are scored, without mien's cut at the neck.
+    With the name of a dataset's `protocol`, the pixels and frames of its authors are scored.
 
     Raises:
         UserError: the run is not finished, the sequences are not those that it was trained on, or they are not of the
-            dataset, or the run was not trained with its split.
+            protocol's dataset, or the run was not trained with its split.
     """
     config = read_run_config(run_dir)
     settings = decode(TrainSettings, config["settings"], str(run_dir / "config.json"), "train it again")
@@ -40,12 +41,14 @@ def load_experiments(
     if [folder.name for folder in sequence_dirs] != wanted:
         given = ", ".join(folder.name for folder in sequence_dirs)
         raise UserError(f"{run_dir}: was trained on {', '.join(wanted)}, not on {given}; give it those sequences")
-    if dataset is not None:
-        _check_dataset(run_dir, sequence_dirs, settings, dataset)
     digests = tuple(_digests(folder) for folder in sequence_dirs)
     scorings = tuple(
         read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
     )
+    rules, whole = None if protocol is None else dataset_protocol(protocol), False
+    if rules is not None:
+        masks = dict(zip(sequence_dirs, scorings, strict=True))
+        whole = scores_whole_mattes(rules, run_dir, masks, settings.split)
     sequences = tuple(sequence_of(folder, scoring) for folder, scoring in zip(sequence_dirs, scorings, strict=True))
     for folder, digest in zip(sequence_dirs, digests, strict=True):
         if _digests(folder) != digest:
@@ -65,26 +68,16 @@ def load_experiments(
         held_out_frames=(),
         split=settings.split,
         edges=edges,
-        whole_mattes=dataset is not None,
-        digests=digests if dataset is None else tuple({**each, "mask": "matte"} for each in digests),
+        whole_mattes=whole,
+        digests=tuple({**each, "mask": "matte"} for each in digests) if whole else digests,
     )
+    found = held_out_by_protocol(sequences, settings)
+    if rules is not None:
+        found = counted_frames(sequences, settings.split, found)
     return {
-        protocol: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
-        for protocol, (split, frames) in held_out_by_protocol(sequences, settings).items()
+        name: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
+        for name, (split, frames) in found.items()
     }
-
-
-def _check_dataset(run_dir: Path, sequence_dirs: Items[Path], settings: TrainSettings, dataset: str) -> None:
-    for folder in sequence_dirs:
-        found = imported_from(folder)
-        if found != dataset:
-            told = "was not imported" if found is None else f"was imported from {found}"
-            raise UserError(f"{folder}: {told}; leave --protocol {dataset} out, or give the dataset's own name")
-    if settings.split != OWN_SPLIT:
-        raise UserError(
-            f"{run_dir}: was trained with --split {settings.split}, and --protocol {dataset} needs the split of the "
-            f"dataset; train another run with --split {OWN_SPLIT}"
-        )
 
 
 def _digests(folder: Path) -> dict[str, str]:

@@ -1,5 +1,7 @@
 """Image metrics: pure functions of float32 RGB images in 0..1."""
 
+from typing import Literal
+
 import cv2
 import numpy as np
 import torch
@@ -9,6 +11,8 @@ from torch import Tensor
 from mien.pictures import Box
 from mien.training.photometric import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
 
+Border = Literal["zeros", "inside"]
+"""Windows of SSIM at the border of a picture: with zeros beyond it, or only those that lie inside."""
 MAX_PSNR = 100.0
 """PSNR of identical images in dB, so that results stay finite."""
 
@@ -39,9 +43,15 @@ def psnr(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], box: Box
     return float(-10 * torch.log10(squared.clamp_min(10 ** (-MAX_PSNR / 10))))
 
 
-def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
-    """Structural similarity (Wang et al. 2004): the mean of `ssim_map` over pixels and channels."""
-    return float(ssim_map(image, target).double().mean())
+def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], border: Border = "zeros") -> float:
+    """Structural similarity (Wang et al. 2004): the mean of `ssim_map` over pixels and channels.
+
+    With `inside`, pixels whose window reaches beyond the picture do not count, unless the picture is smaller than that.
+    """
+    found, r = ssim_map(image, target), WINDOW_RADIUS
+    if border == "inside" and min(found.shape[:2]) > 2 * r:
+        found = found[r:-r, r:-r]
+    return float(found.double().mean())
 
 
 def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

@@ -91,8 +91,13 @@ def _check_protocol(entry: Mapping[str, Any]) -> None:
     for name, row in entry["baselines"].items():
         _require(name in BASELINE_NAMES, "a baseline's name")
         _check_row(row)
-    for name in ("perceptual_backbone", "pixels", "part_crops"):
+    for name in ("perceptual_backbone", "pixels", "part_crops", "lpips_backbone"):
         _require(entry.get(name) is None or is_one_line(entry[name]), name)
+    if "dataset_protocol" in entry:
+        _require(all(is_one_line(entry[name]) for name in ("dataset_protocol", "mask", "ssim_window")), "its protocol")
+    if entry.get("lpips") is not None:
+        _number(entry, "lpips")
+        _require(is_one_line(entry["lpips_backbone"]), "lpips_backbone")
     _require(isinstance(entry.get("perceptual_frames"), int | None), "perceptual_frames")
     for name, digests in entry["scored_on"].items():
         _require(all(map(is_one_line, (name, *digests, *digests.values()))), "scored_on")

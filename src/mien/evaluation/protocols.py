@@ -9,14 +9,15 @@ from typing import Annotated, Any
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
+from mien.evaluation.dataset_protocols import dataset_protocol
 from mien.evaluation.experiment import Edges, Experiment, avatar_image, scored_on, target_image
 from mien.evaluation.fitting import LOSS, FittedFaces
-from mien.evaluation.metrics import psnr
+from mien.evaluation.metrics import Border, psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
     PART_SIDE,
     PIXELS,
-    SSIM_WINDOW,
+    SSIM_WINDOWS,
     Scores,
     ScoreSettings,
     as_8_bit,
@@ -57,12 +58,17 @@ class EvaluationSettings(ScoreSettings):
     """Whether to write every scored picture and its truth as png as well."""
     edges: Edges = "cleaned"
     """Colours of the truth at soft edges of the matte: cleaned of the background, or as filmed."""
-    dataset: str | None = None
-    """Name of the dataset whose protocol counts: its split, and its own mattes. None for mien's scoring masks."""
+    protocol: str | None = None
+    """Name of the dataset protocol that counts (`DATASET_PROTOCOLS`). None for mien's scoring masks."""
     fit_faces: bool = False
     """Whether to score the avatar a third time, with expression and pose fitted to each held-out frame's picture."""
     fit_steps: Annotated[int, Range(1, 10_000)] = 20
     """Number of optimiser steps of that fit, for each timestep."""
+
+    @property
+    def border(self) -> Border:
+        """Windows of SSIM at the border of a picture."""
+        return "zeros" if self.protocol is None else dataset_protocol(self.protocol).border
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +120,8 @@ def evaluate_frames(
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
         truth, crop = target_image(experiment, frame), experiment.crop(frame)
         judges = (metric, lpips) if frame in judged else (None, None)
-        return frame, score_pictures(pictures, truth, crop, judges[0], experiment.parts(frame), judges[1]), seconds
+        scores = score_pictures(pictures, truth, crop, judges[0], experiment.parts(frame), judges[1], settings.border)
+        return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
         jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines, fitted)
@@ -193,11 +200,11 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         **({} if settings.lpips_weights is None else {"lpips_backbone": load_lpips(settings.lpips_weights).backbone}),
         "split": experiment.split,
         "mask": _mask_words(experiment, evaluation.frames),
-        **({} if settings.dataset is None else {"dataset": settings.dataset}),
+        **({} if settings.protocol is None else {"dataset_protocol": settings.protocol}),
         "edges": experiment.edges,
         "crop": _CROP,
         "part_crops": _PART_CROPS,
-        "ssim_window": SSIM_WINDOW,
+        "ssim_window": SSIM_WINDOWS[settings.border],
         "pixels": PIXELS,
         "face_params": experiment.face_source,
         "frames": len(evaluation.frames),

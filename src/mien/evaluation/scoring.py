@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.evaluation.metrics import crop_to, l1, psnr, ssim
+from mien.evaluation.metrics import Border, crop_to, l1, psnr, ssim
 from mien.face import PARTS
 from mien.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
 from mien.perceptual.lpips import Lpips, load_lpips
@@ -27,6 +27,11 @@ LPIPS = "lpips"
 _MAX_THREADS = 8
 """Default limit of the threads. Each thread needs some hundred megabytes for the perceptual metric's features."""
 SSIM_WINDOW = "11x11 Gaussian window, sigma 1.5, zeros beyond the border"
+SSIM_WINDOWS: dict[Border, str] = {
+    "zeros": SSIM_WINDOW,
+    "inside": "11x11 Gaussian window, sigma 1.5, only where it lies inside the picture",
+}
+"""Words for the windows of SSIM, by their border."""
 PIXELS = "8 bits a channel, rounded"
 """The scored pixels: those that a png file would hold, so that files of any program are scored alike."""
 
@@ -82,6 +87,7 @@ def score_pictures(
     metric: PerceptualDistance | None,
     parts: Mapping[str, Box] = MappingProxyType({}),
     lpips: Lpips | None = None,
+    border: Border = "zeros",
 ) -> dict[str, Scores]:
     """The figures of several pictures against one target, on the whole frame and on the crops that are given.
 
@@ -92,6 +98,7 @@ def score_pictures(
         metric: ST-LPIPS, or None. It skips a picture or a head that is too small for it.
         parts: The boxes of eyes and mouth, by name. ST-LPIPS enlarges those with a side below `PART_SIDE` to it.
         lpips: Exact LPIPS, or None. It skips and enlarges the same crops.
+        border: Windows of SSIM at the border of a picture or crop.
     """
     metrics = [(name, each) for name, each in (("perceptual", metric), (LPIPS, lpips)) if each is not None]
     rows: dict[str, dict[str, float]] = {name: {} for name in pictures}
@@ -104,7 +111,7 @@ def score_pictures(
         references = [(key, each, each.features(judged)) for key, each in metrics] if large else []
         for name, picture in pictures.items():
             image, row = crop_to(picture, box), rows[name]
-            row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut)
+            row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut, border)
             row[f"{prefix}l1"] = l1(image, cut)
             for key, each, reference in references:
                 row[f"{prefix}{key}"] = each.between(each.features(enlarged(image, least)), reference)

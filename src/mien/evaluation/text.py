@@ -24,6 +24,14 @@ def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
     return text
 
 
+def dataset_line(entry: Mapping[str, Any]) -> str:
+    """The figures of a dataset's protocol in one line, with what they are of."""
+    text = f"by the protocol of {entry['dataset_protocol']}: whole frame {_figures(entry)}"
+    if entry.get("lpips") is not None:
+        text += f" ({entry['lpips_backbone']})"
+    return f"{text}; pixels: {entry['mask']}; SSIM: {entry['ssim_window']}"
+
+
 def driven_line(entry: Mapping[str, Any]) -> str:
     """Cross-reenactment in one line, with the figures of an avatar that never moves for comparison."""
     text = f"cross_reenactment ({len(entry['drivers'])} drivers, {entry['frames']} frames): "

@@ -8,8 +8,13 @@ if TYPE_CHECKING:
     from mien.training.alignment import align
     from mien.training.alignment_settings import AlignmentSettings
     from mien.training.footage import (
+        BENCHMARK_SPLIT,
+        HIDDEN_CAMERAS,
         NAMED_SPLIT,
         OWN_SPLIT,
+        TEST_CAMERAS,
+        TEST_SEQUENCES,
+        TRAINING_CAMERA,
         NamedSplit,
         OwnSplit,
         Sequence,
@@ -21,6 +26,7 @@ if TYPE_CHECKING:
         read_own_split,
         read_sequence,
         split_by_name,
+        with_benchmark_split,
         with_named_split,
         with_own_split,
         write_own_split,
@@ -53,12 +59,17 @@ else:
 
 __all__ = [
     "AlignmentSettings",
+    "BENCHMARK_SPLIT",
+    "HIDDEN_CAMERAS",
     "MAIN_SETTINGS",
     "NAMED_SPLIT",
     "OWN_SPLIT",
     "PRESETS",
     "NamedSplit",
     "OwnSplit",
+    "TEST_CAMERAS",
+    "TEST_SEQUENCES",
+    "TRAINING_CAMERA",
     "Preset",
     "Sequence",
     "Split",
@@ -85,6 +96,7 @@ __all__ = [
     "run_camera",
     "split_by_name",
     "train",
+    "with_benchmark_split",
     "with_named_split",
     "with_own_split",
     "write_imported_run",

@@ -12,9 +12,10 @@ from mien.devices import DeviceName
 from mien.errors import UserError
 from mien.ranges import NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
-Split = Literal["blocks", "tail", "none", "gaussian-avatars", "dataset"]
+Split = Literal["blocks", "tail", "none", "gaussian-avatars", "nersemble-benchmark", "dataset"]
 """Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
-camera instead (`mien.training.footage.named_split`). dataset holds out what the authors of an imported dataset held out
+camera instead (`mien.training.footage.named_split`), and so does nersemble-benchmark
+(`mien.training.footage.benchmark_split`). dataset holds out what the authors of an imported dataset held out
 (`mien.training.footage.own_split`)."""
 
 
@@ -30,7 +31,8 @@ class TrainSettings:
     frames in one optimiser step, which then counts as so many."""
     split: Split = "blocks"
     """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
-    gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08. dataset is the
+    gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08.
+    nersemble-benchmark is that of the benchmark: four sequences, and all cameras but the frontal one. dataset is the
     split of an imported dataset's authors (docs/datasets.md)."""
     background: Literal["white", "mixed", "random", "auto"] = "auto"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,

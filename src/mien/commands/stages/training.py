@@ -18,6 +18,7 @@ from mien.training import (
     read_sequence,
     read_training_summary,
     train,
+    with_benchmark_split,
     with_named_split,
     with_own_split,
 )
@@ -39,6 +40,20 @@ def fill_in_named_split(workspace: Workspace, settings: TrainSettings, split: Na
         f"subject {split.subject} of GaussianAvatars: held out are the sequence {split.held_out} and camera "
         f"{', '.join(settings.held_out_cameras)}{left_out}"
     )
+    return settings
+
+
+def fill_in_benchmark_split(workspace: Workspace, settings: TrainSettings, names: list[str]) -> TrainSettings:
+    """The settings with what the NeRSemble benchmark holds out, after a message that says so.
+
+    Raises:
+        UserError: nothing of it is there, or the settings hold out something else.
+    """
+    cameras = {name: read_capture(workspace.sequence_dir(name) / "capture").camera_ids for name in names}
+    settings = with_benchmark_split(settings, names, cameras)
+    parts = {"sequences": settings.held_out_sequences, "cameras": settings.held_out_cameras}
+    words = [f"the {kind} {', '.join(part)}" for kind, part in parts.items() if part]
+    say(f"the benchmark's split: held out are {' and '.join(words)}")
     return settings
 
 

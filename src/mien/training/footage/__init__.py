@@ -5,6 +5,14 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mien.training.footage.benchmark_split import (
+        BENCHMARK_SPLIT,
+        HIDDEN_CAMERAS,
+        TEST_CAMERAS,
+        TEST_SEQUENCES,
+        TRAINING_CAMERA,
+        with_benchmark_split,
+    )
     from mien.training.footage.constants import FOOTAGE
     from mien.training.footage.coverage import (
         Coverage,
@@ -62,16 +70,21 @@ else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
+    "BENCHMARK_SPLIT",
     "Coverage",
     "DRIVING",
     "FOOTAGE",
     "Frame",
     "FrameOrder",
+    "HIDDEN_CAMERAS",
     "NAMED_SPLIT",
     "NamedSplit",
     "OWN_SPLIT",
     "OwnSplit",
     "Sequence",
+    "TEST_CAMERAS",
+    "TEST_SEQUENCES",
+    "TRAINING_CAMERA",
     "Target",
     "Targets",
     "side_random",
@@ -107,6 +120,7 @@ __all__ = [
     "representative_frames",
     "training_frames",
     "vertex_colors",
+    "with_benchmark_split",
     "with_named_split",
     "with_own_split",
     "with_shown_angles",

@@ -40,7 +40,8 @@ def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
     - `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
       training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one.
     - `tail`: the last 20 %, which may show things that were never seen.
-    - `none`, `gaussian-avatars` and `dataset`: nothing. The latter two hold out what is listed elsewhere.
+    - `none`, `gaussian-avatars`, `nersemble-benchmark` and `dataset`: nothing. The latter three hold out what is listed
+      elsewhere.
     """
     index = torch.arange(timesteps)
     if split == "blocks":
@@ -80,10 +81,13 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     """
     names = [sequence.name for sequence in sequences]
     check_held_out(names, settings)
-    if settings.split == "gaussian-avatars" and not (settings.held_out_sequences and settings.held_out_cameras):
+    held_out_names, held_out_ids = settings.held_out_sequences, settings.held_out_cameras
+    if (settings.split == "gaussian-avatars" and not (held_out_names and held_out_ids)) or (
+        settings.split == "nersemble-benchmark" and not (held_out_names or held_out_ids)
+    ):
         raise UserError(
-            "--split gaussian-avatars: the sequence and the camera to hold out are not filled in; train with `mien "
-            "train`, or give the result of mien.training.with_named_split"
+            f"--split {settings.split}: the sequence and the camera to hold out are not filled in; train with `mien "
+            "train`, or give the result of mien.training.with_named_split or with_benchmark_split"
         )
     ids = dict.fromkeys(camera_id for sequence in sequences for camera_id in sequence.capture.camera_ids)
     unknown = [camera_id for camera_id in settings.held_out_cameras if camera_id not in ids]

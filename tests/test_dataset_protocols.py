@@ -1,0 +1,211 @@
+"""Protocols of datasets: their splits by name, their pixels, their frames, their window of SSIM and their LPIPS."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import conv2d
+
+from evaluation_case import make_experiment
+from evaluation_rig import two_cameras, write_run, write_sequence
+from mien.capture import read_capture, read_capture_hash
+from mien.cli import main
+from mien.commands.evaluate import Protocol
+from mien.errors import UserError
+from mien.evaluation import EvaluationSettings, evaluate, scoring
+from mien.evaluation.dataset_protocols import DATASET_PROTOCOLS, dataset_protocol
+from mien.evaluation.load import load_experiments
+from mien.evaluation.metrics import ssim
+from mien.tracking import read_scoring, write_scoring
+from mien.training import OwnSplit, TrainSettings, with_benchmark_split, write_own_split
+from plain_settings import plain_run
+from test_named_split import asked, write_subject  # noqa: F401
+
+FRONTAL = "222200037"
+SEQUENCES = ("EMO-1-shout+laugh", "EXP-2-eyes", "FREE", "SEN-01-cramp_small_danger", "SEN-10-port_strong_smokey")
+TESTS = (SEQUENCES[0], "FREE", SEQUENCES[4])
+SPLIT = TrainSettings(split="nersemble-benchmark")
+
+
+# -- the benchmark's split ---------------------------------------------------------------------------------------------
+
+
+def test_the_monocular_task_holds_out_its_test_sequences_and_all_cameras_but_the_frontal_one() -> None:
+    ids = dict.fromkeys(SEQUENCES, (FRONTAL, "222200046", "222200036"))
+    filled = with_benchmark_split(SPLIT, SEQUENCES, ids)
+    assert filled.held_out_sequences == TESTS
+    assert filled.held_out_cameras == ("222200046", "222200036")
+    assert with_benchmark_split(filled, SEQUENCES, ids) == filled, "the config of a run can be repeated"
+    short = ("306_EMO-1", "306_EMO-10", "EXP-2", "FREEZE", "SEN-9", "sen")
+    filled = with_benchmark_split(SPLIT, short, dict.fromkeys(short, (FRONTAL,)))
+    assert filled.held_out_sequences == ("306_EMO-1", "SEN-9")
+
+
+def test_the_task_of_novel_views_holds_out_the_hidden_cameras() -> None:
+    filled = with_benchmark_split(SPLIT, ["HAIR"], {"HAIR": ("222200036", FRONTAL, "222200039")})
+    assert filled.held_out_sequences == ()
+    assert filled.held_out_cameras == (FRONTAL, "222200039")
+
+
+@pytest.mark.parametrize(
+    ("names", "cameras", "settings", "words"),
+    [
+        (["FREE"], (FRONTAL,), SPLIT, "holds out all of FREE, and nothing is left"),
+        (["FREE", "HAIR"], ("222200046",), SPLIT, f"trains on camera {FRONTAL}, and there are 222200046"),
+        (["HAIR"], (FRONTAL, "222200046"), SPLIT, "trains on a camera besides"),
+        (["HAIR", "EXP-1-head"], ("222200036",), SPLIT, "publishes none; train with --split none, and write the"),
+        (["FREE", "HAIR"], (FRONTAL,), replace(SPLIT, held_out_sequences=("HAIR",)), "--hold-out HAIR: --split nersem"),
+        (["FREE", "HAIR"], (FRONTAL,), replace(SPLIT, held_out_cameras=("x",)), "--hold-out-cameras x: --split nersem"),
+    ],
+)
+def test_what_the_benchmark_cannot_hold_out_is_told(
+    names: list[str], cameras: tuple[str, ...], settings: TrainSettings, words: str
+) -> None:
+    with pytest.raises(UserError) as told:
+        with_benchmark_split(settings, names, dict.fromkeys(names, cameras))
+    assert words in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_train_takes_it_by_name(tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    root = write_subject(tmp_path / "393", SEQUENCES, FRONTAL)
+    assert main(["train", str(root), "--split", "nersemble-benchmark"]) == 0
+    names, settings = asked.pop()
+    assert tuple(names) == SEQUENCES
+    assert (settings.held_out_sequences, settings.held_out_cameras) == (TESTS, ("09",))
+    shown = capsys.readouterr().err
+    assert f"held out are the sequences {', '.join(TESTS)} and the cameras 09" in shown
+    line = ["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "new"), "--split", "nersemble-benchmark"]
+    assert main(line) == 2
+    assert "needs several sequences" in capsys.readouterr().err
+
+
+# -- metrics -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_protocol_can_be_asked_for() -> None:
+    assert {each.name for each in DATASET_PROTOCOLS} == set(get_args(Protocol))
+
+
+def test_windows_inside_the_picture_by_another_formula() -> None:
+    random = torch.Generator().manual_seed(1)
+    first, second = torch.rand(2, 40, 33, 3, generator=random, dtype=torch.float64)
+    offsets = torch.arange(-5, 6, dtype=torch.float64)
+    line = (-(offsets**2) / (2 * 1.5**2)).exp()
+    window = (line[:, None] * line / line.sum() ** 2)[None, None]
+
+    def mean(image: torch.Tensor) -> torch.Tensor:
+        return conv2d(image.permute(2, 0, 1)[:, None], window)  # no padding
+
+    x, y = mean(first), mean(second)
+    spread_x, spread_y = mean(first * first) - x * x, mean(second * second) - y * y
+    shared = mean(first * second) - x * y
+    wanted = ((2 * x * y + 1e-4) * (2 * shared + 9e-4)) / ((x * x + y * y + 1e-4) * (spread_x + spread_y + 9e-4))
+    assert wanted.shape[2:] == (30, 23)
+    assert ssim(first.float(), second.float(), "inside") == pytest.approx(float(wanted.mean()), abs=1e-5)
+    assert abs(ssim(first.float(), second.float()) - float(wanted.mean())) > 1e-4, "zeros beyond the border differ"
+    small = first[:10].float(), second[:10].float()
+    assert ssim(*small, "inside") == ssim(*small)
+
+
+def test_lpips_by_the_network_of_other_papers_is_refused(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mien.evaluation import dataset_protocols
+
+    monkeypatch.setattr(dataset_protocols, "lpips_metric", lambda settings: SimpleNamespace(backbone="lpips-vgg"))
+    settings = EvaluationSettings(protocol="imavatar", lpips_weights=Path("vgg16.pth"))
+    with pytest.raises(UserError, match="gives lpips-vgg, and --protocol imavatar reports lpips-alex"):
+        evaluate(root / "runs" / "views", [root / "sequences" / "EXP-2-eyes"], settings)
+    dataset_protocols.check_lpips(dataset_protocol("insta"), settings)
+
+
+# -- pixels and frames -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a workspace of two sequences with two cameras, and a run that holds out FREE and the camera `side`."""
+    root = tmp_path_factory.mktemp("person") / "393"
+    experiment = make_experiment(10)
+    folders = [write_sequence(root, experiment, two_cameras(experiment, name)) for name in ("EXP-2-eyes", "FREE")]
+    settings = plain_run(steps=2, record_every=1, checkpoint_every=2, split="nersemble-benchmark")
+    held = replace(settings, held_out_sequences=("FREE",), held_out_cameras=("side",))
+    write_run(root / "runs" / "views", experiment, folders, held)
+    return root
+
+
+def imported(folder: Path, dataset: str) -> None:
+    write_own_split(folder, OwnSplit(), {"imported": {"dataset": dataset, "from": "there"}})
+
+
+def test_the_benchmark_counts_test_sequences_in_its_four_cameras(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mien.evaluation import dataset_protocols
+
+    folders = [root / "sequences" / name for name in ("EXP-2-eyes", "FREE")]
+    for folder in folders:
+        imported(folder, "nersemble-benchmark")
+    assert set(load_experiments(root / "runs" / "views", folders)) == {"self_reenactment_sequence", "novel_view"}
+    monkeypatch.setattr(dataset_protocols, "TEST_CAMERAS", ("front",))
+    found = load_experiments(root / "runs" / "views", folders, "filmed", "nersemble-benchmark")
+    assert set(found) == {"self_reenactment_sequence"}
+    experiment = found["self_reenactment_sequence"]
+    assert {(frame.sequence, frame.camera) for frame in experiment.held_out_frames} == {(1, 0)}
+    assert len(experiment.held_out_frames) == 10
+    assert experiment.whole_mattes
+    with pytest.raises(
+        UserError, match="split nersemble-benchmark, and --protocol vhap needs the split of the dataset"
+    ):
+        for folder in folders:
+            imported(folder, "vhap")
+        load_experiments(root / "runs" / "views", folders, "filmed", "vhap")
+
+
+def test_raw_recordings_are_cut_at_the_neck_line(root: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(root, tmp_path / "393"))
+    folders, run = [root / "sequences" / name for name in ("EXP-2-eyes", "FREE")], root / "runs" / "views"
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["split"] = "gaussian-avatars"
+    from mien.files import write_json
+
+    content = {name: value for name, value in config.items() if name not in ("format", "version", "checksum")}
+    write_json(run / "config.json", config["format"], config["version"], content)
+    for folder in folders:
+        imported(folder, "nersemble")
+    with pytest.raises(
+        UserError, match=r"are cut at a plane.*delete .*scoring and run `mien track` with --scoring.cut"
+    ):
+        load_experiments(run, folders, "filmed", "nersemble")
+    for folder in folders:
+        found = read_scoring(folder / "scoring", read_capture_hash(folder / "capture"))
+        masks = np.asarray(found.masks).copy()
+        masks[..., masks.shape[2] // 2 :, :] = 0
+        shutil.rmtree(folder / "scoring")
+        write_scoring(
+            folder / "scoring", replace(found, masks=masks, cut="line"), read_capture_hash(folder / "capture")
+        )
+    settings = EvaluationSettings(
+        perceptual=False, baselines=False, video_frames=0, edges="filmed", protocol="nersemble"
+    )
+    protocols = evaluate(run, folders, settings)["protocols"]
+    assert set(protocols) == {"self_reenactment_sequence", "novel_view"}
+    assert protocols["novel_view"]["mask"].startswith("frozen scoring mask: matte above the neck line")
+    assert protocols["novel_view"]["dataset_protocol"] == "nersemble"
+    imported(folders[1], "vhap")
+    with pytest.raises(UserError, match="was trained on nersemble and vhap, whose pixels are not scored alike"):
+        load_experiments(run, folders, "filmed", "nersemble")
+
+
+def test_the_border_of_the_protocol_is_scored_and_told(root: Path, tmp_path: Path) -> None:
+    border = {each.name: EvaluationSettings(protocol=each.name).border for each in DATASET_PROTOCOLS}
+    assert border == {**dict.fromkeys(border, "zeros"), "imavatar": "inside"}
+    assert EvaluationSettings().border == "zeros"
+    image, truth = torch.rand(2, 30, 30, 3, generator=torch.Generator().manual_seed(0))
+    rows = [scoring.score_pictures({"a": image}, truth, None, None, border=each)["a"] for each in ("zeros", "inside")]
+    assert rows[0]["ssim"] != rows[1]["ssim"]
+    assert rows[0]["psnr"] == rows[1]["psnr"]
+    assert read_capture(root / "sequences" / "FREE" / "capture").camera_ids == ("front", "side")
