@@ -47,7 +47,7 @@ DATASET_PROTOCOLS = (
     DatasetProtocol("nerface", ("nerface",)),
     DatasetProtocol("nerf-blendshape", ("nerf-blendshape",)),
 )
-"""`insta`: RGBAvatar. `imavatar`: MonoGaussianAvatar. `nersemble`: GaussianAvatars. docs/datasets.md has the details."""
+"""`insta` is that of RGBAvatar, `imavatar` that of MonoGaussianAvatar, `nersemble` that of GaussianAvatars."""
 
 
 def dataset_protocol(name: str) -> DatasetProtocol:
@@ -64,8 +64,8 @@ def check_lpips(protocol: DatasetProtocol, settings: ScoreSettings) -> None:
     metric = lpips_metric(settings)
     if metric is not None and metric.backbone not in protocol.lpips:
         raise UserError(
-            f"--lpips-weights {settings.lpips_weights}: gives {metric.backbone}, and --protocol {protocol.name} reports "
-            f"{' or '.join(protocol.lpips)}; give the other file, or leave --protocol out"
+            f"--lpips-weights {settings.lpips_weights}: gives {metric.backbone}, and --protocol {protocol.name} "
+            f"reports {' or '.join(protocol.lpips)}; give the other file, or leave --protocol out"
         )
 
 
@@ -95,13 +95,15 @@ def scores_whole_mattes(protocol: DatasetProtocol, run_dir: Path, folders: Mappi
     for folder in cut:
         if folders[folder].cut != "line":
             raise UserError(
-                f"{folder}: its scoring masks are cut at a plane, and --protocol {protocol.name} cuts at the neck line; "
-                f"delete {folder / 'scoring'} and run `mien track` with --scoring.cut line"
+                f"{folder}: its scoring masks are cut at a plane, and --protocol {protocol.name} cuts at the neck "
+                f"line; delete {folder / 'scoring'} and run `mien track` with --scoring.cut line"
             )
     if cut and len(cut) < len(found):
         other = next(folder for folder in found if folder not in cut)
-        raise UserError(f"{run_dir}: was trained on {found[cut[0]]} and {found[other]}, whose pixels are not scored alike; "
-                        "train on one of them")  # fmt: skip
+        raise UserError(
+            f"{run_dir}: was trained on {found[cut[0]]} and {found[other]}, whose pixels are not scored alike; train on "
+            "one of them"
+        )
     return not cut
 
 
