@@ -157,11 +157,11 @@ def test_the_benchmark_counts_test_sequences_in_its_four_cameras(root: Path, mon
     assert {(frame.sequence, frame.camera) for frame in experiment.held_out_frames} == {(1, 0)}
     assert len(experiment.held_out_frames) == 10
     assert experiment.whole_mattes
+    for folder in folders:
+        imported(folder, "vhap")
     with pytest.raises(
         UserError, match="split nersemble-benchmark, and --protocol vhap needs the split of the dataset"
     ):
-        for folder in folders:
-            imported(folder, "vhap")
         load_experiments(root / "runs" / "views", folders, "filmed", "vhap")
 
 

@@ -101,8 +101,8 @@ def scores_whole_mattes(protocol: DatasetProtocol, run_dir: Path, folders: Mappi
     if cut and len(cut) < len(found):
         other = next(folder for folder in found if folder not in cut)
         raise UserError(
-            f"{run_dir}: was trained on {found[cut[0]]} and {found[other]}, whose pixels are not scored alike; train on "
-            "one of them"
+            f"{run_dir}: was trained on {found[cut[0]]} and {found[other]}, whose pixels are not scored alike; train "
+            "on one of them"
         )
     return not cut
 

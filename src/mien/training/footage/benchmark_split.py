@@ -45,7 +45,8 @@ def with_benchmark_split(
     ids = tuple(dict.fromkeys(camera for name in names for camera in camera_ids[name]))
     if len(tests) == len(names):
         raise UserError(
-            f"--split {BENCHMARK_SPLIT}: holds out all of {', '.join(names)}, and nothing is left to train on; {_BY_HAND}"
+            f"--split {BENCHMARK_SPLIT}: holds out all of {', '.join(names)}, and nothing is left to train on; "
+            f"{_BY_HAND}"
         )
     cameras = tuple(camera for camera in ids if (camera != TRAINING_CAMERA if tests else camera in HIDDEN_CAMERAS))
     if len(cameras) == len(ids):
@@ -54,15 +55,15 @@ def with_benchmark_split(
     if not tests and not cameras:
         raise UserError(
             f"--split {BENCHMARK_SPLIT}: there is no test sequence (FREE, EMO-1, SEN-09, SEN-10) and no camera "
-            f"{', '.join(HIDDEN_CAMERAS)} to hold out, because the benchmark publishes none; train with --split none, and "
-            "write the submission with `mien export --format nersemble-benchmark`"
+            f"{', '.join(HIDDEN_CAMERAS)} to hold out, because the benchmark publishes none; train with --split none, "
+            "and write the submission with `mien export --format nersemble-benchmark`"
         )
-    for option, given, held_out in (
-        ("--hold-out", settings.held_out_sequences, tests), ("--hold-out-cameras", settings.held_out_cameras, cameras),
-    ):  # fmt: skip
-        other = [name for name in given if name not in held_out]
-        if other:
-            raise UserError(
-                f"{option} {other[0]}: --split {BENCHMARK_SPLIT} decides what is held out; leave {option} out"
-            )
+    _check_own("--hold-out", settings.held_out_sequences, tests)
+    _check_own("--hold-out-cameras", settings.held_out_cameras, cameras)
     return replace(settings, held_out_sequences=tests, held_out_cameras=cameras)
+
+
+def _check_own(option: str, given: Sequence[str], held_out: Sequence[str]) -> None:
+    other = [name for name in given if name not in held_out]
+    if other:
+        raise UserError(f"{option} {other[0]}: --split {BENCHMARK_SPLIT} decides what is held out; leave {option} out")
