@@ -18,6 +18,8 @@ from mien.workspace import open_workspace
 if TYPE_CHECKING:
     from mien.formats import Options
 
+SUBMISSION = "nersemble-benchmark"
+"""Name for `--format` of the benchmark's submission folder."""
 CaptureSplit = Literal["blocks", "tail", "none", "dataset"]
 """Names of what may be held out of a capture without a run."""
 _REFUSED = {
@@ -54,7 +56,8 @@ def _about_format() -> str:
         f"Name of the format of an avatar: {_any_of(each.name for each in formats())} (default: by the ending of "
         "--out). gaussian-avatars is a folder with point_cloud.ply, whose Gaussians are bound to triangles, and "
         "flame_param.npz with all timesteps of the run's training. Or the layout of a capture, which is a tracked "
-        f"sequence and not an avatar, for programs that train elsewhere: {_any_of(_layouts())} (docs/datasets.md)."
+        f"sequence and not an avatar, for programs that train elsewhere: {_any_of(_layouts())} (docs/datasets.md). Or "
+        f"{SUBMISSION}: a folder of videos that the benchmark of that name scores."
     )
 
 
@@ -76,7 +79,7 @@ class Command:
     """Write an avatar: .mien (all of it), .html and .packed (for pages), .glb (for engines), a pose, or a folder.
 
     With --format insta, imavatar, nerface or nersemble, write a tracked capture instead, for programs that train
-    elsewhere.
+    elsewhere. With --format nersemble-benchmark, write the videos that the NeRSemble benchmark asks for.
     """
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), Described(_about_workspace)]
@@ -121,6 +124,9 @@ class Command:
     split: CaptureSplit | None = None
     """For a capture without --run: the split, as for `mien train` (default: that of the dataset that it was imported
     from, or blocks)."""
+    benchmark: Path | None = None
+    """For --format nersemble-benchmark: the person's folder of the NeRSemble benchmark, whose name is a number. --out
+    is the submission folder, and takes the people one after the other."""
     mattes: MatteKind | None = None
     """For a capture: mattes of the head above the cut at the neck, which mien trains on and scores, or of the whole
     person (default: head)."""
@@ -129,6 +135,13 @@ class Command:
         """Check options and paths without heavy libraries."""
         from mien.files import check_writable
 
+        if self.format == SUBMISSION:
+            self._check_submission()
+            return
+        if self.benchmark is not None:
+            raise UserError(
+                f"--benchmark {self.benchmark}: is for --format {SUBMISSION}; give that too, or leave it out"
+            )
         layout = find_layout(self.format)
         if layout is not None:
             self._check_capture(layout)
@@ -165,6 +178,13 @@ class Command:
 
     def run(self) -> None:
         """Pose the avatar and write the files, or write the capture."""
+        if self.format == SUBMISSION:
+            from mien.commands.stages.exporting_benchmark import export_submission
+
+            workspace = open_workspace(self.workspace)
+            assert self.benchmark is not None
+            export_submission(workspace, workspace.pick_run(self.run_name), self.benchmark, self.out)
+            return
         layout = find_layout(self.format)
         if layout is not None:
             self._export_capture(layout)
@@ -186,13 +206,7 @@ class Command:
         """Check the options and paths of a capture."""
         from mien.datasets.layouts import check_new_folder
 
-        given = {
-            "--set": self.set, "--series": self.series, "--neutral": self.neutral, "--every": self.every != 1,
-            "--sh": self.sh is not None, "--spz-version": self.spz_version, "--webgpu": self.webgpu,
-            "--webcam": self.webcam, "--webcam-model": self.webcam_model, "--title": self.title,
-            "--address": self.address, "--sharp-cut": self.sharp_cut,
-        }  # fmt: skip
-        other = next((option for option, value in given.items() if value), None)
+        other = self._option_of_avatars()
         if other is not None:
             raise UserError(f"{other}: is for avatars, and --format {layout.name} writes a capture; leave {other} out")
         if self.run_name is not None and self.split is not None:
@@ -210,6 +224,51 @@ class Command:
                 f"run {shlex.join(['mien', 'track', str(self.workspace)])}"
             )
         check_new_folder(self.out)
+
+    def _check_submission(self) -> None:
+        """Check the options and paths of a submission to the benchmark."""
+        from mien.files import check_writable
+
+        given = {"--sequence": self.sequence, "--split": self.split, "--mattes": self.mattes}
+        other = self._option_of_avatars() or next((option for option, value in given.items() if value), None)
+        if other is not None:
+            raise UserError(
+                f"{other}: is not for --format {SUBMISSION}, which renders what the benchmark asks for; leave {other} out"
+            )
+        if self.benchmark is None:
+            raise UserError(
+                f"--format {SUBMISSION}: needs the person's folder of the benchmark; give it with --benchmark"
+            )
+        if not (self.benchmark / "calibration" / "camera_params.json").is_file():
+            raise UserError(
+                f"--benchmark {self.benchmark}: has no calibration/camera_params.json; give the folder of a person of the "
+                "benchmark"
+            )
+        name = self.benchmark.resolve().name
+        if not (name.isascii() and name.isdigit() and len(name) <= 3):
+            raise UserError(
+                f"--benchmark {self.benchmark}: its name is not the number of a person, such as 393; give the folder under "
+                "that name"
+            )
+        if self._is_file():
+            raise UserError(
+                f"{self.workspace}: holds an avatar, and --format {SUBMISSION} needs its run; give the folder of a "
+                "workspace"
+            )
+        open_workspace(self.workspace).pick_run(self.run_name)
+        check_writable(self.out, folder=True)
+        if (self.out / name.zfill(3)).exists():
+            raise UserError(f"{self.out / name.zfill(3)}: is there already; delete it, or give another --out")
+
+    def _option_of_avatars(self) -> str | None:
+        """The first option that is given, and is only for files of avatars."""
+        given = {
+            "--set": self.set, "--series": self.series, "--neutral": self.neutral, "--every": self.every != 1,
+            "--sh": self.sh is not None, "--spz-version": self.spz_version, "--webgpu": self.webgpu,
+            "--webcam": self.webcam, "--webcam-model": self.webcam_model, "--title": self.title,
+            "--address": self.address, "--sharp-cut": self.sharp_cut,
+        }  # fmt: skip
+        return next((option for option, value in given.items() if value), None)
 
     def _export_capture(self, layout: Layout) -> None:
         from mien.commands.stages.exporting_capture import export_capture, settings_of

@@ -13,6 +13,7 @@ from mien.datasets.content import REMEDY, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.datasets.nersemble import FRONTAL, read_cameras
 from mien.errors import UserError
+from mien.training import HIDDEN_CAMERAS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,15 +21,11 @@ if TYPE_CHECKING:
     from mien.face import FaceModel
     from mien.training import OwnSplit
 
-_VERSION = "FLAME 2023 (flame2023.pkl)"
+VERSION = "FLAME 2023 (flame2023.pkl)"
 TRACKING = "flame2023_tracking_v2.npz"
 TEST_ENDING = "-test"
 """End of the names of sequences that `mien export` writes of held-out frames. The benchmark itself has none."""
-_FPS_MONO, _FPS_VIEWS = 24.3, 73.0
-TEST_SEQUENCES = ("FREE", "EMO-1-shout+laugh", "SEN-09-frown_events_bad", "SEN-10-port_strong_smokey")
-"""Sequences of the monocular task that are to be rendered. They have tracking only."""
-HIDDEN_CAMERAS = ("222200046", "222200037", "222200039")
-"""Cameras of the task of novel views whose pictures are not published."""
+FPS_MONO, FPS_VIEWS = 24.3, 73.0
 _MAX_ANGLE = 1e-4
 """Largest difference of the two forms of a rotation."""
 
@@ -173,7 +170,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     if not folders:
         yield from _read_pictures(path)
         return
-    model = needed_flame(path, face_model, _VERSION)
+    model = needed_flame(path, face_model, VERSION)
     for folder in folders:
         file = folder / "tracking" / TRACKING
         is_file_inside(path, file)
@@ -190,8 +187,8 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
         face = carried(face_of_flame(file, model, flame), turns, shifts / scale)
         face = in_front(face, np.repeat(viewmat[None], len(face), 0))
         camera = {serials[0]: camera_of(known[serials[0]].K.double().numpy(), FRONT, size)}
-        sequence = tracked_sequence(file, folder.name, images[:, :1], mattes[:, :1], camera, model, face, _FPS_MONO)
-        yield replace(check_overlay(file, sequence, _VERSION), own_split=_own_split(folder, len(face)))
+        sequence = tracked_sequence(file, folder.name, images[:, :1], mattes[:, :1], camera, model, face, FPS_MONO)
+        yield replace(check_overlay(file, sequence, VERSION), own_split=_own_split(folder, len(face)))
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
@@ -203,7 +200,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         unknown = [serial for serial in serials if serial not in known]
         if unknown:
             raise UserError(f"{path}: its calibration has no camera {unknown[0]}; {REMEDY}")
-        fps = _FPS_VIEWS if len(serials) > 1 else _FPS_MONO
+        fps = FPS_VIEWS if len(serials) > 1 else FPS_MONO
         sequence = filmed_sequence(
             folder, folder.name, images, mattes, {serial: known[serial] for serial in serials}, fps
         )

