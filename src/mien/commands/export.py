@@ -233,7 +233,8 @@ class Command:
         other = self._option_of_avatars() or next((option for option, value in given.items() if value), None)
         if other is not None:
             raise UserError(
-                f"{other}: is not for --format {SUBMISSION}, which renders what the benchmark asks for; leave {other} out"
+                f"{other}: is not for --format {SUBMISSION}, which renders what the benchmark asks for; leave "
+                f"{other} out"
             )
         if self.benchmark is None:
             raise UserError(
@@ -241,14 +242,14 @@ class Command:
             )
         if not (self.benchmark / "calibration" / "camera_params.json").is_file():
             raise UserError(
-                f"--benchmark {self.benchmark}: has no calibration/camera_params.json; give the folder of a person of the "
-                "benchmark"
+                f"--benchmark {self.benchmark}: has no calibration/camera_params.json; give the folder of a person of "
+                "the benchmark"
             )
         name = self.benchmark.resolve().name
         if not (name.isascii() and name.isdigit() and len(name) <= 3):
             raise UserError(
-                f"--benchmark {self.benchmark}: its name is not the number of a person, such as 393; give the folder under "
-                "that name"
+                f"--benchmark {self.benchmark}: its name is not the number of a person, such as 393; give the folder "
+                "under that name"
             )
         if self._is_file():
             raise UserError(
