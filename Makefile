@@ -11,7 +11,7 @@ UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native kills mutate lint format docs release elsewhere bench gpu batch-engines lock clean
+.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -110,6 +110,11 @@ fuzz: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
 	  --lines 300 --heavy 10 --viewer 200 --findings out/fuzz/findings.jsonl
 	$(MAKE) fuzz-native
+
+# FAULTS faults in each layout that `mien import` reads, layouts side by side.
+FAULTS ?= 2000
+fuzz-datasets: setup
+	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_THREADS=1 $(BIN)/pytest -q -n auto --dist load --timeout 0 tests/test_datasets_fuzz.py
 
 # Commands that are killed at random moments and run again, until there are KILLS kills; findings go to out/fuzz/kills.jsonl.
 KILLS ?= 200

@@ -1,10 +1,12 @@
-"""Random damage to every file of every dataset: one line of complaint, or content that can be written.
+"""Random faults in every layout of a dataset: one line of complaint, or content that can be written.
 
-MIEN_DATASET_FUZZ=2000 damages each layout so often. Nothing outside the output may change, and no pickle may run.
+`make fuzz-datasets` makes 2,000 in each layout. Nothing outside the output may change, and no pickle may run. Some are
+damage to a file of any kind; others have a meaning: a missing camera, another FLAME (`fuzzing.dataset_faults`).
 """
 
 import os
 import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,16 +32,20 @@ from dataset_writers import (
     write_vhap,
 )
 from flame_like import write_npz
+from fuzzing.dataset_faults import faulty_dataset
 from fuzzing.faults import Place, faulty_file, faulty_place
 from fuzzing.material import tiny_flame
+from mien.cli import main
 from mien.datasets import Footage, datasets, matting, overlay, sequences, write_sequence
 from mien.errors import UserError
-from mien.face import Landmarks
+from mien.face import FaceModel, Landmarks, add_face_model
 from mien.face.flame import flame_face_model, read_flame
 from mien.training import read_own_split
 
-CASES = int(os.environ.get("MIEN_DATASET_FUZZ", "40"))
+CASES = int(os.environ.get("MIEN_DATASET_FUZZ", "20"))
 SIDE = 32
+_BY_COMMAND = 5
+"""One of so many cases is run as the command `mien import`, the others as the functions that it calls."""
 
 LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     "insta": write_insta,
@@ -94,7 +100,16 @@ def tiny_scene(folder: Path) -> Scene:
     return scene_of(arrays, replace(model, landmarks={"mediapipe": marks}), 6)
 
 
-def used(path: Path, scene: Scene, out: Path) -> None:
+def another_flame(scene: Scene) -> FaceModel:
+    """Return a head of another version: as many vertices, with other bases and in another order."""
+    arrays = {**scene.arrays, "shapedirs": 40 * np.roll(scene.arrays["shapedirs"], 31, 0)}
+    arrays |= {"v_template": np.roll(scene.arrays["v_template"], 31, 0), "weights": np.roll(arrays["weights"], 31, 0)}
+    arrays |= {"f": (scene.arrays["f"] + 31) % len(arrays["weights"])}
+    path = write_npz(Path(tempfile.mkdtemp()) / "other.npz", arrays)
+    return replace(flame_face_model(read_flame(path), "other"), landmarks=scene.model.landmarks)
+
+
+def used(path: Path, model: FaceModel, out: Path) -> None:
     """Read and write a dataset as `mien import` does.
 
     Raises:
@@ -106,7 +121,7 @@ def used(path: Path, scene: Scene, out: Path) -> None:
     assert len(known) == 1, [each.name for each in known]
     assert known[0].survey is not None
     known[0].survey(path)
-    for sequence in known[0].read(path, scene.model):  # type: ignore[union-attr]
+    for sequence in known[0].read(path, model):  # type: ignore[union-attr]
         if isinstance(sequence, Footage):
             continue
         folder = out / "sequences" / sequence.capture.name
@@ -114,27 +129,47 @@ def used(path: Path, scene: Scene, out: Path) -> None:
         read_own_split(folder)
 
 
+def complaint_of(command: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Run a command, and return its complaint without its beginning; nothing if it succeeds."""
+    capsys.readouterr()
+    code = main(command)
+    told = capsys.readouterr().err
+    lines = [line for line in told.splitlines() if line.startswith("mien: ")]
+    assert "Traceback" not in told
+    assert (code, len(lines)) in ((0, 0), (2, 1)), (code, told)
+    return "".join(lines).removeprefix("mien: ")
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_damage_is_told_in_one_line(layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damage_is_told_in_one_line(
+    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     scene = tiny_scene(tmp_path)
+    models = {model.name: model for model in (scene.model, another_flame(scene))}
+    for model in models.values():
+        add_face_model(model, Path("tiny.npz"), "0")
     material = LAYOUTS[layout](tmp_path / "material", scene)
-    used(material, scene, tmp_path / "whole")
+    used(material, scene.model, tmp_path / "whole")
     canary = tmp_path / "canary"
-    canary.mkdir()
-    (canary / "file").write_text("a secret")
     refused = 0
     for seed in range(CASES):
         dice, root, out = Random(f"{layout} {seed}"), tmp_path / f"case{seed}", tmp_path / f"out{seed}"
         shutil.copytree(material, root)
-        file = dice.choice(sorted(each for each in root.rglob("*") if each.is_file()))
-        fault = dice.choice([faulty_file, faulty_file, faulty_file, faulty_place])
-        told = fault(Place(root, file, canary, 9), dice)
+        canary.mkdir()
+        (canary / "file").write_text("a secret")
+        told = one_fault(root, canary, dice)
+        name = "other" if dice.random() < 0.1 else "tiny"
         complaint, before = "", tree_bytes(canary)  # some faults move the file there
+        around = {each.name for each in tmp_path.iterdir()}
         try:
-            used(root, scene, out)
+            if seed % _BY_COMMAND == 0:
+                complaint = complaint_of(["import", str(root), "--out", str(out), "--face-model", name], capsys)
+            else:
+                used(root, models[name], out)
         except UserError as error:
             complaint = str(error)
         except Exception as error:
@@ -143,6 +178,16 @@ def test_damage_is_told_in_one_line(layout: str, tmp_path: Path, monkeypatch: py
         assert "\n" not in complaint, (seed, told, complaint)
         assert len(complaint) < 1000, (seed, told, complaint)
         assert tree_bytes(canary) == before, (seed, told)
-        shutil.rmtree(root)
-        shutil.rmtree(out, ignore_errors=True)
-    assert refused > CASES / 10, "faults that nobody notices"
+        assert {each.name for each in tmp_path.iterdir()} - {out.name} == around, (seed, told)
+        for place in (root, tmp_path / f"case{seed}-aside", canary, out):
+            shutil.rmtree(place, ignore_errors=True)
+    assert refused > CASES / 5, "faults that nobody notices"
+
+
+def one_fault(root: Path, canary: Path, dice: Random) -> str:
+    """Damage a file of any kind, or make a fault with a meaning. Return what it is."""
+    if dice.random() < 0.5:
+        return faulty_dataset(root, canary, dice)
+    file = dice.choice(sorted(each for each in root.rglob("*") if each.is_file()))
+    fault = dice.choice([faulty_file, faulty_file, faulty_file, faulty_place])
+    return fault(Place(root, file, canary, 9), dice)
