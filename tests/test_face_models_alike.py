@@ -1,4 +1,4 @@
-"""One suite over face models of all schemas: mesh, regions, joints, landmarks, gradients, training, driving."""
+"""One suite over face models of all schemas: mesh, regions, joints, landmarks, gradients, tracking, avatars, driving."""
 
 import shutil
 from dataclasses import replace
@@ -21,8 +21,9 @@ from mien.face.cache import cache_folder
 from mien.face.chart import find_outside
 from mien.face.checks import check_face_model
 from mien.render import render_mesh
-from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
-from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS
+from mien.tracking import Scoring, Tracking, TrackingSettings, track, write_scoring, write_tracking
+from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS, read_response
+from mien.tracking.settings import PhotometricSettings
 from mien.training import read_sequence, train
 
 UPPER_LIP, LOWER_LIP, CHIN, NOSE, CORNER_LEFT, CORNER_RIGHT = 13, 14, 152, 4, 291, 61
@@ -143,6 +144,45 @@ def _moving(model: FaceModel, timesteps: int) -> FaceParams:
         head_rotation=torch.stack([0.1 * (5 * time).sin(), 0.3 * (4 * time).cos(), 0.05 * time], 1),
         head_translation=torch.tensor([0.0, 0.0, -0.9]).expand(timesteps, 3),
     )
+
+
+def _as_detected(model: FaceModel, face: FaceParams) -> Tensor:
+    """Landmarks in the world, with the offsets that the detector was measured to have on this model.
+
+    Only anny was measured. Its fit takes these offsets away, so landmarks without them are not those of a picture.
+    """
+    response, double = read_response(model, TrackingSettings.bias_sigma), face.to(torch.zeros((), dtype=torch.float64))
+    offsets = response.mean + response.of_turns(double.head_rotation)
+    offsets = offsets + torch.einsum("be,elc->blc", double.expression, response.by_expression)
+    pose = double.T_world_head
+    return (_marks(model, face).double() + offsets) @ pose[:, :3, :3].transpose(1, 2) + pose[:, None, :3, 3]
+
+
+def test_a_small_capture_is_tracked(model: FaceModel) -> None:
+    """Pictures of 256 pixels and their landmarks give back turns, the opening of the mouth and the size of the head."""
+    face, size, timesteps = _moving(model, 8), 256, 8
+    K = torch.tensor([[390.0, 0, 128], [0, 390.0, 128], [0, 0, 1]])
+    camera = Camera(K, torch.diag(torch.tensor([1.0, -1, -1, 1])), size, size)
+    colors = torch.tensor([0.8, 0.5, 0.4]) * (0.6 + 4 * model.template[:, 1:2].abs())
+    drawn = [render_mesh(v, model.faces, camera, colors, background=(0.3, 0.4, 0.6)) for v in model(face)]
+    images = np.stack([(255 * image.clamp(0, 1)).byte().numpy() for image, _ in drawn])[:, None]
+    mattes = np.stack([(255 * alpha.clamp(0, 1)).byte().numpy() for _, alpha in drawn])[:, None]
+    pixels = camera.project(_as_detected(model, face).float())[0].numpy()[:, None]
+    capture = Capture(
+        name="clip", camera_ids=("0",), fps=25.0, timestamps=np.arange(timesteps) / 25.0, images=images, mattes=mattes,
+        landmarks=pixels, valid=np.ones((timesteps, 1), bool), principal_point=np.full((1, 2), 128.0, np.float32),
+        source={},
+    )  # fmt: skip
+    pixel_fit = PhotometricSettings(sizes=(128,), texture_size=64, texture_frames=8, shared_steps=1, keyframes=4)
+    tracking = track(capture, model, TrackingSettings(focal=390.0, keyframes=8, photometric=pixel_fit))
+    assert tracking.pixel_residuals is not None
+    assert tracking.residuals.nanmedian() < 0.5
+    turn = torch.stack([tracking.face.head_rotation[:, 1], face.head_rotation[:, 1]]).double()
+    assert torch.corrcoef(turn)[0, 1] > 0.995
+    found, wanted = _marks(model, tracking.face), _marks(model, face)
+    opened = torch.stack([(m[:, UPPER_LIP] - m[:, LOWER_LIP]).norm(dim=1) for m in (found, wanted)])
+    assert torch.corrcoef(opened)[0, 1] > 0.97
+    assert float((opened[0] - opened[1]).abs().mean()) < 0.003
 
 
 def test_an_avatar_is_trained_and_driven_by_a_recording(

@@ -18,7 +18,7 @@ from mien.face.anny_source import anny_tag
 from mien.face.cache import cache_folder
 from mien.face.checks import check_face_model
 from mien.face.model import FaceModel, Landmarks
-from mien.inside import is_plain_name
+from mien.inside import is_one_line, is_plain_name
 from mien.limits import are_indices, is_moderate
 from mien.storage import expect_whole, read_json, read_tensors, write_atomically, write_json, write_tensors
 
@@ -93,7 +93,7 @@ def available_face_models() -> list[FaceModelInfo]:
         for name, source in _SOURCES.items()
     ]
     return ours + [
-        FaceModelInfo(name, "its own; you have to follow it", f"added from {source['path']}", True)
+        FaceModelInfo(name, _licence_in(source), f"added from {source['path']}", True)
         for name in _added_names()
         if (source := read_added_source(name)) is not None
     ]
@@ -104,18 +104,19 @@ def is_built_in(name: str) -> bool:
     return name in _SOURCES
 
 
-def add_face_model(model: FaceModel, source: Path, source_sha256: str) -> None:
+def add_face_model(model: FaceModel, source: Path, source_sha256: str, licence: str | None = None) -> None:
     """Add a complete face model, with landmarks, to the user's cache. It can then be loaded by its name.
 
     Args:
         model: The model. It replaces one that was added under the same name.
         source: The user's file, for messages.
         source_sha256: Hash of the file's content.
+        licence: The licence, if it is known.
     """
     stem = _added_file(model.name)
     write_face_model(stem, model)
     write_landmarks(_landmark_file(stem), model, "mien face-models --add FILE")
-    content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": _ADDED_RECIPE}
+    content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": _ADDED_RECIPE, "licence": licence}
     write_json(_source_file(stem), _SOURCE_FORMAT, 1, content)
 
 
@@ -236,6 +237,11 @@ def write_landmarks(path: Path, model: FaceModel, command: str, error: float | N
 
 def _added_file(name: str) -> Path:
     return cache_folder() / "face_models" / "added" / name
+
+
+def _licence_in(source: dict[str, Any]) -> str:
+    licence = source.get("licence")
+    return licence if is_one_line(licence) and licence else "its own; you have to follow it"
 
 
 def _added_names() -> list[str]:

@@ -21,6 +21,14 @@ def default_name(path: Path) -> str:
     return path.stem.lower().replace(" ", "_")
 
 
+def licence_of(path: Path) -> str | None:
+    """Return the licence of a model that is known by its schema; None for FLAME's schema, which many models have."""
+    members = _members(path)
+    if is_gnm(members):
+        return "Apache-2.0 (GNM Head)"
+    return "MIT (ICT-FaceKit)" if is_ict_folder(path) or _is_packed_ict(members) else None
+
+
 def read_model_file(path: Path, name: str, shareable: bool = False, teeth: bool = False) -> FaceModel:
     """Read a face model of any schema, without landmarks: FLAME's, GNM's, or ICT-FaceKit.
 

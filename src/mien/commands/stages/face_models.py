@@ -7,7 +7,7 @@ from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
 from mien.face.ict import NEUTRAL, is_ict_folder
 from mien.face.loading import cache_folder, is_built_in
-from mien.face.model_files import SUFFIXES, default_name, read_model_file
+from mien.face.model_files import SUFFIXES, default_name, licence_of, read_model_file
 from mien.face.teeth import TOOTH_VERTICES, VERTICES
 from mien.locks import hold
 from mien.progress import say
@@ -71,7 +71,7 @@ def _add(path: Path, name: str, shareable: bool, teeth: bool) -> FaceModel:
         if model.shareable or not shareable:
             return model
         model = replace(model, shareable=True)
-    add_face_model(model, path, digest)
+    add_face_model(model, path, digest, licence_of(path))
     return load_face_model(name)
 
 
