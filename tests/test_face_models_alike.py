@@ -1,4 +1,4 @@
-"""One suite over face models of all schemas: mesh, regions, joints, landmarks, gradients, tracking, avatars, driving."""
+"""One suite over face models of all schemas: mesh, regions, joints, landmarks, gradients, tracking, avatar, driving."""
 
 import shutil
 from dataclasses import replace
