@@ -111,7 +111,7 @@ fuzz: setup
 	  --lines 300 --heavy 10 --viewer 200 --findings out/fuzz/findings.jsonl
 	$(MAKE) fuzz-native
 
-# FAULTS faults in each layout that `mien import` reads, layouts side by side.
+# FAULTS faults in each layout that `mien import` reads, layouts side by side: an hour or two on two cores, by what 20 of each take.
 FAULTS ?= 2000
 fuzz-datasets: setup
 	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_THREADS=1 $(BIN)/pytest -q -n auto --dist load --timeout 0 tests/test_datasets_fuzz.py

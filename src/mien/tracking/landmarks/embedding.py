@@ -202,13 +202,11 @@ def _best_point(
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
     known = TRACKING.embedding
-    # First try few points of near triangles in some of the views, then all points of the best triangles in all views.
+    # First try few points of all triangles in some of the views, then all points of the best triangles in all views.
     some = DetectedViews(
         *(part[:: max(1, len(part) // known.coarse_views)] for part in (views.vertices, views.depth, views.detected))
     )
     everywhere = allowed.nonzero()[:, 0]
-    distances = _least_distances(some, faces[everywhere], landmark).clamp(0, 4 * clamp).sum(0)
-    everywhere = everywhere[distances.topk(min(known.near_triangles, len(distances)), largest=False).indices]
     rough = _errors(some, faces[everywhere], _triangle_grid(known.coarse_subdivisions), landmark)
     scores = rough.clamp_max(4 * clamp).sum(0).amin(1)
     triangles = everywhere[scores.topk(min(known.best_triangles, len(scores)), largest=False).indices]
@@ -217,14 +215,6 @@ def _best_point(
     best = int(error.clamp_max(clamp).sum(0).argmin())
     triangle, point = divmod(best, len(weights))
     return triangles[triangle], weights[point], error[:, triangle, point].median()
-
-
-def _least_distances(views: DetectedViews, corners: Int[Tensor, "t 3"], landmark: int) -> Float[Tensor, "n t"]:
-    """Pixels that a triangle is at least away from the detected landmark in each view; below 0 if it may be nearer."""
-    places = views.vertices[:, corners]
-    middle = places.mean(2)
-    reach = (places - middle[:, :, None]).norm(dim=-1).amax(2)
-    return (middle - views.detected[:, landmark, None]).norm(dim=-1) - reach
 
 
 def _errors(
