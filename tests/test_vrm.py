@@ -82,7 +82,9 @@ def test_three_vrm_opens_the_file_and_moves_the_face(folder: Path) -> None:
     assert about["meta"]["licenseUrl"] == LICENCE
     assert about["meta"]["avatarPermission"] == "onlyAuthor"
     assert about["meta"]["thumbnailImage"] == 512
-    presets = "aa ih ou ee oh happy angry sad relaxed surprised neutral blink blinkLeft blinkRight lookUp lookDown lookLeft"
+    presets = (
+        "aa ih ou ee oh happy angry sad relaxed surprised neutral blink blinkLeft blinkRight lookUp lookDown lookLeft"
+    )
     assert set(about["presets"]) == {*presets.split(), "lookRight"}
     assert {"jawOpen", "eyeLookUpLeft", "mouthPucker"} <= set(about["custom"])
     assert len(about["custom"]) == 50
@@ -140,5 +142,9 @@ def test_the_validator_finds_no_error_in_a_vrm(folder: Path) -> None:
     command = [node(), str(WEB / "tests" / "validate.mjs"), str(folder / "drawn.vrm")]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     issues = json.loads(done.stdout)["issues"]["messages"]
-    told = {"UNSUPPORTED_EXTENSION": "it does not know VRM", "UNUSED_OBJECT": "the thumbnail", "NODE_EMPTY": "hands, feet"}
+    told = {
+        "UNSUPPORTED_EXTENSION": "it does not know VRM",
+        "UNUSED_OBJECT": "the thumbnail",
+        "NODE_EMPTY": "hands, feet",
+    }
     assert [one for one in issues if one["severity"] < 2 or one["code"] not in told] == []

@@ -73,7 +73,7 @@ def _layouts() -> list[str]:
 
 @dataclass(frozen=True)
 class Command:
-    """Write an avatar: .mien (all of it), .html and .packed (for pages), .glb and .vrm (for engines), a pose, or a folder.
+    """Write an avatar: .mien (all of it), .html and .packed (for pages), .glb and .vrm (for engines), a pose, a folder.
 
     With --format insta, imavatar, nerface or nersemble, write a tracked capture instead, for programs that train
     elsewhere.

@@ -94,7 +94,7 @@ class Head:
 
     writer: GlbWriter
     content: dict[str, Any]
-    """The json so far: node 0 is the mesh; from node 1 on come the joints of its skin, of which the first is the root."""
+    """The json so far: node 0 is the mesh; from node 1 on come the joints of its skin, the root first."""
     targets: tuple[str, ...]
     """Names of the morph targets."""
     gaussians: Gaussians
