@@ -31,17 +31,18 @@ HEAR = """(async () => {
   const tracks = ear.stream.getTracks();
   button.click();
   await wait(0.3);
-  return { log, told, pressed: [pressed, button.getAttribute("aria-pressed")], left: viewer.shown.expression[jaw] - rest,
+  return { log, told, pressed: [pressed, button.getAttribute("aria-pressed")],
+    left: viewer.shown.expression[jaw] - rest,
     ended: tracks.every((track) => track.readyState === "ended") };
 })()"""
 PRESS = """(async () => {
   await microphone;
   %s
-  const told = document.getElementById("microphone-state");
+  const [told, button] = ["microphone-state", "microphone"].map((id) => document.getElementById(id));
   told.textContent = "";
-  document.getElementById("microphone").click();
+  button.click();
   for (let i = 0; i < 500 && !told.textContent; ++i) await new Promise((done) => setTimeout(done, 20));
-  return [told.textContent, told.getAttribute("role"), document.getElementById("microphone").getAttribute("aria-pressed")];
+  return [told.textContent, told.getAttribute("role"), button.getAttribute("aria-pressed")];
 })()"""
 
 

@@ -194,7 +194,8 @@ class Command:
             "--set": self.set, "--series": self.series, "--neutral": self.neutral, "--every": self.every != 1,
             "--sh": self.sh is not None, "--spz-version": self.spz_version, "--webgpu": self.webgpu,
             "--webcam": self.webcam, "--webcam-model": self.webcam_model,
-            "--microphone": self.microphone, "--title": self.title, "--address": self.address, "--sharp-cut": self.sharp_cut,
+            "--microphone": self.microphone, "--title": self.title,
+            "--address": self.address, "--sharp-cut": self.sharp_cut,
         }  # fmt: skip
         other = next((option for option, value in given.items() if value), None)
         if other is not None:
@@ -288,7 +289,8 @@ class Command:
 
         webcam = find_webcam_files(self.webcam_model) if self.webcam else None
         version = self.spz_version or 4
-        return Options(self.sh, self.webgpu, webcam, version, self.title, self.address, not self.sharp_cut, self.microphone)
+        soft_cut = not self.sharp_cut
+        return Options(self.sh, self.webgpu, webcam, version, self.title, self.address, soft_cut, self.microphone)
 
     def _check_file(self, kind: Format) -> None:
         from mien.files import check_writable
