@@ -21,6 +21,7 @@ NO_NODE_PACKAGES = "no packages in web/node_modules"
 NO_CHROMIUM = "no Chromium"
 NO_WEBGPU = "Chromium has no adapter of WebGPU"
 NO_VALIDATOR = "no gltf-validator in web/node_modules"
+NO_THREE_VRM = "no @pixiv/three-vrm in web/node_modules"
 NO_SPLAT_TRANSFORM = "no @playcanvas/splat-transform in web/node_modules"
 NO_MOUNT = "no right to mount a small disk"
 NO_NAMESPACE = "no right to make a network namespace"
@@ -39,6 +40,7 @@ _REMEDIES = {
     NO_INSTRUCTIONS: "run them on one that has",
     NO_NODE_PACKAGES: "run `make web-packages`",
     NO_VALIDATOR: "run `make web-packages`",
+    NO_THREE_VRM: "run `make web-packages`",
     NO_SPLAT_TRANSFORM: "run `make web-packages`",
     NO_TASKS_VISION: "run `make web-packages`",
     NO_NODE: "install Node.js 20 or newer with npm, then run `make web-packages`",
@@ -52,7 +54,7 @@ _EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_MOUNT, NO_NAMESPACE, NO_INSTRUCTIONS
 """Reasons that lie in the machine alone. Others mean an incomplete set-up; MIEN_STRICT makes them an error."""
 _AREAS = {
     "pages in a browser": (NO_CHROMIUM, NO_WEBGPU),
-    "the web runtime": (NO_NODE, NO_NODE_PACKAGES, NO_VALIDATOR, NO_SPLAT_TRANSFORM, NO_TASKS_VISION),
+    "the web runtime": (NO_NODE, NO_NODE_PACKAGES, NO_VALIDATOR, NO_SPLAT_TRANSFORM, NO_THREE_VRM, NO_TASKS_VISION),
     "real footage": (NO_TEST_DATA,),
     "GPUs": (NO_GPU,),
 }

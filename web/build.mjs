@@ -1,5 +1,5 @@
-// Builds dist/ (the package), and src/mien/export/page.html, webgpu.js and webcam.html (the page that
-// `mien export` fills, and what --webgpu and --webcam put into it; they are committed, so that the Python package needs no node). `node build.mjs FOLDER` writes all into FOLDER instead.
+// Builds dist/ (the package), and src/mien/export/page.html, webgpu.js, webcam.html and microphone.html (the page that
+// `mien export` fills, and what --webgpu, --webcam and --microphone put into it; they are committed, so that the Python package needs no node). `node build.mjs FOLDER` writes all into FOLDER instead.
 import { build, transform } from "esbuild";
 import { mkdir, readFile, writeFile } from "node:fs/promises";
 import { dirname, join } from "node:path";
@@ -44,7 +44,8 @@ const script = await bundle("src/page.ts", "iife");
 if (script.includes("</script")) throw new Error("the script would end its own element");
 const detector = { DETECTOR: JSON.stringify(await bundle("src/webcam_detector.ts", "iife")) };
 const camera = await bundle("src/webcam_page.ts", "iife", detector);
-if (camera.includes("</script")) throw new Error("the camera's script would end its own element");
+const voice = await bundle("src/microphone_page.ts", "iife");
+if (`${camera}${voice}`.includes("</script")) throw new Error("a script would end its own element");
 /** A page's html without blanks between its lines, and with small styles. */
 const smaller = async (name) => {
   const [, before, style, after] = /^(.*<style>)(.*)(<\/style>.*)$/s.exec(await readFile(join(here, "src", name), "utf8"));
@@ -56,6 +57,7 @@ for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/mot
   await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm", detector)) + "\n");
 const page = (name, text, own = name) => write(folder ? join(folder, own) : join(here, "../src/mien/export", name), text);
 await page("page.html", template.replace("{{script}}", () => script));
+await page("microphone.html", (await smaller("microphone_page.html")).replace("{{script}}", () => voice));
 await page("webcam.html", (await smaller("webcam_page.html")).replace("{{script}}", () => camera));
 const gpu = await build({ ...options, plugins: [shaders], entryPoints: ["src/webgpu.ts"], format: "iife", globalName: "mienWebGpu" });
 await page("webgpu.js", gpu.outputFiles[0].text, "webgpu_page.js");

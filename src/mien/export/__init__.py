@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mien.export.sog import read_sog, write_sog
     from mien.export.spz import read_spz, write_spz
     from mien.export.usd import read_usd, write_usd
+    from mien.export.vrm import write_vrm
     from mien.export.web_page import WrittenPage, write_packed, write_page
     from mien.export.webcam import WebcamFiles, find_webcam_files
     from mien.export.world_space import in_world
@@ -56,4 +57,5 @@ __all__ = [
     "write_sog",
     "write_spz",
     "write_usd",
+    "write_vrm",
 ]

@@ -74,6 +74,48 @@ def write_glb(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size
     Raises:
         UserError: the path cannot be written, or an array holds NaN or infinity.
     """
+    head = head_of(path, avatar, model, texture_size)
+    writer, content = head.writer, head.content
+    _add_splats(writer, content, avatar, head.gaussians)
+    about = {**vars(avatar.about), "format": FORMAT, "version": VERSION, "animates": _ANIMATES}
+    content |= {
+        "asset": {"version": "2.0", "generator": f"mien {avatar.about.mien}", "extras": {"mien": about}},
+        "scene": 0,
+        "scenes": [{"name": "mesh", "nodes": [0, 1]}, {"name": "gaussians", "nodes": [len(content["nodes"]) - 1]}],
+        "extensionsUsed": ["KHR_materials_unlit", _SPLATS, EXTENSION],
+        "extensions": {EXTENSION: avatar_extension(path, writer, avatar)},
+    }
+    return head.write(path)
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """The head of a person as the part of a .glb file that engines animate."""
+
+    writer: GlbWriter
+    content: dict[str, Any]
+    """The json so far: node 0 is the mesh; from node 1 on come the joints of its skin, the root first."""
+    targets: tuple[str, ...]
+    """Names of the morph targets."""
+    gaussians: Gaussians
+    """The Gaussians of the person at rest, in the head frame."""
+
+    def write(self, path: Path) -> WrittenGlb:
+        """Write the file with what `content` holds by now.
+
+        Raises:
+            UserError: the path cannot be written.
+        """
+        missing = tuple(name for name in ARKIT_NAMES if name not in self.targets)
+        return WrittenGlb(self.writer.write(path, self.content), self.targets, missing)
+
+
+def head_of(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int) -> Head:
+    """The mesh of the person at rest with morph targets, skin and texture, in the head frame, in metres.
+
+    Raises:
+        UserError: the path cannot be written, or an array holds NaN or infinity.
+    """
     check_writable(path)
     face = _at_rest(avatar)
     vertices = rig_points(model.rig, face)
@@ -88,18 +130,7 @@ def write_glb(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size
     content["nodes"] = [{"name": avatar.about.name, "mesh": 0, "skin": 0}, *skin.pop("nodes")]
     content["skins"] = [skin]
     _add_texture(writer, content, _texture(avatar, model, face, texture_size))
-    _add_splats(writer, content, avatar, gaussians)
-    names = tuple(targets)
-    about = {**vars(avatar.about), "format": FORMAT, "version": VERSION, "animates": _ANIMATES}
-    content |= {
-        "asset": {"version": "2.0", "generator": f"mien {avatar.about.mien}", "extras": {"mien": about}},
-        "scene": 0,
-        "scenes": [{"name": "mesh", "nodes": [0, 1]}, {"name": "gaussians", "nodes": [len(content["nodes"]) - 1]}],
-        "extensionsUsed": ["KHR_materials_unlit", _SPLATS, EXTENSION],
-        "extensions": {EXTENSION: avatar_extension(path, writer, avatar)},
-    }
-    size = writer.write(path, content)
-    return WrittenGlb(size, names, tuple(name for name in ARKIT_NAMES if name not in names))
+    return Head(writer, content, tuple(targets), gaussians)
 
 
 def morph_targets(avatar: PortableAvatar, rig: Rig, face: Face) -> dict[str, Float32[np.ndarray, "m 3"]]:

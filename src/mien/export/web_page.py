@@ -21,6 +21,9 @@ from mien.runtime import PortableAvatar
 
 TEMPLATE = Path(__file__).with_name("page.html")
 WEBGPU = Path(__file__).with_name("webgpu.js")
+MICROPHONE = Path(__file__).with_name("microphone.html")
+_SILENT = "; form-action 'none'; base-uri 'none'"
+"""What the policy of a page with a microphone forbids in addition, so that nothing that it hears can leave it."""
 _SIDE = 512
 """Sides of the pictures that the loss is measured on, in pixels."""
 _SHARE = 0.25
@@ -47,6 +50,7 @@ def write_page(
     webcam: WebcamFiles | None = None,
     webgpu: bool = False,
     described: Described | None = None,
+    microphone: bool = False,
 ) -> WrittenPage:
     """Write a page with an avatar, and a motion that it can play, as one file.
 
@@ -58,6 +62,7 @@ def write_page(
         webgpu: Whether the page draws with WebGPU where the browser has it on a GPU. WebGL2 is the default.
         described: What the page says of itself. None for the avatar's name. With an address, a poster for messengers is
             written beside the page, with its name and the ending .jpg.
+        microphone: Whether a button lets the lips follow a voice.
 
     Raises:
         UserError: pages cannot draw the avatar's colours, a file cannot be read, or the path cannot be written.
@@ -71,7 +76,8 @@ def write_page(
     packed = base64.b64encode(pack(avatar, motion)).decode()
     parts = {
         "head": head_part(drawn, described, poster),
-        "policy": POLICY if webcam else "",
+        "policy": POLICY if webcam else _SILENT if microphone else "",
+        "microphone": MICROPHONE.read_text(encoding="utf-8") if microphone else "",
         "webcam": webcam_part(webcam) if webcam else "",
         "title": html.escape(described.title),
         "webgpu": f"\n<script>{WEBGPU.read_text(encoding='utf-8').strip()}</script>" if webgpu else "",

@@ -79,6 +79,8 @@ class Options:
     """Address at which a page will be published."""
     soft_cut: bool = True
     """Whether a head fades towards its neck cut."""
+    microphone: bool = False
+    """Whether the lips of a page follow a voice."""
 
 
 def _no_check(path: Path) -> None:

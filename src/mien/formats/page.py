@@ -12,7 +12,7 @@ def _write_page(path: Path, content: Content, options: Options) -> str:
     motion = content.motion()
     avatar = content.portable(confidence=False, soft_cut=options.soft_cut)
     described = export.Described(options.title or avatar.about.name, options.address)
-    page = export.write_page(path, avatar, motion, options.webcam, options.webgpu, described)
+    page = export.write_page(path, avatar, motion, options.webcam, options.webgpu, described, options.microphone)
     poster = f"\n{path.with_suffix('.jpg')}: the picture that messengers show" if options.address else ""
     return _told(content, motion, page) + poster
 
@@ -36,7 +36,7 @@ PAGE = Format(
     "avatar",
     _write_page,
     (".html",),
-    options=frozenset({"webgpu", "webcam", "title", "address", "soft_cut"}),
+    options=frozenset({"webgpu", "webcam", "microphone", "title", "address", "soft_cut"}),
     refusals=_ITSELF,
 )
 PACKED = Format("packed", "avatar", _write_packed, (".packed",), options=frozenset({"soft_cut"}), refusals=_ITSELF)

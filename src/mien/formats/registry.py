@@ -15,9 +15,10 @@ from mien.formats.ply import PLY
 from mien.formats.sog import SOG
 from mien.formats.spz import SPZ
 from mien.formats.usd import USD
+from mien.formats.vrm import VRM
 from mien.plugins import plugin, with_plugins
 
-_OWN = (MIEN, PAGE, PACKED, GLB, PLY, SPZ, SOG, USD, GAUSSIAN_AVATARS)
+_OWN = (MIEN, PAGE, PACKED, GLB, VRM, PLY, SPZ, SOG, USD, GAUSSIAN_AVATARS)
 
 _GROUP = "mien.formats"
 """Group of entry points of other packages. They are imported only for lists, and for formats that mien lacks."""

@@ -1,6 +1,7 @@
-"""Names beside those of expressions: ARKit's eight names of gaze, which turn the eyes, and preset faces.
+"""Names beside those of expressions: ARKit's eight names of gaze, which turn the eyes, preset faces, and visemes.
 
-presets.json beside this file is the only table of preset faces. The web runtime's build reads it, too.
+presets.json beside this file is the only table of preset faces, and visemes.json that of visemes. The web runtime's
+build reads them, too.
 """
 
 import json
@@ -44,6 +45,12 @@ class Part:
 def presets() -> Mapping[str, Mapping[str, float]]:
     """Preset faces by name: coefficients by ARKit's names, which are added to the face at rest."""
     return json.loads(files("mien.runtime").joinpath("presets.json").read_text(encoding="utf-8"))
+
+
+@cache
+def visemes() -> Mapping[str, Mapping[str, float]]:
+    """Mouths of sounds by the names of Oculus' 15 visemes: coefficients by ARKit's names, added to the face at rest."""
+    return json.loads(files("mien.runtime").joinpath("visemes.json").read_text(encoding="utf-8"))
 
 
 def is_gaze(name: str, joint_names: Sequence[str]) -> bool:

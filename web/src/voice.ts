@@ -1,0 +1,73 @@
+// A voice moves the mouth as it sounds: what src/mien/driving/speech.py does with a file, without knowing what comes next.
+
+/** Coefficients by ARKit's names. */
+export type Mouth = Record<string, number>;
+
+/** Seconds of sound that say what is loud and what is noise. */
+const REMEMBERED = 12;
+/** Percentiles of the noise floor and of a loud voice, in 1. */
+const FLOOR = 0.1, LOUD = 0.95;
+/** Distance from the noise floor to a loud voice in dB, and the least loudness of one, where 0 is the loudest possible. */
+const RANGE = [25, 45], SILENCE = -55;
+/** Share of this distance that is silence, and the exponent from loudness to opening. */
+const GATE = 0.15, EXPONENT = 1.6;
+/** Drops of the loudness in dB, within so many seconds, from which on lips begin to shut, and at which they are shut. */
+const DROP = [4, 9], WITHIN = 0.14;
+/** Time in which the mouth goes two thirds of its way, in seconds. */
+const SOFT = 0.03;
+/** Frequencies in Hz below which sound is low, and above which it is high. */
+const SPLIT = [700, 2500];
+
+const clip = (value: number, least = 0, most = 1) => Math.min(Math.max(value, least), most);
+
+export class Voice {
+  private heard: [seconds: number, loudness: number][] = [];
+  private opening = 0;
+  private low = 0;
+  private high = 0;
+
+  /**
+   * The mouth for a moment of sound.
+   * @param loudness In dB; 0 is the loudest possible.
+   * @param low Share of the energy at low frequencies, and `high` at high ones.
+   * @param seconds When it sounded; increases.
+   */
+  next(loudness: number, low: number, high: number, seconds: number): Mouth {
+    const { heard } = this, step = seconds - (heard.at(-1)?.[0] ?? seconds);
+    heard.push([seconds, loudness]);
+    while (heard[0][0] < seconds - REMEMBERED) heard.shift();
+    const sorted = heard.map(([, level]) => level).sort((a, b) => a - b), at = (share: number) => sorted[Math.floor(share * (sorted.length - 1))];
+    // A steady noise is no voice: one is louder than its pauses.
+    const loud = Math.max(at(LOUD), at(FLOOR) + RANGE[0], SILENCE + RANGE[0]), floor = Math.max(at(FLOOR), loud - RANGE[1]);
+    const opening = clip(((loudness - floor) / (loud - floor) - GATE) / (1 - GATE)) ** EXPONENT;
+    const before = Math.max(...heard.filter(([when]) => when > seconds - WITHIN).map(([, level]) => level));
+    const shut = clip((before - loudness - DROP[0]) / (DROP[1] - DROP[0])) * (1 - clip(3 * high));
+    const share = 1 - Math.exp(-step / SOFT), soft = (from: number, to: number) => from + share * (to - from);
+    this.opening = soft(this.opening, opening);
+    this.low = soft(this.low, clip(2 * low - 1));
+    this.high = soft(this.high, clip(high));
+    const open = this.opening * (1 - shut), lower = 0.25 * open, upper = 0.12 * open, wide = 0.3 * open * this.high, press = 0.3 * shut * clip(before - floor, 0, 10) / 10;
+    return {
+      jawOpen: 0.55 * open * (1 - 0.6 * this.high),
+      mouthLowerDownLeft: lower, mouthLowerDownRight: lower, mouthUpperUpLeft: upper, mouthUpperUpRight: upper,
+      mouthFunnel: 0.35 * open * this.low, mouthStretchLeft: wide, mouthStretchRight: wide, mouthPressLeft: press, mouthPressRight: press,
+    };
+  }
+}
+
+/** Loudness in dB of what an analyser hears now, and the shares of its energy at low and at high frequencies. */
+export function measured(analyser: AnalyserNode): [loudness: number, low: number, high: number] {
+  const samples = new Float32Array(analyser.fftSize), spectrum = new Float32Array(analyser.frequencyBinCount);
+  analyser.getFloatTimeDomainData(samples);
+  analyser.getFloatFrequencyData(spectrum);
+  const mean = samples.reduce((sum, x) => sum + x, 0) / samples.length, power = samples.reduce((sum, x) => sum + (x - mean) ** 2, 0) / samples.length;
+  const wide = analyser.context.sampleRate / analyser.fftSize;
+  let low = 0, high = 0, all = 1e-20;
+  spectrum.forEach((level, k) => {
+    const energy = k && 10 ** (level / 10);
+    all += energy;
+    if (k * wide < SPLIT[0]) low += energy;
+    if (k * wide > SPLIT[1]) high += energy;
+  });
+  return [10 * Math.log10(Math.max(power, 1e-12)), low / all, high / all];
+}
