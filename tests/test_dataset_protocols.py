@@ -37,7 +37,7 @@ SPLIT = TrainSettings(split="nersemble-benchmark")
 
 
 def test_the_monocular_task_holds_out_its_test_sequences_and_all_cameras_but_the_frontal_one() -> None:
-    ids = dict.fromkeys(SEQUENCES, (FRONTAL, "222200046", "222200036"))
+    ids: dict[str, tuple[str, ...]] = dict.fromkeys(SEQUENCES, (FRONTAL, "222200046", "222200036"))
     filled = with_benchmark_split(SPLIT, SEQUENCES, ids)
     assert filled.held_out_sequences == TESTS
     assert filled.held_out_cameras == ("222200046", "222200036")

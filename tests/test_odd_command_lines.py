@@ -99,7 +99,7 @@ ODD = [
     ("view W --host 256.1.1.1", "--host 256.1.1.1: is no address of this machine"),
     (
         "export W --out a.obj",
-        "cannot write .obj; use .mien, .html, .packed, .glb, .ply, .spz, .sog, .usd,",
+        "cannot write .obj; use .mien, .html, .packed, .glb, .vrm, .ply, .spz, .sog,",
     ),
     ("export W --out a.mien --set drop=1", "leave --set and --series out"),
     ("export W --out a.mien --every 3", "--every 3"),

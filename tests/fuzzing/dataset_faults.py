@@ -177,7 +177,7 @@ def _in_values(root: Path, dice: Random, fits: Callable[[Any], bool], changed: C
         return None
     container, key = dice.choice(places)
     container[key] = changed(container[key])
-    whole = content if container is not None and key != "" else container[key]
+    whole = container[key] if key == "" else content
     if file.suffix == ".json":
         file.write_text(json.dumps(whole))
     elif file.suffix == ".frame":
