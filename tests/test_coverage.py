@@ -152,6 +152,30 @@ def test_only_what_is_seen_is_trained(toy: tuple[FaceModel, Sequence]) -> None:
     assert not moved[filled_in][:, [0, 2]].any()
 
 
+def test_features_of_fills_are_not_trained(toy: tuple[FaceModel, Sequence]) -> None:
+    """Their bases have a gradient of their own kind, which is masked like the others."""
+    model, sequence = toy
+    config = plain_gaussian_avatars(appearance="features", appearance_directions=2, appearance_features=3)
+    avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
+    with torch.no_grad():
+        avatar.gaussian_store()["feature_bases"].normal_()
+        (network,) = (group for group in avatar.parameter_groups() if group.name == "appearance")
+        for tensor in network.tensors.values():
+            tensor.normal_()
+    unseen = known(toy, avatar)
+    filled_in = unseen.filled_in(avatar)
+    assert filled_in is not None
+    gaussians = avatar.pose(sequence.tracking.face[0]).gaussians
+    (gaussians.sh.sum() + gaussians.opacities.sum()).backward()
+    (factored,) = (one for group in avatar.parameter_groups() for one in group.factored.values())
+    rows = factored.terms[0][0]
+    before = rows.clone()
+    assert before[filled_in].any()
+    unseen.mask_gradients(avatar)
+    assert not rows[filled_in].any()
+    assert torch.equal(rows[~filled_in], before[~filled_in])
+
+
 def test_what_is_beside_shown_triangles_is_trained(
     toy: tuple[FaceModel, Sequence], monkeypatch: pytest.MonkeyPatch
 ) -> None:

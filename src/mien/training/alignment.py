@@ -13,24 +13,28 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from mien.avatar import DEFAULT_METHOD, Avatar, FaceTuning, Progress, Rate, frozen
+from mien.avatar import DEFAULT_METHOD, Avatar, FaceTuning, Moments, ParameterGroup, Rate, frozen
 from mien.config import overlay
 from mien.face import FaceModel, FaceParams, concatenate
 from mien.progress import progress_bar
 from mien.render.rasterize import rasterize_each
 from mien.threads import one_torch_thread
-from mien.training.adam import Adam
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.constants import TRAINING
 from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
-from mien.training.footage import Sequence, Targets
+from mien.training.footage import Frame, Sequence, Target, Targets, evenly_spread, training_frames
 from mien.training.photometric import photometric_loss
 from mien.training.run import read_face_track
 from mien.training.settings import PRESETS, TrainSettings
 from mien.training.trainer import ProgressBar, train
 
 _WHITE = np.full(3, 255, np.uint8)
+_EPSILON = 1e-12
+"""Least size of gradients, so that those of zero move nothing."""
+_Timestep = tuple[int, int, tuple[int, ...]]
+"""A timestep to align: the index of its sequence, the timestep, and the cameras that see the face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +96,8 @@ def align(
     template = train(sequences, face_model, config, how, folder, titled)
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     starts = _split(read_face_track(folder, face_model), lengths)
-    aligned = align_faces(template, sequences, starts, settings, training.held_out_cameras, progress)
+    known = training_frames(sequences, how)
+    aligned = align_faces(template, sequences, starts, known, settings, training.held_out_cameras, progress)
     return [steadier(sequence.tracking.face, face) for sequence, face in zip(sequences, aligned, strict=True)]
 
 
@@ -113,71 +118,150 @@ def align_faces(
     avatar: Avatar,
     sequences: Items[Sequence],
     starts: Items[FaceParams],
+    known: Items[Frame],
     settings: AlignmentSettings,
     held_out_cameras: Items[str] = (),
     progress: ProgressBar = progress_bar,
 ) -> list[FaceParams]:
     """Return the face parameters of each sequence with which a fixed avatar looks most like the pictures.
 
-    Each timestep descends on its own, by Adam on L1 and SSIM, for the same number of steps. Timesteps in which nothing
-    was found, or in which a hand covers the face, get corrections from their neighbours.
+    Each timestep descends on its own on L1 and SSIM, for the same number of steps (`_Descent`). Timesteps in which
+    nothing was found, or in which a hand covers the face, get corrections from their neighbours.
 
     Args:
         avatar: The avatar, on the CPU. It is the same afterwards.
         sequences: The sequences.
         starts: The face parameters of each sequence to start from.
+        known: The frames that the avatar was trained on. Some of them say how large gradients are.
         settings: Settings of the descent.
         held_out_cameras: Ids of cameras that are not looked at.
         progress: Makes progress bars.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
-    turns, shift = Rate(settings.rate), Rate(TRAINING.aligned_shift * settings.rate)
-    rates = FaceTuning(True, turns, turns, turns, shift, keep_mean_pose=True, keep_turns=single, within_bounds=True)
-    track = FaceTrack(concatenate(list(starts)), rates, lengths, avatar.face_model.expression_bounds)
+    track = FaceTrack(concatenate(list(starts)), _tuning(settings, single), lengths, avatar.face_model.expression_bounds)
     targets = [Targets(sequence, settings.resolution, len(sequences), cleaned=True) for sequence in sequences]
     timesteps = [one for index, own in enumerate(sequences) for one in _looked_at(index, own, held_out_cameras)]
-    adam = Adam()
+    trained = {frame[:2] for frame in known}
+    judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, TRAINING.aligned_judged)
     with one_torch_thread(), frozen(avatar), progress("aligning frames", len(timesteps), 0) as advance:
-        for first in range(0, len(timesteps), TRAINING.aligned_together):
-            batch = timesteps[first : first + TRAINING.aligned_together]
-            indices = [track.index_of(sequence, timestep) for sequence, timestep, _ in batch]
-            views = [
-                _View(place, targets[sequence], timestep, camera)
-                for place, (sequence, timestep, cameras) in enumerate(batch)
-                for camera in cameras
-            ]
-            _descend(avatar, track, adam, indices, views, settings.iterations)
-            advance(len(batch))
+        descent = _Descent(_sizes([_Batch.of(part, track, targets) for part in _batches(judged)], avatar, track))
+        for part in _batches(timesteps):
+            batch = _Batch.of(part, track, targets)
+            for _ in range(settings.iterations):
+                batch.find_gradients(avatar, track)
+                descent.step(batch.groups(track))
+                for index in batch.indices:
+                    track.confine(index)
+            advance(len(part))
     track.steady_pose()
     return _split(track.params().detach(), lengths)
 
 
-def _descend(
-    avatar: Avatar, track: FaceTrack, adam: Adam, indices: Items[int], views: Items[_View], iterations: int
-) -> None:
-    """Move the timesteps of a batch towards their pictures."""
-    shown = [view.targets.target(view.timestep, view.camera, _WHITE, keep=False) for view in views]
-    for iteration in range(iterations):
-        posed = avatar.pose(concatenate([track.face(index) for index in indices])).gaussians.timesteps()
+def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
+    """How far a step moves each field."""
+    rates = (TRAINING.aligned_expression, TRAINING.aligned_joints, 1.0, TRAINING.aligned_shift)
+    own = [Rate(settings.rate).scaled(share) for share in rates]
+    return FaceTuning(True, *own, keep_mean_pose=True, keep_turns=single, within_bounds=True)
+
+
+def _batches(timesteps: list[_Timestep]) -> Iterator[list[_Timestep]]:
+    """The timesteps in parts that are drawn together."""
+    for first in range(0, len(timesteps), TRAINING.aligned_together):
+        yield timesteps[first : first + TRAINING.aligned_together]
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Timesteps that are drawn together, for speed alone, with their pictures."""
+
+    indices: list[int]
+    """Where the timesteps are in the track."""
+    views: list[_View]
+    shown: list[Target]
+    """The picture of each view."""
+
+    @staticmethod
+    def of(timesteps: list[_Timestep], track: FaceTrack, targets: Items[Targets]) -> "_Batch":
+        """The batch of some timesteps."""
+        views = [
+            _View(place, targets[sequence], timestep, camera)
+            for place, (sequence, timestep, cameras) in enumerate(timesteps)
+            for camera in cameras
+        ]
+        shown = [view.targets.target(view.timestep, view.camera, _WHITE, keep=False) for view in views]
+        return _Batch([track.index_of(sequence, timestep) for sequence, timestep, _ in timesteps], views, shown)
+
+    def groups(self, track: FaceTrack) -> list[ParameterGroup]:
+        """The parameters of all timesteps."""
+        return [group for index in self.indices for group in track.parameter_groups(index)]
+
+    def find_gradients(self, avatar: Avatar, track: FaceTrack) -> None:
+        """Draw all views, and leave the gradient of what differs from their pictures at the parameters."""
+        posed = avatar.pose(concatenate([track.face(index) for index in self.indices])).gaussians.timesteps()
         pictures = rasterize_each(
-            [(posed[view.place], view.targets.camera(view.camera)) for view in views],
-            [target.background for target in shown],
+            [(posed[view.place], view.targets.camera(view.camera)) for view in self.views],
+            [target.background for target in self.shown],
         )
         losses = [
             photometric_loss(picture.image, target.picture, box=target.box, drawn=picture.alpha)
-            for picture, target in zip(pictures, shown, strict=True)
+            for picture, target in zip(pictures, self.shown, strict=True)
         ]
         torch.autograd.backward(losses)
-        groups = [group for index in indices for group in track.parameter_groups(index)]
-        adam.step(groups, Progress(iteration, iterations))
-        for index in indices:
-            track.confine(index)
+
+
+@dataclass(frozen=True, eq=False)
+class _Descent:
+    """Steps along the gradient with momentum, in units of its usual size.
+
+    Adam divides the gradient of a timestep by its own size, so that its first steps move every coefficient by the
+    whole rate, whether it matters or not. Here, what matters more moves further, and a timestep that fits stays.
+    """
+
+    sizes: dict[str, float]
+    """Root mean square of each group's gradients, by name, over coefficients and over some timesteps."""
+
+    @torch.no_grad()
+    def step(self, groups: Items[ParameterGroup]) -> None:
+        """Move the parameters, and clear their gradients."""
+        kept = TRAINING.aligned_momentum
+        for group in groups:
+            for (name, tensor), gradient in zip(group.tensors.items(), _taken(group), strict=True):
+                state = _moments(group, name)
+                state.step += 1
+                state.first.lerp_(gradient, 1 - kept)
+                unbiased = state.first / (1 - kept ** state.step.item())
+                tensor -= group.rate.start / max(self.sizes[group.name], _EPSILON) * unbiased
+
+
+def _sizes(batches: list[_Batch], avatar: Avatar, track: FaceTrack) -> dict[str, float]:
+    """`_Descent.sizes` at the present parameters of some batches."""
+    found: dict[str, list[Tensor]] = {}
+    for batch in batches:
+        batch.find_gradients(avatar, track)
+        for group in batch.groups(track):
+            found.setdefault(group.name, []).extend(_taken(group))
+    return {name: torch.stack(own).double().square().mean().sqrt().item() for name, own in found.items()}
+
+
+def _taken(group: ParameterGroup) -> list[Tensor]:
+    """The gradients of a group, which it has no more afterwards."""
+    gradients = [torch.zeros_like(one) if one.grad is None else one.grad for one in group.tensors.values()]
+    for tensor in group.tensors.values():
+        tensor.grad = None
+    return gradients
+
+
+def _moments(group: ParameterGroup, name: str) -> Moments:
+    assert group.moments is not None
+    state = group.moments[name]
+    assert isinstance(state, Moments)
+    return state
 
 
 def _looked_at(
     index: int, sequence: Sequence, held_out_cameras: Items[str]
-) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-    """The timesteps of a sequence to align: its index, the timestep, and the cameras that see the face."""
+) -> Iterator[_Timestep]:
+    """The timesteps of a sequence to align."""
     kept = [camera_id not in held_out_cameras for camera_id in sequence.capture.camera_ids]
     usable = sequence.usable() & sequence.clear() & np.array(kept)
     for timestep in range(sequence.capture.timesteps):

@@ -13,10 +13,17 @@ class TrainingConstants:
     # alignment.py
     aligned_together: int = 4
     """Number of timesteps that are aligned in one pass. Not varied."""
+    aligned_judged: int = 32
+    """Number of training timesteps that say how large gradients are. Not varied."""
+    aligned_momentum: float = 0.7
+    """Share of the last steps' direction in the next one. Measured: the log, 11-27."""
+    aligned_expression: float = 10.0
+    """Rate of expression coefficients, as a share of that of the head's rotation. Measured: the log, 11-27."""
+    aligned_joints: float = 3.0
+    """Rate of joint angles, as a share of that of the head's rotation. Measured: the log, 11-27."""
     aligned_shift: float = 0.3
-    """Learning rate of the head's position in metres, as a share of that of its rotation in radians: the ratio with
-    which training corrects the tracking. Not varied."""
-
+    """Rate of the head's position in metres, as a share of that of its rotation in radians: the ratio with which
+    training corrects the tracking. Not varied."""
     aligned_tuning: float = 0.2
     """Share of the learning rates of faces in a training on aligned faces. Measured: the log, 11-27."""
 

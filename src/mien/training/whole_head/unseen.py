@@ -74,6 +74,8 @@ class Unseen:
         store = avatar.gaussian_store()
         gradients = [own for own in (store[name].grad for name in store.trained) if own is not None]
         gradients += [own for own in (rendering.means2d_offset.grad for rendering in renderings) if own is not None]
+        factored = [own for group in avatar.parameter_groups() for own in group.factored.values()]
+        gradients += [rows for own in factored for rows, _ in own.terms]
         # The second axis of a triangle's frame is its normal.
         places = store["means"].grad
         height = None if places is None else places[:, 1].clone()
