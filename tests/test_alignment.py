@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment
+from mien.avatar import Moments, ParameterGroup, Rate
 from mien.cli import main
 from mien.commands.create import Command as Create
 from mien.commands.options import TrainOptions
@@ -17,7 +18,7 @@ from mien.evaluation.metrics import l1
 from mien.face import FaceParams
 from mien.tracking import read_tracking
 from mien.training import AlignmentSettings, TrainSettings, align
-from mien.training.alignment import align_faces, steadier
+from mien.training.alignment import _Descent, align_faces, steadier
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 
@@ -70,6 +71,20 @@ def test_a_frame_does_not_depend_on_those_beside_it() -> None:
     found = aligned(experiment, start, iterations=3).expression
     images[5] = 255 - images[5]
     assert aligned(experiment, start, iterations=3).expression[:5].equal(found[:5])
+
+
+def test_what_matters_more_moves_further() -> None:
+    """Adam would move both coefficients by the same in its first step."""
+    values = torch.zeros(1, 2, requires_grad=True)
+    group = ParameterGroup("face", {"face": values}, Rate(0.01), {"face": Moments.zeros(values.detach())})
+    values.grad = torch.tensor([[4.0, 1.0]])
+    descent = _Descent({"face": 2.0})
+    descent.step([group])
+    assert torch.allclose(values, torch.tensor([[-0.02, -0.005]]))
+    assert values.grad is None
+    descent.step([group])
+    assert torch.equal(values[:, 0] / values[:, 1], torch.tensor([4.0])), "momentum goes on without a gradient"
+    assert values[0, 0] < -0.02
 
 
 def test_what_a_hand_covers_gets_the_corrections_of_its_neighbours() -> None:

@@ -138,7 +138,8 @@ def align_faces(
         progress: Makes progress bars.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
-    track = FaceTrack(concatenate(list(starts)), _tuning(settings, single), lengths, avatar.face_model.expression_bounds)
+    tuning, bounds = _tuning(settings, single), avatar.face_model.expression_bounds
+    track = FaceTrack(concatenate(list(starts)), tuning, lengths, bounds)
     targets = [Targets(sequence, settings.resolution, len(sequences), cleaned=True) for sequence in sequences]
     timesteps = [one for index, own in enumerate(sequences) for one in _looked_at(index, own, held_out_cameras)]
     trained = {frame[:2] for frame in known}
@@ -258,9 +259,7 @@ def _moments(group: ParameterGroup, name: str) -> Moments:
     return state
 
 
-def _looked_at(
-    index: int, sequence: Sequence, held_out_cameras: Items[str]
-) -> Iterator[_Timestep]:
+def _looked_at(index: int, sequence: Sequence, held_out_cameras: Items[str]) -> Iterator[_Timestep]:
     """The timesteps of a sequence to align."""
     kept = [camera_id not in held_out_cameras for camera_id in sequence.capture.camera_ids]
     usable = sequence.usable() & sequence.clear() & np.array(kept)
