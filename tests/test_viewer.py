@@ -199,6 +199,14 @@ def test_pictures_have_the_shape_of_the_window(session: Session) -> None:
     assert front_view(session.avatar, 9000, 20).sized(512)[0] == 2048
 
 
+def test_a_head_fits_a_narrow_window(session: Session) -> None:
+    """Half as wide a window shows a head of half the size, and as much of it."""
+    wide, narrow = (session.picture(front_view(session.avatar, width, 192)) for width in (192, 96))
+    drawn = [np.nonzero((picture < 250).any((0, 2)))[0] for picture in (wide, narrow)]
+    assert drawn[1].min() == pytest.approx(drawn[0].min() / 2, abs=2)
+    assert drawn[1].max() == pytest.approx(drawn[0].max() / 2, abs=2)
+
+
 def test_a_view_is_that_of_the_native_renderer(session: Session) -> None:
     camera = session.avatar.camera.resized(64, 64)
     expected, _ = session.avatar.render(session.avatar.pose(), camera)

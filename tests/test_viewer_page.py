@@ -350,6 +350,20 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
     assert (serving.loop.error, serving.failures) == (None, [])
 
 
+@pytest.mark.slow
+def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
+    """The head fits the narrow window, and the panel, which would cover half of it, is folded."""
+    shot = tmp_path / "phone.png"
+    steps: list[dict[str, Any]] = [{"see": "mien"}, {"wait": 6000}, {"screenshot": str(shot)}]
+    told = browse(serving.address, steps, (390, 844))
+    assert told["errors"] == []
+    drawn = (read(shot)[:700] < 250).any(-1)
+    columns = np.nonzero(drawn.any(0))[0]
+    assert 10 < columns[0] < columns[-1] < 380
+    left, right = drawn[:, :195].mean(), drawn[:, 195:].mean()
+    assert left == pytest.approx(right, rel=0.3), "nothing lies over a half"
+
+
 @contextlib.contextmanager
 def proxied(port: int, folder: str) -> Iterator[int]:
     """Pass requests below a folder on to a port, without the folder's name, as nginx does. Yield the proxy's port."""

@@ -2,7 +2,7 @@
 // width divided by the height of the canvas at each saving.
 // tests/test_viewer_page.py calls it:
 //   node view.mjs CHROMIUM ADDRESS < {"width", "height", "steps": [..]}
-// A step is one of: {"see": text}, {"wait": milliseconds}, {"click": text of a button}, {"drag": [x, y]},
+// A narrow window is that of a phone. A step is one of: {"see": text}, {"wait": milliseconds}, {"click": text of a button}, {"drag": [x, y]},
 // {"fill": [label, text]}, {"save": [button, path]}, {"screenshot": path}, {"reload": true}.
 import { readFileSync } from "node:fs";
 import { chromium } from "playwright-core";
@@ -13,7 +13,7 @@ const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swifts
   "--disable-background-networking", "--disable-component-update", "--disable-sync"];
 const browser = await chromium.launch({ executablePath, args });
 try {
-  const context = await browser.newContext({ viewport: { width, height }, acceptDownloads: true });
+  const context = await browser.newContext({ viewport: { width, height }, isMobile: width < 600, acceptDownloads: true });
   const requests = [], errors = [], shapes = [];
   const tab = await context.newPage();
   tab.on("request", (request) => requests.push(request.url()));

@@ -151,6 +151,14 @@ def beside(
     return np.concatenate([left, shown], axis=1)
 
 
+def fitted(camera: runtime.Camera, width: int, height: int) -> float:
+    """How much smaller the avatar is drawn in a narrow window than in one of its height and any width, at most 1.
+
+    What the filmed camera shows then fits the width, as on a phone that is held upright.
+    """
+    return min(1.0, width * camera.height / (camera.width * height))
+
+
 def shrunk(filmed: UInt8[np.ndarray, "h w 3"], width: int, height: int) -> float:
     """How much smaller a filmed frame is that fits a half of the picture than one of the half's height, at most 1.
 

@@ -14,15 +14,15 @@ for (const kind of [self.WebGLRenderingContext, self.WebGL2RenderingContext]) {
     return name === "WEBGL_debug_renderer_info" ? null : get.call(this, name);
   };
 }
-// On phones, viser's panel lies over the avatar: it begins folded, and a touch of its title unfolds it.
-if (matchMedia("(max-width: 36em)").matches)
-  new MutationObserver((changes, watch) => {
-    const isTitle = ({ style }) => style.height === "3.5em" && style.cursor === "pointer";
-    const title = [...document.querySelectorAll("div")].find(isTitle);
-    if (!title) return;
-    watch.disconnect();
-    title.click();
-  }).observe(document, { childList: true, subtree: true });
+// On phones, viser's panel lies over the avatar: it begins folded, and a touch of its title unfolds it. How wide the
+// window is shows only after this script, because the words on the viewport come later in the page.
+new MutationObserver((changes, watch) => {
+  const isTitle = ({ style }) => style.height === "3.5em" && style.cursor === "pointer";
+  const title = [...document.querySelectorAll("div")].find(isTitle);
+  if (!title) return;
+  watch.disconnect();
+  if (matchMedia("(max-width: 36em)").matches) title.click();
+}).observe(document, { childList: true, subtree: true });
 </script>"""
 _HEAD = b"<head>"
 

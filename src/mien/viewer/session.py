@@ -26,6 +26,7 @@ from mien.viewer.drawing import (
     View,
     beside,
     draw,
+    fitted,
     in_corner,
     shrunk,
     words_about_view,
@@ -278,7 +279,10 @@ class Session:
         with self._drawing:
             frame = None if filmed is None else filmed(timestep)
             half = max(1, wide // 2)
-            camera = view.camera(wide, high) if frame is None else view.camera(half, high, shrunk(frame, half, high))
+            if frame is None:
+                camera = view.camera(wide, high, fitted(self.avatar.camera, wide, high))
+            else:
+                camera = view.camera(half, high, shrunk(frame, half, high))
             shown = draw(self._gaussians(face), face, self.mesh, look, camera)
             picture = shown if frame is None else beside(frame, shown, look.background)
             if seen is not self._last_seen:
