@@ -357,7 +357,7 @@ def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
     steps: list[dict[str, Any]] = [{"see": "mien"}, {"wait": 6000}, {"screenshot": str(shot)}]
     told = browse(serving.address, steps, (390, 844))
     assert told["errors"] == []
-    drawn = (read(shot)[:700] < 250).any(-1)
+    drawn = np.any(read(shot)[:700] < 250, axis=-1)
     columns = np.nonzero(drawn.any(0))[0]
     assert 10 < columns[0] < columns[-1] < 380
     left, right = drawn[:, :195].mean(), drawn[:, 195:].mean()
