@@ -111,7 +111,10 @@ def test_export_reads_a_glb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert main(["export", str(tmp_path / "a.mien"), "--out", str(tmp_path / "c.ply")]) == 0
     capsys.readouterr()
     for line, told in (
-        (["a.glb", "--out", "a.glb"], "cannot write .glb; use .mien, .html, .packed, .ply"),
+        (
+            ["a.glb", "--out", "a.glb"],
+            "cannot write .glb from a file; export the workspace, or use .mien, .html, .packed, .ply",
+        ),
         (["a.mien", "--out", "a.mien"], "is the file that is read"),
         (["a.glb", "--out", "c.mien", "--set", "drop=1"], "leave --run, --set, --series, --neutral and --every out"),
         (["gone.glb", "--out", "c.mien"], "gone.glb: no such file"),

@@ -79,6 +79,31 @@ def test_a_page_opens_alive(page: Path) -> None:
     assert gaze > 0.25
 
 
+PRESSED = """window.pressed = [];
+const opened = setInterval(() => {
+  if (!window.mien) return;
+  clearInterval(opened);
+  mien.then((viewer) => {
+    const turned = setInterval(() => {
+      if (viewer.yaw < 0.1) return;
+      clearInterval(turned);
+      const before = viewer.yaw;
+      document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "x", bubbles: true }));
+      pressed.push(before, viewer.yaw);
+    }, 1);
+  });
+}, 1)"""
+WAIT = "(async () => { while (!pressed.length) await new Promise((done) => setTimeout(done, 20)); return pressed; })()"
+
+
+@pytest.mark.slow
+def test_a_key_ends_the_first_turn_in_front(page: Path) -> None:
+    told = browse(page, [WAIT], size=(300, 200), device=["lively"], opening=PRESSED)
+    before, after = told["results"][0]
+    assert before >= 0.1
+    assert after == 0
+
+
 STILL = "(async () => { const v = await mien; return [v.yaw, v.playing, document.getElementById('idle').checked]; })()"
 PRESS = """(async () => {
   const viewer = await mien, [smile] = [...document.querySelectorAll("#faces [aria-pressed]")];

@@ -29,7 +29,7 @@ export function addLife(viewer: Viewer, moveSliders: () => void): Alive {
   viewer.alive = (drawn) => enliven(drawn, avatar, life, performance.now() / 1000);
 
   const beat = (now: number) => {
-    const step = Math.min((now - before) / 1000, 0.1);
+    const passed = (now - before) / 1000, step = Math.min(passed, 0.1);
     before = now;
     if (!goal && !first && !life.idle && !life.pointer) return void (waiting = 0);
     waiting = requestAnimationFrame(beat);
@@ -38,7 +38,7 @@ export function addLife(viewer: Viewer, moveSliders: () => void): Alive {
       life.pointer = at = at.map((value, k) => value + share * (to[k] - value)) as [number, number];
     }
     if (first) {
-      first = Math.max(first - step, 0);
+      first = Math.max(first - passed, 0);
       viewer.yaw = ASIDE * (first / FIRST) ** 3;
     }
     if (goal) {
@@ -99,7 +99,11 @@ export function addLife(viewer: Viewer, moveSliders: () => void): Alive {
     aim = [share(event.clientX, box.left, box.width), -share(event.clientY, box.top, box.height)];
     moved = performance.now() / 1000;
   });
-  on(window, "pointerdown wheel keydown", () => (first = 0), { passive: true });
+  // A drag goes on from where the head is. A key comes with the head seen from the front.
+  on(window, "pointerdown wheel keydown", (event) => {
+    if (first && event.type === "keydown") viewer.yaw = 0;
+    first = 0;
+  }, { passive: true });
   for (const box of [idle, gaze]) on(box, "change", choose);
   idle.checked = gaze.checked = !calm;
   choose();

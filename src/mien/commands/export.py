@@ -321,6 +321,8 @@ class Command:
         folder = "" if self._is_file() else f", or --format {_any_of(_folders())} for a folder"
         ending = self.out.suffix.lower() or "a file without ending"
         use = _any_of(endings(only_from_files=self._is_file()))
+        if self._is_file() and ending in endings():
+            return UserError(f"{self.out}: cannot write {ending} from a file; export the workspace, or use {use}")
         return UserError(f"{self.out}: cannot write {ending}; use {use}{folder}")
 
     def _check_options(self, kind: Format) -> None:
