@@ -6,7 +6,6 @@ damage to a file of any kind; others have a meaning: a missing camera, another F
 
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -100,12 +99,12 @@ def tiny_scene(folder: Path) -> Scene:
     return scene_of(arrays, replace(model, landmarks={"mediapipe": marks}), 6)
 
 
-def another_flame(scene: Scene) -> FaceModel:
+def another_flame(scene: Scene, folder: Path) -> FaceModel:
     """Return a head of another version: as many vertices, with other bases and in another order."""
     arrays = {**scene.arrays, "shapedirs": 40 * np.roll(scene.arrays["shapedirs"], 31, 0)}
     arrays |= {"v_template": np.roll(scene.arrays["v_template"], 31, 0), "weights": np.roll(arrays["weights"], 31, 0)}
     arrays |= {"f": (scene.arrays["f"] + 31) % len(arrays["weights"])}
-    path = write_npz(Path(tempfile.mkdtemp()) / "other.npz", arrays)
+    path = write_npz(folder / "other.npz", arrays)
     return replace(flame_face_model(read_flame(path), "other"), landmarks=scene.model.landmarks)
 
 
@@ -149,7 +148,7 @@ def test_damage_is_told_in_one_line(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     scene = tiny_scene(tmp_path)
-    models = {model.name: model for model in (scene.model, another_flame(scene))}
+    models = {model.name: model for model in (scene.model, another_flame(scene, tmp_path))}
     for model in models.values():
         add_face_model(model, Path("tiny.npz"), "0")
     material = LAYOUTS[layout](tmp_path / "material", scene)

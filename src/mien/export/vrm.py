@@ -30,7 +30,7 @@ PERMISSIONS = {
     "allowPoliticalOrReligiousUsage": False,
     "allowAntisocialOrHateUsage": False,
 }
-"""What the file permits: the least that VRM can say, because the head is that of a living person."""
+"""Permissions of the file: the least that VRM can say, because the head is that of a living person."""
 BODY: dict[str, tuple[str | None, tuple[float, float, float]]] = {
     "hips": (None, (0, 0.92, 0)),
     "spine": ("hips", (0, 0.14, -0.01)),

@@ -23,7 +23,7 @@ TEMPLATE = Path(__file__).with_name("page.html")
 WEBGPU = Path(__file__).with_name("webgpu.js")
 MICROPHONE = Path(__file__).with_name("microphone.html")
 _SILENT = "; form-action 'none'; base-uri 'none'"
-"""What the policy of a page with a microphone forbids in addition, so that nothing that it hears can leave it."""
+"""Additions to the policy of a page with a microphone, so that nothing that it hears can leave it."""
 _SIDE = 512
 """Sides of the pictures that the loss is measured on, in pixels."""
 _SHARE = 0.25

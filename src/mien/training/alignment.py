@@ -176,7 +176,7 @@ class _Batch:
     """Timesteps that are drawn together, for speed alone, with their pictures."""
 
     indices: list[int]
-    """Where the timesteps are in the track."""
+    """Indices of the timesteps in the track."""
     views: list[_View]
     shown: list[Target]
     """The picture of each view."""
