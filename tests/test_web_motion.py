@@ -213,14 +213,16 @@ LIVE = """(async () => {
   document.getElementById("reset").click();
   for (const id of ["idle", "gaze"]) document.getElementById(id).click();
   const box = viewer.canvas.getBoundingClientRect(), blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft");
-  dispatchEvent(new PointerEvent("pointermove", { clientX: box.right, clientY: box.top }));
   const eye = 3 * viewer.avatar.joint_names.indexOf("left_eye"), began = performance.now();
-  let closed = 0;
-  while (performance.now() - began < 30000 && closed < 0.3) {
+  let closed = 0, gaze = [0, 0, 0], head_rotation;
+  // Eyes follow a pointer for some seconds, and a blink may come later or at once: the pointer moves until both are seen.
+  while (performance.now() - began < 30000 && (closed < 0.3 || gaze[0] > -0.1 || gaze[1] < 0.2)) {
+    dispatchEvent(new PointerEvent("pointermove", { clientX: box.right, clientY: box.top }));
     closed = Math.max(closed, viewer.shown.expression[blink]);
+    gaze = Array.from(viewer.shown.joints.subarray(eye, eye + 3));
+    ({ head_rotation } = viewer.shown);
     await new Promise((done) => setTimeout(done, 10));
   }
-  const { joints, head_rotation } = viewer.shown, gaze = Array.from(joints.subarray(eye, eye + 3));
   const turned = Array.from(head_rotation), blinks = () => viewer.shown.expression[blink] > 0;
   for (const id of ["idle", "gaze"]) document.getElementById(id).click();
   for (let i = 0; i < 100 && viewer.shown !== viewer.face && blinks(); ++i)
