@@ -23,23 +23,24 @@ int checked_rank(const Basis& basis, const Values& values, const In<-1>& activat
 }
 
 mien::ActivationArrays activation_arrays(const In<-1>& inputs, const In<-1>& rest, const In<-1, -1>& directions,
-                                         const In<1>& reach, size_t rank) {
+                                         const In<-1, -1>& seen, size_t rank) {
   const size_t count = inputs.shape(0);
-  require(rest.shape(0) == count && has_shape(directions, count, rank), "the arrays do not fit each other");
-  return {inputs.data(),     static_cast<int64_t>(count), rest.data(),
-          directions.data(), static_cast<int64_t>(rank),  *reach.data()};
+  require(rest.shape(0) == count && has_shape(directions, count, rank) && seen.shape(1) == rank,
+          "the arrays do not fit each other");
+  return {inputs.data(), static_cast<int64_t>(count),        rest.data(), directions.data(), static_cast<int64_t>(rank),
+          seen.data(),   static_cast<int64_t>(seen.shape(0))};
 }
 
-void expression_activations(const In<-1>& inputs, const In<-1>& rest, const In<-1, -1>& directions, const In<1>& reach,
-                            const Out<-1>& out) {
-  const mien::ActivationArrays arrays = activation_arrays(inputs, rest, directions, reach, out.shape(0));
+void expression_activations(const In<-1>& inputs, const In<-1>& rest, const In<-1, -1>& directions,
+                            const In<-1, -1>& seen, const Out<-1>& out) {
+  const mien::ActivationArrays arrays = activation_arrays(inputs, rest, directions, seen, out.shape(0));
   const nb::gil_scoped_release release;
   mien::expression_activations(arrays, out.data());
 }
 
 void expression_activations_backward(const In<-1>& inputs, const In<-1>& rest, const In<-1, -1>& directions,
-                                     const In<1>& reach, const In<-1>& gradient, const Out<-1>& grad_inputs) {
-  const mien::ActivationArrays arrays = activation_arrays(inputs, rest, directions, reach, gradient.shape(0));
+                                     const In<-1, -1>& seen, const In<-1>& gradient, const Out<-1>& grad_inputs) {
+  const mien::ActivationArrays arrays = activation_arrays(inputs, rest, directions, seen, gradient.shape(0));
   require(same_shape(grad_inputs, inputs), "a gradient must have the shape of its array");
   const nb::gil_scoped_release release;
   mien::expression_activations_backward(arrays, gradient.data(), grad_inputs.data());
@@ -66,9 +67,9 @@ void expression_change_backward(const Array<const float>& basis, const In<-1>& a
 
 void bind_expression_change(nb::module_& module) {
   module.def("expression_activations", &expression_activations, "inputs"_a.noconvert(), "rest"_a, "directions"_a,
-             "reach"_a, "out"_a.noconvert(), "Fills the activations of one face.");
+             "seen"_a, "out"_a.noconvert(), "Fills the activations of one face.");
   module.def("expression_activations_backward", &expression_activations_backward, "inputs"_a.noconvert(), "rest"_a,
-             "directions"_a, "reach"_a, "gradient"_a, "grad_inputs"_a.noconvert(),
+             "directions"_a, "seen"_a, "gradient"_a, "grad_inputs"_a.noconvert(),
              "Fills the gradient of the inputs of one face.");
   module.def("expression_change", &expression_change, "basis"_a.noconvert(), "activations"_a, "out"_a.noconvert(),
              "Fills the changes [..] of a basis [.., r].");

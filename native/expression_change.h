@@ -8,14 +8,15 @@ namespace mien {
 
 constexpr int kMostExpressionRank = 8;
 
-// The activations of one face: (inputs - rest) directions, softly shortened to a length.
+// The activations of one face: (inputs - rest) directions, softly shortened to how far training saw faces go that way.
 struct ActivationArrays {
   const float* inputs;  // [inputs_count]
   int64_t inputs_count;
   const float* rest;        // [inputs_count]
   const float* directions;  // [inputs_count, rank]
   int64_t rank;
-  float reach;  // not negative
+  const float* seen;  // [seen_count, rank]: activations that training saw; none shortens nothing
+  int64_t seen_count;
 };
 // Fills out [rank]. Sums run in the order of the inputs, so that training and the runtime get the same bits.
 void expression_activations(const ActivationArrays& arrays, float* out);

@@ -19,8 +19,9 @@ from mien.avatar.ops.expression_changes import (
     activations_reference,
     expression_change,
     expression_change_reference,
+    outermost,
     principal_directions,
-    within_reach,
+    within_seen,
 )
 from mien.errors import UserError
 from mien.render.rendering import Rendering
@@ -74,21 +75,34 @@ def test_changes_have_the_same_bits_for_any_number_of_threads() -> None:
 
 
 def test_activations_follow_training_within_its_range_and_stop_soon_after() -> None:
-    reach, margin = torch.tensor([2.0]), 2.0 * MARGIN
+    margin = 2.0 * MARGIN
     along = torch.tensor([0.6, 0.8])
+    seen = torch.stack([2 * along, torch.tensor([-3.0, 0.0])])
     lengths = torch.tensor([0.0, 1.0, 2.0, 2.0 + margin, 1e6])
     expected = torch.tensor([0.0, 1.0, 2.0, 2.0 + margin / 2, 2.0 + margin])
-    shortened = within_reach(lengths[:, None] * along, reach)
+    shortened = within_seen(lengths[:, None] * along, seen)
     torch.testing.assert_close(shortened, expected[:, None] * along, rtol=0, atol=1e-5)
-    # Expressions that training never saw do nothing.
-    assert within_reach(lengths[:, None] * along, torch.zeros(1)).abs().max() < 1e-5
-    inputs = (lengths[1:4, None] * along).double() + 0.01
-    assert torch.autograd.gradcheck(lambda x: within_reach(x, reach.double()), inputs.requires_grad_())
+    # Of (0.8, -0.6), training saw nothing: the product with its rows is 0 and less.
+    assert within_seen(torch.tensor([[0.8, -0.6], [8.0, -6.0]]), seen).abs().max() < 1e-5
+    assert torch.equal(within_seen(lengths[:, None] * along, seen[:0]), lengths[:, None] * along)
+    inputs = torch.cat([lengths[1:4, None] * along, torch.tensor([[-4.0, 0.5], [2.0, 3.0]])]).double() + 0.01
+    assert torch.autograd.gradcheck(lambda x: within_seen(x, seen.double()), inputs.requires_grad_())
+
+
+def test_frames_of_training_are_not_shortened() -> None:
+    activations = random(200, 4)
+    seen = outermost(activations)
+    assert len(seen) < 100
+    assert torch.equal(within_seen(activations, seen), activations)
+    # One expression alone is held long before it has the length of what many together have.
+    alone = torch.tensor([[1.2 * float(activations[:, 0].max()), 0, 0, 0]])
+    assert float(alone.norm()) < float(activations.norm(dim=1).max())
+    assert float(within_seen(alone, seen).norm()) < float(alone.norm())
 
 
 def test_native_activations_equal_their_reference() -> None:
     avatar = new_avatar()
-    fixed = [getattr(avatar.activations, name) for name in ("rest", "directions", "reach")]
+    fixed = [getattr(avatar.activations, name) for name in ("rest", "directions", "seen")]
     face = toy_face(5)
     face = replace(face, expression=(3 * face.expression).requires_grad_())
     inputs = torch.cat([face.expression, face.joints.flatten(1)], -1)
@@ -103,13 +117,12 @@ def test_native_activations_equal_their_reference() -> None:
 def test_directions_are_those_of_the_largest_spread() -> None:
     axes = torch.linalg.qr(random(6, 6)).Q
     offsets = (random(500, 6, seed=1) * torch.tensor([4.0, 2.0, 0, 0, 0, 0])) @ axes.T
-    directions, reach = principal_directions(offsets, 4)
+    directions = principal_directions(offsets, 4)
     along = offsets @ directions
     assert (directions[:, 0] @ axes[:, 0]).abs() * 4 == pytest.approx(1, abs=0.1)
     torch.testing.assert_close(along.std(0)[:2], torch.ones(2), rtol=0, atol=0.02)
     # There are only two directions in these timesteps; the others do nothing.
     assert directions[:, 2:].abs().max() == 0
-    assert (along.norm(dim=-1) > reach).float().mean() == pytest.approx(0.02)
 
 
 def test_rank_0_is_the_method_without_changes() -> None:
@@ -213,12 +226,12 @@ def test_impossible_changes_are_refused(tmp_path: Path) -> None:
     changes = baked.changes
     assert changes is not None
     parts = {name: getattr(changes, name) for name in ("color", "opacity_logits", "means")}
-    fixed = {name: getattr(changes, name) for name in ("rest", "directions", "reach")}
-    none = {name: array[..., :0] for name, array in (parts | fixed).items() if name not in ("rest", "reach")}
+    fixed = {name: getattr(changes, name) for name in ("rest", "directions", "seen")}
+    none = {name: array[..., :0] for name, array in (parts | fixed).items() if name != "rest"}
     for wrong, part in (
         (replace(changes, **{name: array[:3] for name, array in parts.items()}), "the shape of color of its changes"),
         (replace(changes, rest=fixed["rest"][:1], directions=fixed["directions"][:1]), "the shape of rest of its"),
-        (replace(changes, reach=-changes.reach), "is negative"),
+        (replace(changes, seen=changes.seen[:, :1]), "the shape of seen of its"),
         (replace(changes, **none), "0 activations"),
         (replace(changes, directions=changes.directions * np.float32("nan")), "NaN"),
     ):

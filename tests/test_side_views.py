@@ -91,7 +91,7 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     avatar = GaussianAvatars(plain_gaussian_avatars(expression_rank=2, expression_weight=3.0), anny, face)
     avatar.store.assign("offset_basis", torch.ones_like(avatar.store["offset_basis"]))
     avatar.activations.directions.fill_(1.0)
-    avatar.activations.reach.fill_(1.0)
+    avatar.activations.seen = torch.full((1, 2), 0.5**0.5)
     views = replace(_views(anny), weight=0.0)
     turned, raised = (views.loss(avatar, face, _camera(), _PROGRESS, step, _random()).detach() for step in (0, 4))
     assert float(turned) == 0

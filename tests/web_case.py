@@ -119,6 +119,7 @@ def drawn_head(
     if rank:
         directions = random.standard_normal((inputs, rank)).astype(np.float32)
         rest, reach = np.zeros(inputs, np.float32), np.ones(1, np.float32)
+        seen = np.random.default_rng(1).standard_normal((7, rank)).astype(np.float32)
         taken = columns or rank
         parts = (some(0.3, 3, taken), some(0.3, taken), some(0.1, 3, taken))
         network = None
@@ -126,7 +127,7 @@ def drawn_head(
             layers = [(0.3 * random.standard_normal(shape)).astype(np.float32) for shape in ((32, features), (4, 32))]
             zeros = tuple(np.zeros(len(layer), np.float32) for layer in layers)
             network = FeatureChanges(some(0.3, features), some(0.3, rank, features), some(1, 0), tuple(layers), zeros)
-        changes = runtime.ExpressionChanges(rest, directions, reach, *parts, basis_columns=columns, features=network)
+        changes = runtime.ExpressionChanges(rest, directions, seen, *parts, basis_columns=columns, features=network)
         eye = np.eye(inputs, dtype=np.float32)
         filmed = runtime.Filmed(rest, rest + 1, eye, reach, np.zeros((2, 2), np.float32))
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)

@@ -47,12 +47,19 @@ def sigmoid_backward(native: Any, rng: Rng) -> Arguments:
 
 def expression_activations(native: Any, rng: Rng) -> Arguments:
     i, r = few(rng), int(rng.integers(1, 9))
-    return [normal(rng, i), normal(rng, i), normal(rng, i, r), np.abs(normal(rng, 1)), empty(r)]
+    return [normal(rng, i), normal(rng, i), normal(rng, i, r), normal(rng, int(rng.integers(0, 5)), r), empty(r)]
 
 
 def expression_activations_backward(native: Any, rng: Rng) -> Arguments:
     i, r = few(rng), int(rng.integers(1, 9))
-    return [normal(rng, i), normal(rng, i), normal(rng, i, r), np.abs(normal(rng, 1)), normal(rng, r), empty(i)]
+    return [
+        normal(rng, i),
+        normal(rng, i),
+        normal(rng, i, r),
+        normal(rng, int(rng.integers(0, 5)), r),
+        normal(rng, r),
+        empty(i),
+    ]
 
 
 def expression_change(native: Any, rng: Rng) -> Arguments:

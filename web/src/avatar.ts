@@ -36,7 +36,7 @@ export interface FeatureChanges {
 export interface ExpressionChanges {
   rest: Float32Array; // [i]
   directions: Float32Array; // [i, r]
-  reach: Float32Array; // [1]
+  seen: Float32Array; // [s, r], activations that training saw
   color: Float32Array | null; // [n, 3, c], where the first c of the r activations count
   opacity_logits: Float32Array | null; // [n, c]
   means: Float32Array | null; // [n, 3, c]

@@ -204,10 +204,11 @@ function isRig(rig: Rig, { expression, joints }: Face): boolean {
 }
 
 /** Whether changes with the face fit a face and `count` Gaussians. */
-function isChanges({ rest, directions, features, ...others }: ExpressionChanges, { expression, joints }: Face, count: number): boolean {
-  if (!fits({ rest, ...others }, { rest: expression.length + joints.length, reach: 1 })) return false;
+function isChanges(changes: ExpressionChanges, { expression, joints }: Face, count: number): boolean {
+  const { rest, directions, seen, features } = changes, rank = directions.length / rest.length;
+  if (!fits(changes, { rest: expression.length + joints.length, seen: rank * Math.floor(seen.length / rank) })) return false;
   if (!features) return true;
-  const { neutral, own, weights, biases } = features, hidden = biases[0].length, rank = directions.length / rest.length;
+  const { neutral, own, weights, biases } = features, hidden = biases[0].length;
   return (
     weights.length === 2 && biases.length === 2 && fits(features, { basis: rank * neutral.length }) && fits(biases, { 0: hidden, 1: 4 }) &&
     fits(weights, { 0: (hidden * (neutral.length + own.length)) / Math.max(count, 1), 1: 4 * hidden })

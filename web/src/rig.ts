@@ -143,19 +143,21 @@ export function triangleFrames(points: Float32Array, faces: Int32Array, out: Flo
   }
 }
 
-/** Activations beyond the reach are shortened by this share of it, as in native/expression_change.cpp. */
+/** How far activations get beyond what training saw along them, as a share of it, as in native/expression_change.cpp. */
 const MARGIN = 0.1;
 
-/** The r activations of a face. */
-export function activations({ rest, directions }: FeatureDirections | ExpressionChanges, face: Face, reach = Infinity): Float64Array {
+/** The r activations of a face, shortened to what training saw. */
+export function activations({ rest, directions }: FeatureDirections | ExpressionChanges, face: Face, seen?: Float32Array): Float64Array {
   const inputs = [...face.expression, ...face.joints], rank = directions.length / inputs.length, out = new Float64Array(rank);
   inputs.forEach((input, i) => {
     for (let k = 0; k < rank; ++k) out[k] += (input - rest[i]) * directions[i * rank + k];
   });
-  const length = Math.sqrt(Math.max(out.reduce((sum, x) => sum + x * x, 0), 1e-12)), over = length - reach;
-  if (!(over > 0)) return out;
-  const margin = MARGIN * reach, shorter = (reach + (margin * over) / Math.max(margin + over, 1e-6)) / length;
-  return out.map((x) => x * shorter);
+  if (!seen?.length) return out;
+  const along = (row: ArrayLike<number>, from: number) => out.reduce((sum, x, k) => sum + x * row[from + k], 0);
+  let furthest = 1e-6;
+  for (let from = 0; from < seen.length; from += rank) furthest = Math.max(furthest, along(seen, from));
+  const ratio = along(out, 0) / furthest, over = ratio - 1;
+  return over > 0 ? out.map((x) => (x * (1 + (MARGIN * over) / (MARGIN + over))) / ratio) : out;
 }
 
 /** raw + basis times the first activations, into `out`. */
@@ -238,7 +240,7 @@ export class Poser {
     if (this.binds) triangleFrames(this.points, bound.faces, this.frames);
     const { changes, attributes } = bound;
     if (!changes) return;
-    const weights = activations(changes, face, changes.reach[0]), before = this.activations;
+    const weights = activations(changes, face, changes.seen), before = this.activations;
     this.activations = weights;
     // Turns of the head alone change none of this.
     this.changed = !this.posed || weights.some((weight, k) => weight !== before[k]);

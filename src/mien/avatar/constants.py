@@ -29,8 +29,6 @@ class AvatarConstants:
     expression would count as far outside, however weak it is. Not varied."""
 
     # ops/expression_changes.py
-    expressions_seen_share: float = 0.98
-    """Share of the training timesteps whose activations are not shortened. Not varied (log, 11-22)."""
     expressions_least_deviation: float = 0.1
     """Smallest deviation that is scaled to 1, relative to that of the first direction. Weaker ones stay weak. Not
     varied."""

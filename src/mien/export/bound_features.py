@@ -10,8 +10,6 @@ from mien.runtime.baked import ExpressionChanges, FeatureChanges
 
 _UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
 """A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""
-_REACH = np.float32(1e6)
-"""Length of activations that no face has, so that none is shortened."""
 
 
 def bound_features(avatar: PortableAvatar, baked: Static) -> MeshBound | None:
@@ -36,7 +34,7 @@ def bound_features(avatar: PortableAvatar, baked: Static) -> MeshBound | None:
     changes = ExpressionChanges(
         rest=along.rest,
         directions=along.directions,
-        reach=np.array([_REACH]),
+        seen=np.empty((0, along.directions.shape[1]), np.float32),
         features=FeatureChanges(
             neutral=np.ascontiguousarray(network.base[:, :width]),
             basis=along.basis,

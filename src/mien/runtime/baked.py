@@ -117,15 +117,16 @@ class FeatureChanges:
 class ExpressionChanges:
     """Changes of the raw values with the expression, of low rank. A part that is None does not change.
 
-    The activations are (inputs - rest) directions. If their length d is beyond `reach`, they are shortened to the
-    length reach + m o / (m + o), with o = d - reach and m = reach / 10. `_native.expression_activations` computes this.
+    The activations a are (inputs - rest) directions. The furthest that a row of `seen` goes along them is l = max (seen
+    a) / |a|. If |a| is beyond l, they are shortened to the length l + m o / (m + o), with o = |a| - l and m = l / 10.
+    `_native.expression_activations` computes this.
     """
 
     rest: Float32[np.ndarray, " i"]
     """Inputs of the person at rest: expression coefficients, then axis-angle vectors of the free joints, in radians."""
     directions: Float32[np.ndarray, "i r"]
-    reach: Float32[np.ndarray, " 1"]
-    """Length of the activations up to which training saw expressions."""
+    seen: Float32[np.ndarray, "s _"]
+    """[s, r]: activations of training, those that go furthest along one of its frames. No rows shorten nothing."""
     color: Float32[np.ndarray, "n 3 _"] | None = None
     """[n, 3, r], or [n, 3, c]: changes of the first SH coefficient per unit of each activation."""
     opacity_logits: Float32[np.ndarray, "n _"] | None = None

@@ -179,15 +179,13 @@ def _changes_faults(changes: ExpressionChanges, n: int, inputs: int) -> Iterator
     if r < 1 or not 1 <= c <= r or (limited and c > MAX_ACTIVATIONS):
         yield f"its changes with the expression have {c} of {r} activations, not 1 to {MAX_ACTIVATIONS}"
         return
-    shapes = {"rest": (inputs,), "directions": (inputs, r), "reach": (1,)}
+    shapes = {"rest": (inputs,), "directions": (inputs, r), "seen": (len(changes.seen), r)}
     shapes |= {"color": (n, 3, c), "opacity_logits": (n, c), "means": (n, 3, c)}
     for name, shape in shapes.items():
         part = getattr(changes, name)
         if part is not None and part.shape != shape:
             yield f"the shape of {name} of its changes with the expression does not fit"
             return
-    if changes.reach[0] < 0:
-        yield "the reach of its changes with the expression is negative"
     if changes.features is not None:
         yield from _features_faults(changes.features, n, r)
 

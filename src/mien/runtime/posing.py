@@ -20,8 +20,6 @@ from mien.runtime.baked import (
 )
 
 _MOST_LAYERS = 64
-_UNBOUNDED = np.array([np.finfo(np.float32).max])
-"""A reach that no face goes beyond."""
 _POINT_OUTPUTS = ("log_scales", "quats", "opacity_logits", "sh")
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic: colour = 0.5 + SH_C0 * coefficient."""
@@ -191,7 +189,7 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
 
 def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.ndarray]:
     """Return the changes of the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None changes nothing."""
-    activations = _along(face, changes.rest, changes.directions, changes.reach)
+    activations = _along(face, changes.rest, changes.directions, changes.seen)
     added = {}
     for name in ("color", "opacity_logits", "means"):
         basis = getattr(changes, name)
@@ -209,12 +207,13 @@ def _along(
     face: Face,
     rest: Float32[np.ndarray, " i"],
     directions: Float32[np.ndarray, "i r"],
-    reach: Float32[np.ndarray, " 1"],
+    seen: Float32[np.ndarray, "s r"] | None = None,
 ) -> Float32[np.ndarray, " r"]:
-    """(inputs - rest) directions, shortened to the reach, by the same operation as in training."""
+    """(inputs - rest) directions, shortened to what training saw, by the same operation as in training."""
     inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
     activations = np.empty(directions.shape[1], np.float32)
-    _native.expression_activations(inputs, rest, directions, reach, activations)
+    limits = np.empty((0, len(activations)), np.float32) if seen is None else seen
+    _native.expression_activations(inputs, rest, directions, limits, activations)
     return activations
 
 
@@ -302,7 +301,7 @@ def _run_native(network: AttributeNetwork, face: Face) -> tuple[np.ndarray, np.n
         layers = zip(network.weights, network.biases, strict=True)
         arrays = [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer]
         prepared = _networks[network] = _native.FeatureNetwork(*rows, *arrays)
-    activations = _along(face, along.rest, along.directions, _UNBOUNDED)
+    activations = _along(face, along.rest, along.directions)
     bases = [_native.FeatureBases(np.ascontiguousarray(along.basis), activations, by_input=False)]
     n, outputs = len(network.base), len(network.biases[-1])
     sh, opacity_logits = np.empty((n, outputs - 1), np.float32), np.empty(n, np.float32)
@@ -323,7 +322,7 @@ def run_network(
     """The outputs of an attribute network, in numpy. This is the reference of `_native.feature_network`."""
     along = network.along
     if along is not None:
-        activations = _along(face, along.rest, along.directions, _UNBOUNDED)
+        activations = _along(face, along.rest, along.directions)
         blended = _combined(along.basis.swapaxes(0, 1), activations)
         values = network.base.copy()
         values[:, : blended.shape[1]] += blended

@@ -179,7 +179,7 @@ class GaussianAvatars(Avatar):
         if not self._changes:
             return None
         features = None if self.appearance is None else self.appearance.bake(self.store)
-        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "reach"))
+        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "seen"))
         bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in BASES)
         rank = self.config.expression_rank
         basis_columns = rank if self._basis_shapes() and rank < self._activation_count else None

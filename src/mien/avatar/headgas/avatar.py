@@ -314,7 +314,7 @@ def input_directions(
     scaled to a deviation of about 1. So one second moment serves the bases of all of them.
     """
     rest, inputs = expression_inputs(neutral)[0].detach(), expression_inputs(face)
-    directions, _ = principal_directions(inputs - rest, min(count or len(rest), len(rest)))
+    directions = principal_directions(inputs - rest, min(count or len(rest), len(rest)))
     return rest.clone(), directions
 
 

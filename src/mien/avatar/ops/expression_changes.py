@@ -17,7 +17,9 @@ from mien.avatar.constants import AVATAR
 from mien.face import FaceParams
 
 MARGIN = 0.1
-"""How far activations can get beyond what training saw, as a share of its reach."""
+"""How far activations can get beyond what training saw along them, as a share of it."""
+_LEAST_SEEN = 1e-6
+"""Smallest product with what training saw. Activations of which it saw nothing come to almost 0."""
 
 
 class ExpressionActivations(nn.Module):
@@ -30,10 +32,10 @@ class ExpressionActivations(nn.Module):
 
     rest: Tensor
     directions: Tensor
-    reach: Tensor
+    seen: Tensor
 
     def __init__(self, face: FaceParams, neutral: FaceParams, rank: int):
-        """Take the directions and the reach from the timesteps of `face`.
+        """Take the directions, and the range of the activations, from the timesteps of `face`.
 
         Args:
             face: Face parameters of all training timesteps.
@@ -42,23 +44,24 @@ class ExpressionActivations(nn.Module):
         """
         super().__init__()
         rest = expression_inputs(neutral)[0]
-        directions, reach = principal_directions(expression_inputs(face) - rest, rank)
-        for name, value in (("rest", rest), ("directions", directions), ("reach", reach)):
+        offsets = expression_inputs(face) - rest
+        directions = principal_directions(offsets, rank)
+        for name, value in (("rest", rest), ("directions", directions), ("seen", outermost(offsets @ directions))):
             self.register_buffer(name, value.detach().clone())
 
     def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
         """The activations of some timesteps. Differentiable in `face`; native for float32 on a CPU."""
-        return _activations(expression_inputs(face), self.rest, self.directions, self.reach)
+        return _activations(expression_inputs(face), self.rest, self.directions, self.seen)
 
 
 def activations_reference(
     inputs: Float[Tensor, "b i"],
     rest: Float[Tensor, " i"],
     directions: Float[Tensor, "i r"],
-    reach: Float[Tensor, " 1"],
+    seen: Float[Tensor, "s r"],
 ) -> Float[Tensor, "b r"]:
-    """(inputs - rest) directions, shortened to the reach (`within_reach`), in plain PyTorch, any dtype and device."""
-    return within_reach((inputs - rest) @ directions, reach)
+    """(inputs - rest) directions, shortened (`within_seen`), in plain PyTorch, any dtype and device."""
+    return within_seen((inputs - rest) @ directions, seen)
 
 
 @native(activations_reference)
@@ -91,11 +94,8 @@ def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
     return torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
 
 
-def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> tuple[Float[Tensor, "i r"], Float[Tensor, " 1"]]:
-    """Directions of the largest spread, strongest first, and how far along them the timesteps reach from 0.
-
-    The reach is the length of the activations that `AVATAR.expressions_seen_share` of the timesteps do not exceed.
-    """
+def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> Float[Tensor, "i r"]:
+    """Directions of the largest spread, strongest first. Along each, the timesteps have a deviation of 1 or less."""
     exact = offsets.detach().double().cpu()
     centered = exact - exact.mean(0)
     strengths, vectors = torch.linalg.eigh(centered.T @ centered / len(centered))
@@ -106,20 +106,31 @@ def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> tuple[Floa
     scales = deviations.clamp_min(max(AVATAR.expressions_least_deviation * float(deviations[0]), 1e-6))
     directions = exact.new_zeros(len(vectors), rank)
     directions[:, :count] = vectors * largest.sign() * usable / scales
-    reach = (exact @ directions).norm(dim=-1).quantile(AVATAR.expressions_seen_share, dim=0, keepdim=True)
-    return directions.to(offsets), reach.to(offsets)
+    return directions.to(offsets)
 
 
-def within_reach(values: Float[Tensor, "b r"], reach: Float[Tensor, " 1"]) -> Float[Tensor, "b r"]:
-    """`values` as they are up to the length `reach`. Longer ones keep their direction and get a shorter length.
+def outermost(activations: Float[Tensor, "t r"]) -> Float[Tensor, "s r"]:
+    """Those of some activations that go furthest along at least one of them, in their order."""
+    exact = activations.detach().double().cpu()
+    return activations[(exact @ exact.T).argmax(0).unique().to(activations.device)]
 
-    The new length approaches (1 + `MARGIN`) reach and never gets there. Its slope is continuous.
+
+def within_seen(values: Float[Tensor, "b r"], seen: Float[Tensor, "s r"]) -> Float[Tensor, "b r"]:
+    """`values`, but where they are longer than any row of `seen` goes along them: there they get shorter.
+
+    With l the furthest that a row of `seen` goes along them, the new length approaches (1 + `MARGIN`) l and never gets
+    there. Its slope is continuous. The rows of `seen` are not shortened. If there are none, nothing is.
+
+    A limit of the length alone does not hold one strong expression: in r directions of deviation 1, usual activations
+    have the length sqrt(r), which is far beyond what was filmed along any single direction.
     """
-    lengths = values.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
-    over = (lengths - reach).clamp_min(0)
-    margin = MARGIN * reach
-    shortened = reach + margin * over / (margin + over).clamp_min(1e-6)
-    return values * torch.where(over > 0, shortened / lengths, 1.0)
+    if not len(seen):
+        return values
+    furthest = (values @ seen.T).amax(-1, keepdim=True).clamp_min(_LEAST_SEEN)
+    ratio = values.square().sum(-1, keepdim=True) / furthest
+    over = (ratio - 1).clamp_min(0)
+    shortened = (1 + MARGIN * over / (MARGIN + over)) / ratio.clamp_min(1)
+    return values * torch.where(over > 0, shortened, 1.0)
 
 
 def expression_change_reference(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
