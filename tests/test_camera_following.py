@@ -75,7 +75,13 @@ def until(done: Callable[[], bool], seconds: float = 60.0) -> None:
 
 
 def test_a_file_plays_in_real_time_and_only_the_newest_frame_is_kept(clip: tuple[Path, np.ndarray]) -> None:
-    with LiveCamera(camera_named(f"camera:{clip[0]}", None), again=False) as camera:
+    tries = [_played_for_a_second(clip[0]) for _ in range(3)]  # a busy machine may stall any one of them
+    assert any(number >= 15 and abs(seconds - number / FPS) < 0.1 for number, seconds in tries), tries
+
+
+def _played_for_a_second(path: Path) -> tuple[int, float]:
+    """Play a file to its end. Return the newest frame after a second, and its time after the first frame."""
+    with LiveCamera(camera_named(f"camera:{path}", None), again=False) as camera:
         camera.start()
         first = camera.newest(-1, 30.0)
         assert first is not None
@@ -83,12 +89,11 @@ def test_a_file_plays_in_real_time_and_only_the_newest_frame_is_kept(clip: tuple
         time.sleep(1.0)
         later = camera.newest(first.number, 5.0)
         assert later is not None
-        assert later.number >= 15, "frames that nobody took are dropped"
-        assert later.seconds - first.seconds == pytest.approx(later.number / FPS, abs=0.1)
         assert camera.newest(later.number + 1000, 0.05) is None
         until(lambda: camera.ended)
         assert camera.frames == round(SECONDS * FPS)
         assert camera.error is None
+        return later.number, later.seconds - first.seconds
 
 
 def test_a_camera_that_vanishes_is_taken_up_again(clip: tuple[Path, np.ndarray], tmp_path: Path) -> None:
