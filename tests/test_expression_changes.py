@@ -12,7 +12,7 @@ from torch import Tensor
 
 import train_toy
 from mien import _native, runtime
-from mien.avatar import GaussianAvatars, Progress, Rate, make_portable
+from mien.avatar import GaussianAvatars, Progress, Rate, load_avatar, make_portable, write_avatar
 from mien.avatar.gaussian_avatars.avatar import resting_opacities
 from mien.avatar.ops.expression_changes import (
     MARGIN,
@@ -217,6 +217,17 @@ def test_files_with_changes_and_without_come_back(tmp_path: Path) -> None:
         read = runtime.read_portable(path)
         runtime.write_portable(tmp_path / "again.mien", read)
         assert (tmp_path / "again.mien").read_bytes() == path.read_bytes()
+
+
+def test_avatars_on_disk_keep_what_training_saw(tmp_path: Path) -> None:
+    avatar = new_avatar(2)
+    avatar.activations.seen = random(7, 2)
+    write_avatar(tmp_path, avatar)
+    assert torch.equal(load_avatar(tmp_path).activations.seen, avatar.activations.seen)
+    avatar.activations.seen = random(7, 3)
+    write_avatar(tmp_path, avatar)
+    with pytest.raises(UserError, match="does not fit its settings"):
+        load_avatar(tmp_path)
 
 
 def test_impossible_changes_are_refused(tmp_path: Path) -> None:

@@ -49,6 +49,13 @@ class ExpressionActivations(nn.Module):
         for name, value in (("rest", rest), ("directions", directions), ("seen", outermost(offsets @ directions))):
             self.register_buffer(name, value.detach().clone())
 
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
+        # The number of rows comes from the frames, which are not there when an avatar is loaded.
+        seen = state_dict.get(prefix + "seen")
+        if seen is not None and seen.shape[1:] == self.seen.shape[1:]:
+            self.seen = self.seen.new_empty(seen.shape)
+        super()._load_from_state_dict(state_dict, prefix, *others)
+
     def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
         """The activations of some timesteps. Differentiable in `face`; native for float32 on a CPU."""
         return _activations(expression_inputs(face), self.rest, self.directions, self.seen)
