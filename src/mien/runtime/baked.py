@@ -126,7 +126,8 @@ class ExpressionChanges:
     """Inputs of the person at rest: expression coefficients, then axis-angle vectors of the free joints, in radians."""
     directions: Float32[np.ndarray, "i r"]
     seen: Float32[np.ndarray, "s _"]
-    """[s, r]: activations of training, those that go furthest along one of its frames. No rows shorten nothing."""
+    """[s, r]: activations that are allowed: those of training frames that go furthest along one of these, and a fifth
+    more. No rows shorten nothing."""
     color: Float32[np.ndarray, "n 3 _"] | None = None
     """[n, 3, r], or [n, 3, c]: changes of the first SH coefficient per unit of each activation."""
     opacity_logits: Float32[np.ndarray, "n _"] | None = None

@@ -46,7 +46,8 @@ class ExpressionActivations(nn.Module):
         rest = expression_inputs(neutral)[0]
         offsets = expression_inputs(face) - rest
         directions = principal_directions(offsets, rank)
-        for name, value in (("rest", rest), ("directions", directions), ("seen", outermost(offsets @ directions))):
+        seen = AVATAR.expressions_beyond * outermost(offsets @ directions)
+        for name, value in (("rest", rest), ("directions", directions), ("seen", seen)):
             self.register_buffer(name, value.detach().clone())
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
