@@ -1,6 +1,8 @@
 """Frames aligned to a quick avatar: they come nearer to the truth, and what is held out reaches no avatar."""
 
+import itertools
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from mien.evaluation.metrics import l1
 from mien.face import FaceParams
 from mien.tracking import read_tracking
 from mien.training import AlignmentSettings, TrainSettings, align
-from mien.training.alignment import _Descent, align_faces, steadier
+from mien.training.alignment import TRAINING, _Descent, align_faces, steadier
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 
@@ -71,6 +73,47 @@ def test_a_frame_does_not_depend_on_those_beside_it() -> None:
     found = aligned(experiment, start, iterations=3).expression
     images[5] = 255 - images[5]
     assert aligned(experiment, start, iterations=3).expression[:5].equal(found[:5])
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_what_was_stopped_goes_on_to_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mien.training.alignment.TRAINING", replace(TRAINING, aligned_together=2))
+    experiment = make_experiment(6)
+    start, settings = astray(experiment.faces[0]), AlignmentSettings(resolution=32, iterations=2)
+    begun: list[int] = []
+
+    def interrupted(title: str, total: int, completed: int):  # noqa: ANN202
+        begun.append(completed)
+
+        @contextmanager
+        def bar():  # noqa: ANN202
+            done = itertools.count(1)
+
+            def advance(count: int) -> None:
+                if len(begun) == 1 and next(done) == 2:
+                    raise Stopped
+
+            yield advance
+
+        return bar()
+
+    def run(folder: Path | None) -> FaceParams:
+        known = experiment.training_frames
+        return align_faces(
+            experiment.avatar, experiment.sequences, [start], known, settings, folder=folder, progress=interrupted
+        )[0]
+
+    with pytest.raises(Stopped):
+        run(tmp_path)
+    resumed, whole = run(tmp_path), run(None)
+    assert begun == [0, 4, 0]
+    for name, tensor in whole.tensors().items():
+        assert tensor.equal(resumed.tensors()[name]), name
+    (tmp_path / "aligned.safetensors").write_bytes(b"damaged")
+    assert run(tmp_path).expression.equal(whole.expression)
 
 
 def test_what_matters_more_moves_further() -> None:

@@ -17,9 +17,11 @@ from torch import Tensor
 
 from mien.avatar import DEFAULT_METHOD, Avatar, FaceTuning, Moments, ParameterGroup, Rate, frozen
 from mien.config import overlay
+from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, concatenate
 from mien.progress import progress_bar
 from mien.render.rasterize import rasterize_each
+from mien.storage import read_tensors, write_tensors
 from mien.threads import one_torch_thread
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.constants import TRAINING
@@ -33,6 +35,8 @@ from mien.training.trainer import ProgressBar, train
 _WHITE = np.full(3, 255, np.uint8)
 _EPSILON = 1e-12
 """Least size of gradients, so that those of zero move nothing."""
+_KEPT = "aligned.safetensors"
+"""File with the parameters of timesteps that are aligned."""
 _Timestep = tuple[int, int, tuple[int, ...]]
 """A timestep to align: the index of its sequence, the timestep, and the cameras that see the face."""
 
@@ -64,7 +68,8 @@ def align(
         face_model: The face model that they were tracked with.
         settings: Settings of the template and of the alignment.
         training: Settings of the run that the alignment is for. Its split, seed, device and threads are used.
-        folder: Where the template is trained. A stopped training continues there.
+        folder: Where the template is trained, and the frames that are aligned are kept. What was stopped continues
+            there. It belongs to these sequences and settings alone.
         progress: Makes progress bars.
 
     Returns:
@@ -97,7 +102,7 @@ def align(
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     starts = _split(read_face_track(folder, face_model), lengths)
     known = training_frames(sequences, how)
-    aligned = align_faces(template, sequences, starts, known, settings, training.held_out_cameras, progress)
+    aligned = align_faces(template, sequences, starts, known, settings, training.held_out_cameras, folder, progress)
     return [steadier(sequence.tracking.face, face) for sequence, face in zip(sequences, aligned, strict=True)]
 
 
@@ -121,6 +126,7 @@ def align_faces(
     known: Items[Frame],
     settings: AlignmentSettings,
     held_out_cameras: Items[str] = (),
+    folder: Path | None = None,
     progress: ProgressBar = progress_bar,
 ) -> list[FaceParams]:
     """Return the face parameters of each sequence with which a fixed avatar looks most like the pictures.
@@ -135,6 +141,7 @@ def align_faces(
         known: The frames that the avatar was trained on. Some of them say how large gradients are.
         settings: Settings of the descent.
         held_out_cameras: Ids of cameras that are not looked at.
+        folder: Where timesteps that are aligned are kept, for this call and no other. A stopped call continues there.
         progress: Makes progress bars.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
@@ -144,18 +151,59 @@ def align_faces(
     timesteps = [one for index, own in enumerate(sequences) for one in _looked_at(index, own, held_out_cameras)]
     trained = {frame[:2] for frame in known}
     judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, TRAINING.aligned_judged)
-    with one_torch_thread(), frozen(avatar), progress("aligning frames", len(timesteps), 0) as advance:
+    with one_torch_thread(), frozen(avatar):
         descent = _Descent(_sizes([_Batch.of(part, track, targets) for part in _batches(judged)], avatar, track))
-        for part in _batches(timesteps):
-            batch = _Batch.of(part, track, targets)
-            for _ in range(settings.iterations):
-                batch.find_gradients(avatar, track)
-                descent.step(batch.groups(track))
-                for index in batch.indices:
-                    track.confine(index)
-            advance(len(part))
+        indices = [track.index_of(*timestep[:2]) for timestep in timesteps]
+        done = _take_up(folder, track, indices)
+        with progress("aligning frames", len(timesteps), done) as advance:
+            for part in _batches(timesteps[done:]):
+                batch = _Batch.of(part, track, targets)
+                for _ in range(settings.iterations):
+                    batch.find_gradients(avatar, track)
+                    descent.step(batch.groups(track))
+                    for index in batch.indices:
+                        track.confine(index)
+                done += len(part)
+                _keep(folder, track, indices[:done])
+                advance(len(part))
     track.steady_pose()
     return _split(track.params().detach(), lengths)
+
+
+def _keep(folder: Path | None, track: FaceTrack, indices: list[int]) -> None:
+    """Write the parameters of timesteps that are aligned."""
+    if folder is not None:
+        each = [_values(track, index) for index in indices]
+        write_tensors(folder / _KEPT, {name: torch.stack([values[name] for values in each]) for name in each[0]})
+
+
+@torch.no_grad()
+def _take_up(folder: Path | None, track: FaceTrack, indices: list[int]) -> int:
+    """Take what `_keep` wrote. Return how many timesteps that is, which are the first of `indices`."""
+    if folder is None or not (folder / _KEPT).exists():
+        return 0
+    try:
+        kept = read_tensors(folder / _KEPT)
+    except UserError:  # damaged
+        return 0
+    shapes = {name: tensor.shape for name, tensor in _values(track, indices[0]).items()}
+    counts = {len(tensor) for tensor in kept.values() if tensor.ndim}
+    if {name: tensor.shape[1:] for name, tensor in kept.items()} != shapes or len(counts) != 1:
+        return 0
+    done = counts.pop()
+    for place, index in enumerate(indices[:done]):
+        for name, tensor in _values(track, index).items():
+            tensor.copy_(kept[name][place])
+        for group in track.parameter_groups(index):
+            for name in group.tensors:
+                _moments(group, name).step += 1  # tells the track that the timestep moved
+    return min(done, len(indices))
+
+
+def _values(track: FaceTrack, index: int) -> dict[str, Tensor]:
+    """The parameters of one timestep."""
+    groups = track.parameter_groups(index)
+    return {f"{group.name}.{name}": tensor for group in groups for name, tensor in group.tensors.items()}
 
 
 def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
