@@ -92,7 +92,7 @@ def test_what_was_stopped_goes_on_to_the_same_bytes(tmp_path: Path, monkeypatch:
         def bar():  # noqa: ANN202
             done = itertools.count(1)
 
-            def advance(count: int) -> None:
+            def advance(amount: int = 1, status: str = "") -> None:
                 if len(begun) == 1 and next(done) == 2:
                     raise Stopped
 
