@@ -215,7 +215,7 @@ LIVE = """(async () => {
   const box = viewer.canvas.getBoundingClientRect(), blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft");
   const eye = 3 * viewer.avatar.joint_names.indexOf("left_eye"), began = performance.now();
   let closed = 0, gaze = [0, 0, 0], head_rotation;
-  // Eyes follow a pointer for some seconds, and a blink may come later or at once: the pointer moves until both are seen.
+  // Eyes follow a pointer for some seconds, and a blink may come later: the pointer moves until both are seen.
   while (performance.now() - began < 30000 && (closed < 0.3 || gaze[0] > -0.1 || gaze[1] < 0.2)) {
     dispatchEvent(new PointerEvent("pointermove", { clientX: box.right, clientY: box.top }));
     closed = Math.max(closed, viewer.shown.expression[blink]);

@@ -63,7 +63,7 @@ def picture_grid(
     gap: int = 4,
     color: int | tuple[int, int, int] = WHITE,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Pictures of one size in rows of `columns`, with gaps of `gap` pixels in a colour, which also fills the last row."""
+    """Pictures of one size in rows of `columns`. A colour is that of gaps of `gap` pixels, and fills the last row."""
     assert images, "no pictures"
     blank = np.full_like(images[0], color)
     padded = [*images, *([blank] * (-len(images) % columns))]
