@@ -22,7 +22,7 @@ return [buttons.length, avatar.viewer.face.expression[jaw]];
 
 def npm(folder: Path, *arguments: str | Path) -> None:
     command = [shutil.which("npm") or "npm", *map(str, arguments), "--no-audit", "--no-fund"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=400)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1000)
     assert done.returncode == 0, done.stderr
 
 
@@ -40,9 +40,10 @@ def test_the_starter_is_built_from_the_packed_package_and_shows_an_avatar(tmp_pa
     write_packed(starter / "public" / "me.packed", drawn_head(3000))
     npm(starter, "run", "build")
     with served(starter / "dist") as address:
-        told = browse(address, [script(LOADED, PRESS)], size=(640, 480), screenshots=[tmp_path / "page.png"])
+        told = browse(address, [script(LOADED, PRESS)], size=(640, 480), screenshots=[str(tmp_path / "page.png")])
     (count, jaw), shown = told["results"][0], cv2.imread(str(tmp_path / "page.png"))
     assert told["messages"] == []
     assert count >= 6
     assert jaw > 0.1
+    assert shown is not None
     assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 500, "a head in many colours is drawn"
