@@ -143,10 +143,15 @@ def test_missing_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert not (tmp_path / "out").exists()
 
 
-def test_file_that_is_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("command", ["create", "capture"])
+def test_file_that_is_no_video(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """It is refused before anything heavy is loaded, so that nobody waits for the answer."""
     path = tmp_path / "letter.mp4"
     path.write_text("Dear reader")
-    assert "letter.mp4" in complaint(capsys, "create", str(path), "--out", str(tmp_path / "out"))
+    monkeypatch.setattr(f"mien.commands.{command}.Command.run", lambda command: pytest.fail("the work began"))
+    assert "letter.mp4" in complaint(capsys, command, str(path), "--out", str(tmp_path / "out"))
 
 
 def test_video_without_a_face(faceless_video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

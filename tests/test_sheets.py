@@ -86,6 +86,19 @@ def test_a_name_that_is_too_wide_is_written_smaller() -> None:
     assert draw_sheet(tiles, lambda face, camera: picture).shape[1] == TURNTABLE_TILES * 40 + (TURNTABLE_TILES - 1) * 4
 
 
+def test_a_sheet_fits_a_screen_its_names_are_legible_and_its_gaps_have_the_colour_of_the_background() -> None:
+    tiles = turntable_tiles(make_small_face_model().neutral(), CAMERA, torch.zeros(3), 90.0)
+    blue = (26, 32, 80)
+    picture = np.full((512, 512, 3), blue, np.uint8)
+    sheet = draw_sheet(tiles, lambda face, camera: picture, blue)
+    high = named_picture(picture, "-70 degrees").shape[0] - 512
+    assert sheet.shape == (3 * (512 + high) + 2 * 4, 3 * 512 + 2 * 4, 3)
+    bar = sheet[512 : 512 + high, :512].astype(int)
+    rows = np.flatnonzero(np.abs(bar - blue).sum(-1).max(1) > 300)
+    assert np.ptp(rows) > 0.03 * 512, "letters are as large as their picture asks for, and light over a dark colour"
+    assert (sheet[:, 512:516] == blue).all()
+
+
 @pytest.mark.parametrize("options", [["expressions"], ["filmed", "--strength", "1.5"], ["turntable", "--span", "180"]])
 def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: list[str]) -> None:
     out = tmp_path / "sheet.png"

@@ -11,6 +11,7 @@ from mien import runtime
 from mien.avatar import GaussianAvatars, make_portable
 from mien.cli import main
 from mien.commands.stages.exporting import RunContent
+from mien.commands.stages.pictures import posed_softly
 from mien.export import write_packed
 from mien.face import FaceModel, load_face_model
 from mien.gaussians import world_means
@@ -62,6 +63,14 @@ def test_what_is_far_from_the_cut_keeps_its_bytes_and_the_end_of_the_neck_is_cle
     assert between.any()
     assert (now[between] <= was[between]).all()
     assert (now[between] < 0.9 * was[between]).any()
+
+
+def test_pictures_end_as_softly_as_files(avatar: GaussianAvatars) -> None:
+    soft, sharp = posed_softly(avatar)(avatar.subject), avatar.pose(avatar.subject).gaussians.timestep(0)
+    shown = opacities(with_soft_cut(make_portable(avatar, toy_camera(64), "soft"), avatar))
+    np.testing.assert_allclose(soft.opacities.numpy(), shown, atol=WHOLE_HEAD.soft_cut_least + 1e-6)
+    assert torch.equal(soft.means, sharp.means)
+    assert float((soft.opacities / sharp.opacities.detach()).min()) < 0.01
 
 
 def test_shares_grow_with_the_distance_from_the_cut(model: FaceModel) -> None:

@@ -85,7 +85,7 @@ const opened = setInterval(() => {
   clearInterval(opened);
   mien.then((viewer) => {
     const turned = setInterval(() => {
-      if (viewer.yaw < 0.1) return;
+      if (Math.abs(viewer.yaw) < 0.1) return;
       clearInterval(turned);
       const before = viewer.yaw;
       document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "x", bubbles: true }));
@@ -97,10 +97,14 @@ WAIT = "(async () => { while (!pressed.length) await new Promise((done) => setTi
 
 
 @pytest.mark.slow
-def test_a_key_ends_the_first_turn_in_front(page: Path) -> None:
-    told = browse(page, [WAIT], size=(300, 200), device=["lively"], opening=PRESSED)
+@pytest.mark.parametrize("looks", [-1, 1])
+def test_a_key_ends_the_first_turn_in_front(portable: runtime.PortableAvatar, tmp_path: Path, looks: int) -> None:
+    """The turn begins at the side that the camera saw: a head that looks to the picture's right shows its right."""
+    turned = replace(portable.neutral, head_rotation=np.array([0.05, 0.2 * looks, 0.02], np.float32))
+    write_page(tmp_path / "a.html", replace(portable, neutral=turned))
+    told = browse(tmp_path / "a.html", [WAIT], size=(300, 200), device=["lively"], opening=PRESSED)
     before, after = told["results"][0]
-    assert before >= 0.1
+    assert -looks * before >= 0.1
     assert after == 0
 
 

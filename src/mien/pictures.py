@@ -45,25 +45,30 @@ def error_heat(
     return heat_colors(difference.detach().cpu().numpy().astype(np.float32), limit)
 
 
-def side_by_side(images: Sequence[UInt8[np.ndarray, "_ _ 3"]], gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
-    """Pictures in a row, scaled to the first one's height, with white gaps of `gap` pixels."""
+def side_by_side(
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"]], gap: int = 4, color: int | tuple[int, int, int] = WHITE
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Pictures in a row, scaled to the first one's height, with gaps of `gap` pixels in a colour."""
     assert images, "no pictures"
     height = images[0].shape[0]
     row: list[np.ndarray] = []
     for image in images:
-        row += [np.full((height, gap, 3), WHITE, np.uint8), _scaled_to_height(image, height)]
+        row += [np.full((height, gap, 3), color, np.uint8), _scaled_to_height(image, height)]
     return np.concatenate(row[1:], axis=1)
 
 
 def picture_grid(
-    images: Sequence[UInt8[np.ndarray, "_ _ 3"]], columns: int, gap: int = 4
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"]],
+    columns: int,
+    gap: int = 4,
+    color: int | tuple[int, int, int] = WHITE,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Pictures of one size in rows of `columns`, with white gaps of `gap` pixels. The last row is filled with white."""
+    """Pictures of one size in rows of `columns`. A colour is that of gaps of `gap` pixels, and fills the last row."""
     assert images, "no pictures"
-    blank = np.full_like(images[0], WHITE)
+    blank = np.full_like(images[0], color)
     padded = [*images, *([blank] * (-len(images) % columns))]
-    rows = [side_by_side(padded[start : start + columns], gap) for start in range(0, len(padded), columns)]
-    between = np.full((gap, rows[0].shape[1], 3), WHITE, np.uint8)
+    rows = [side_by_side(padded[start : start + columns], gap, color) for start in range(0, len(padded), columns)]
+    between = np.full((gap, rows[0].shape[1], 3), color, np.uint8)
     stacked = [part for row in rows for part in (between, row)]
     return np.concatenate(stacked[1:], axis=0)
 

@@ -11,8 +11,8 @@ import type { Viewer } from "./viewer";
 const MOST_FACES = 8;
 /** Time in which a face goes two thirds of its way, that of the eyes, and how long the first turn takes, in seconds. */
 const SOFT = 0.07, EYES = 0.12, FIRST = 1.6;
-/** Turn of the camera when the page opens, in radians, and seconds after which eyes look ahead again. */
-const ASIDE = 0.6, BORED = 4;
+/** Turn of the camera when the page opens, in radians, to the side of the head that the camera saw, and seconds after which eyes look ahead again. */
+const ASIDE = 0.45, BORED = 4;
 
 export interface Alive {
   /** Goes softly to a face; to the person at rest without a name. */
@@ -24,6 +24,7 @@ export interface Alive {
 export function addLife(viewer: Viewer, moveSliders: () => void): Alive {
   const idle = find<HTMLInputElement>("idle"), gaze = find<HTMLInputElement>("gaze"), { canvas, avatar, face } = viewer;
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches, buttons = new Map<string, HTMLButtonElement>();
+  const side = viewer.view(1, 1).head[2] > 0 ? -ASIDE : ASIDE;
   const life: Life = { idle: false, pointer: null };
   let goal: Face | null = null, shown: string | undefined, at = [0, 0], aim = [0, 0], moved = -BORED, before = 0, waiting = 0, first = calm ? 0 : FIRST;
   viewer.alive = (drawn) => enliven(drawn, avatar, life, performance.now() / 1000);
@@ -38,8 +39,9 @@ export function addLife(viewer: Viewer, moveSliders: () => void): Alive {
       life.pointer = at = at.map((value, k) => value + share * (to[k] - value)) as [number, number];
     }
     if (first) {
-      first = Math.max(first - passed, 0);
-      viewer.yaw = ASIDE * (first / FIRST) ** 3;
+      // A page that draws slowly shows it, too.
+      first = Math.max(first - Math.min(passed, 0.3), 0);
+      viewer.yaw = side * (first / FIRST) ** 3;
     }
     if (goal) {
       const share = 1 - Math.exp(-step / SOFT);

@@ -41,7 +41,7 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without the libraries that capture."""
-        from mien.commands.stages.names import rig_name, sequence_names
+        from mien.commands.stages.names import check_videos, rig_name, sequence_names
 
         names = () if self.name is None else (self.name,)
         if self.calibration is not None:
@@ -55,6 +55,7 @@ class Command:
             sequence_names(self.videos, names)
         self.settings.check()
         check_new_workspace(self.out)
+        check_videos(self.videos)
 
     def run(self) -> None:
         """Capture the videos and report what was found."""

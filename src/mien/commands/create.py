@@ -53,7 +53,7 @@ class Command:
 
     def check(self) -> None:
         """Check options, names and paths without heavy libraries."""
-        from mien.commands.stages.names import rig_name, run_name, sequence_names
+        from mien.commands.stages.names import check_videos, rig_name, run_name, sequence_names
 
         self.options.check()
         if self.view:
@@ -77,6 +77,7 @@ class Command:
         self.tracking.check()
         self.alignment.check()
         check_new_workspace(self.out)
+        check_videos(self.videos)
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import mien.export.output
 
 _NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "green": (0.0, 1.0, 0.0)}
-_MIN_SIDE = 16
+_MIN_SIDE, _SIDE = 16, 512
 _HEX = re.compile(r"#?([0-9a-fA-F]{6})")
 
 
@@ -20,8 +20,8 @@ _HEX = re.compile(r"#?([0-9a-fA-F]{6})")
 class PictureOptions:
     """Size and background of pictures."""
 
-    size: int = 512
-    """Width and height in pixels, from 16 to 8192."""
+    size: int | None = None
+    """Width and height in pixels, from 16 to 8192 (default: 512)."""
     width: int | None = None
     """Width in pixels, instead of --size. The head keeps its shape."""
     height: int | None = None
@@ -50,7 +50,8 @@ class PictureOptions:
 
     def shape(self) -> tuple[int, int]:
         """Width and height in pixels."""
-        wide, high = (self.size if given is None else given for given in (self.width, self.height))
+        size = _SIDE if self.size is None else self.size
+        wide, high = (size if given is None else given for given in (self.width, self.height))
         return wide, high
 
     def color(self) -> tuple[float, float, float]:

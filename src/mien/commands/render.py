@@ -46,7 +46,7 @@ class Command:
     sheet: Literal["none", "expressions", "filmed", "turntable"] = "none"
     """Many pictures in one .png, each with its name: every expression at --strength (expressions), every expression at
     --strength times the most that was filmed (filmed), or sides of the head, --span degrees from end to end
-    (turntable). --size is that of one of them."""
+    (turntable). --size is that of one of them (default: 288, and 512 for sides)."""
     strength: float = 1.0
     """Strength of the expressions on a sheet, from 0 to 3."""
     cameras: Path | None = None
@@ -104,7 +104,7 @@ class Command:
             return
         from mien.avatar import load_avatar, move_avatar
         from mien.commands.expression import tell_of_unfilmed, with_expression
-        from mien.commands.stages.pictures import draw, warn_of_white
+        from mien.commands.stages.pictures import draw, posed_softly, warn_of_white
         from mien.export.pictures import write_pictures
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
@@ -143,11 +143,11 @@ class Command:
         like = like_on(choose_device(self.device))
         move_avatar(avatar, like)
         face = face.to(like)
-        still = None if motion is not None else avatar.pose(face).gaussians.detach().timestep(0)
+        pose = posed_softly(avatar)
+        still = None if motion is not None else pose(face)
 
         def picture(index: int) -> "numpy.ndarray":
-            posed = still or avatar.pose(face[index]).gaussians.detach().timestep(0)
-            return draw(self.picture, posed, cameras[index], avatar.extras.closing)
+            return draw(self.picture, still or pose(face[index]), cameras[index], avatar.extras.closing)
 
         pictures = (picture(index) for index in range(len(cameras)))
         shown = pictures if output.kind == "still" else track_progress(pictures, "Rendering", len(cameras))
@@ -204,10 +204,14 @@ class Command:
     def _camera(self, run_dir: Path, subject: "mien.face.FaceParams") -> "mien.camera.Camera":
         """The run's first camera, moved by --yaw, --pitch and --zoom."""
         from mien.commands.stages.pictures import view
+        from mien.commands.stages.sheets import SMALL_TILE
         from mien.render.camera_paths import turned_camera
         from mien.training import run_camera
 
-        camera, center = view(self.picture, run_camera(run_dir), self.zoom), subject.head_translation[0]
+        options = self.picture
+        if self.sheet in ("expressions", "filmed") and options.size is None:
+            options = replace(options, size=SMALL_TILE)
+        camera, center = view(options, run_camera(run_dir), self.zoom), subject.head_translation[0]
         return turned_camera(camera, center, math.radians(self.yaw), math.radians(self.pitch))
 
     def _draw_sheet(
@@ -218,7 +222,7 @@ class Command:
         output: "mien.export.output.Output",
     ) -> None:
         from mien.avatar import move_avatar
-        from mien.commands.stages.pictures import draw
+        from mien.commands.stages.pictures import draw, posed_softly
         from mien.commands.stages.sheets import draw_sheet, expression_tiles, filmed_tiles, turntable_tiles
         from mien.export.pictures import write_pictures
         from mien.progress import say
@@ -233,12 +237,13 @@ class Command:
             tiles = expression_tiles(model, face, camera, self.strength)
         like = like_on(choose_device(self.device))
         move_avatar(avatar, like)
+        pose = posed_softly(avatar)
 
         def picture(face: "mien.face.FaceParams", camera: "mien.camera.Camera") -> "numpy.ndarray":
-            posed = avatar.pose(face.to(like)).gaussians.detach().timestep(0)
-            return draw(self.picture, posed, camera, avatar.extras.closing)
+            return draw(self.picture, pose(face.to(like)), camera, avatar.extras.closing)
 
-        write_pictures(output, [draw_sheet(tiles, picture)], self.fps)
+        red, green, blue = (round(255 * value) for value in self.picture.color())
+        write_pictures(output, [draw_sheet(tiles, picture, (red, green, blue))], self.fps)
         say(f"{self.out}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
 
     def _chosen_timestep(self, run_dir: Path, face_model: "mien.face.FaceModel") -> "mien.face.FaceParams | None":

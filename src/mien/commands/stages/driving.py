@@ -13,7 +13,7 @@ from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.options import NEUTRALS, check_driver, check_neutral, is_tracked_sequence
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import run_capture_stage
-from mien.commands.stages.pictures import draw, view, warn_of_white
+from mien.commands.stages.pictures import draw, posed_softly, view, warn_of_white
 from mien.commands.stages.tracking import run_tracking_stage
 from mien.driving import (
     Driver,
@@ -124,10 +124,10 @@ def run_driving_stage(
         if softened:
             say(f"{softened} of {len(driven)} frames go beyond what was filmed and are softened; --unlimited lets go")
     beside = None if options.alone or output.transparent else driver.pictures
+    pose = posed_softly(avatar)
 
     def frame(timestep: int) -> np.ndarray:
-        posed = avatar.pose(driven[timestep]).gaussians.detach().timestep(0)
-        shown = draw(picture, posed, camera, avatar.extras.closing)
+        shown = draw(picture, pose(driven[timestep]), camera, avatar.extras.closing)
         if beside is None:
             return shown
         theirs = beside(timestep)

@@ -74,6 +74,20 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
     return found
 
 
+def check_videos(videos: Sequence[Path]) -> None:
+    """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture.
+
+    Raises:
+        UserError: a file is no video, or one that cannot be opened.
+    """
+    from mien.capture.video_file import open_video
+
+    for video in videos:
+        if video.is_file():
+            with open_video(video):
+                pass
+
+
 def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
     """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder.
 

@@ -1,5 +1,7 @@
 """From posed Gaussians to pictures, with the options of the command line."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +13,34 @@ from mien.avatar import Avatar
 from mien.camera import Camera
 from mien.commands.picture import PictureOptions
 from mien.export.pixels import to_rgb, to_rgba
+from mien.face import FaceParams
 from mien.gaussians import Gaussians
 from mien.progress import say
 from mien.render import close_holes, rasterize
 from mien.render.validation import drawable
 from mien.training import read_run_config
+from mien.training.whole_head import shares_left
 
 
 def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
     """The camera for pictures of the chosen size."""
     return camera.fitted(*options.shape(), zoom)
+
+
+@torch.no_grad()
+def posed_softly(avatar: Avatar) -> Callable[[FaceParams], Gaussians]:
+    """How an avatar is posed for pictures that people look at: it fades towards the neck cut, as in pages and files.
+
+    The returned function takes a face of one timestep.
+    """
+    shares = shares_left(avatar)
+
+    @torch.no_grad()
+    def posed(face: FaceParams) -> Gaussians:
+        gaussians = avatar.pose(face).gaussians.timestep(0)
+        return replace(gaussians, opacities=gaussians.opacities * shares)
+
+    return posed
 
 
 @torch.no_grad()

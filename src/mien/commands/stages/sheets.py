@@ -22,11 +22,17 @@ TURNTABLE_TILES = 9
 """Number of angles on a sheet of a turntable."""
 MAX_TILES = 120
 """Largest number of expressions on a sheet. Face models with more show the first ones."""
-_COLUMNS = 9
-_BAR, _BASELINE = 22, 15
-"""Height of the bar with a name, and of the foot of its letters above, in pixels."""
-_INK = (40, 40, 40)
-_FONT, _FONT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
+_WIDEST = 1800
+"""Width in pixels that a sheet of several columns stays below."""
+SMALL_TILE = 288
+"""Width and height of the pictures on a sheet of expressions without --size, in pixels."""
+_GAP = 4
+_BAR, _SMALLEST_BAR = 0.09, 22
+"""Height of the bar with a name, as a part of the picture's width, and at least, in pixels."""
+_FONT, _LETTERS = cv2.FONT_HERSHEY_SIMPLEX, 0.021
+"""The font, and its scale per pixel of the bar's height."""
+_DARK, _LIGHT = (40, 40, 40), (225, 225, 225)
+"""Colours of names over light and dark backgrounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,18 +93,29 @@ def turntable_tiles(face: FaceParams, camera: Camera, center: Float[Tensor, " 3"
 
 
 def draw_sheet(
-    tiles: Sequence[Tile], picture: Callable[[FaceParams, Camera], UInt8[np.ndarray, "h w 3"]]
+    tiles: Sequence[Tile],
+    picture: Callable[[FaceParams, Camera], UInt8[np.ndarray, "h w 3"]],
+    background: tuple[int, int, int] = (WHITE, WHITE, WHITE),
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """All tiles in rows, each above its name."""
-    return picture_grid([named_picture(picture(tile.face, tile.camera), tile.name) for tile in tiles], _COLUMNS)
+    """All tiles in rows as even as possible, each above its name, over the colour of their background."""
+    named = [named_picture(picture(tile.face, tile.camera), tile.name, background) for tile in tiles]
+    most = max((_WIDEST + _GAP) // (named[0].shape[1] + _GAP), 1)
+    rows = math.ceil(len(named) / most)
+    return picture_grid(named, math.ceil(len(named) / rows), _GAP, background)
 
 
-def named_picture(picture: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "_ w 3"]:
-    """A picture with its name below. A name that is too wide is written smaller."""
-    bar = np.full((_BAR, picture.shape[1], 3), WHITE, np.uint8)
-    (wide, _), _ = cv2.getTextSize(name, _FONT, _FONT_SIZE, 1)
-    size = _FONT_SIZE * min(1.0, (picture.shape[1] - 8) / max(wide, 1))
-    cv2.putText(bar, name, (4, _BASELINE), _FONT, size, _INK, 1, cv2.LINE_AA)
+def named_picture(
+    picture: UInt8[np.ndarray, "h w 3"], name: str, background: tuple[int, int, int] = (WHITE, WHITE, WHITE)
+) -> UInt8[np.ndarray, "_ w 3"]:
+    """A picture with its name below, in letters that fit the picture's size. A name that is too wide is smaller."""
+    wide = picture.shape[1]
+    high = max(_SMALLEST_BAR, round(_BAR * wide))
+    bar = np.full((high, wide, 3), background, np.uint8)
+    size, thick = _LETTERS * high, max(1, round(high / 24))
+    (length, _), _ = cv2.getTextSize(name, _FONT, size, thick)
+    size *= min(1.0, (wide - 8) / max(length, 1))
+    ink = _DARK if sum(background) > 3 * WHITE / 2 else _LIGHT
+    cv2.putText(bar, name, (4, round(0.68 * high)), _FONT, size, ink, thick, cv2.LINE_AA)
     return np.concatenate([picture, bar])
 
 

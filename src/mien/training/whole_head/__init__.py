@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from mien.training.whole_head.mouth_interior import prepare_inside
     from mien.training.whole_head.outline_fit import fitted_faces
     from mien.training.whole_head.part import prepare_whole_head
-    from mien.training.whole_head.soft_cut import with_soft_cut
+    from mien.training.whole_head.soft_cut import shares_left, with_soft_cut
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 
@@ -18,6 +18,7 @@ __all__ = [
     "fitted_faces",
     "prepare_inside",
     "prepare_whole_head",
+    "shares_left",
     "vertex_means",
     "with_soft_cut",
 ]

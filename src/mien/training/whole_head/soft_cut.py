@@ -33,16 +33,22 @@ def with_soft_cut(portable: PortableAvatar, avatar: Avatar) -> PortableAvatar:
     attributes = getattr(portable.baked, "attributes", None)
     if attributes is None:
         return portable
-    model, rest = avatar.face_model, avatar.subject
-    vertices, gaussians = model(rest)[0], avatar.pose(rest).gaussians.timestep(0)
-    cut = fit_neck_cut(NeckParts.of(model), vertices, rest.T_world_head[0, :3, 1])
-    head = vertices[model.faces[~model.region_mask("neck")].unique()]
-    shares = opacity_shares(world_means(gaussians), cut, head).double().cpu().numpy()
+    shares = shares_left(avatar).double().cpu().numpy()
     opacities = shares / (1 + np.exp(-attributes.opacity_logits.astype(np.float64)))
     opacities = opacities.clip(WHOLE_HEAD.soft_cut_least, 1 - WHOLE_HEAD.soft_cut_least)
     logits = np.log(opacities / (1 - opacities)).astype(np.float32)
     kept = np.where(shares < 1, logits, attributes.opacity_logits)
     return replace(portable, baked=replace(portable.baked, attributes=replace(attributes, opacity_logits=kept)))
+
+
+@torch.no_grad()
+def shares_left(avatar: Avatar) -> Float[Tensor, " n"]:
+    """For each Gaussian of an avatar, the share of its opacity that the soft cut leaves, 0..1."""
+    model, rest = avatar.face_model, avatar.subject
+    vertices, gaussians = model(rest)[0], avatar.pose(rest).gaussians.timestep(0)
+    cut = fit_neck_cut(NeckParts.of(model), vertices, rest.T_world_head[0, :3, 1])
+    head = vertices[model.faces[~model.region_mask("neck")].unique()]
+    return opacity_shares(world_means(gaussians), cut, head)
 
 
 def opacity_shares(centers: Float[Tensor, "n 3"], cut: NeckCut, head: Float[Tensor, "m 3"]) -> Float[Tensor, " n"]:
