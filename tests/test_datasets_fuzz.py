@@ -28,6 +28,7 @@ from dataset_writers import (
     write_nerf_blendshape,
     write_nerface,
     write_nersemble,
+    write_take,
     write_vhap,
 )
 from flame_like import write_npz
@@ -55,6 +56,7 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     "nerf-blendshape": write_nerf_blendshape,
     "nersemble-benchmark": lambda folder, scene: write_benchmark(folder, scene, (FRONTAL,)),
     "nersemble": lambda folder, scene: write_nersemble(folder),
+    "live-link-face": lambda folder, scene: write_take(folder),
 }
 
 
