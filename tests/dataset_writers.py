@@ -106,6 +106,15 @@ IMAVATAR_PLACE = np.array([0.03, -0.02, -3.7])
 """Place of FLAME's origin before the camera, in units of a quarter of a metre, with OpenGL's axes."""
 
 
+def imavatar_classes(matte: np.ndarray) -> np.ndarray:
+    """Return the classes of a picture of IMavatar: a necklace and cloth in the lower rows, skin above them."""
+    classes = np.where(matte > 127, 1, 0).astype(np.uint8)
+    rows = np.arange(len(matte))[:, None]
+    classes[(rows > 0.8 * SIDE) & (matte > 127)] = 16
+    classes[(rows > 0.75 * SIDE) & (classes == 1)] = 15
+    return classes
+
+
 def write_imavatar(folder: Path, scene: Scene, clips: tuple[str, ...] = ("MVI_1810", "MVI_1812")) -> Path:
     """Write a subject of IMavatar, whose frames are divided among the clips. Rays go through whole pixels."""
     share = len(scene) // len(clips)
@@ -118,6 +127,7 @@ def write_imavatar(folder: Path, scene: Scene, clips: tuple[str, ...] = ("MVI_18
             image, matte = draw(scene, vertices, UNEQUAL, rotation, shift)
             write_picture(place / f"image/{number + 1}.png", image)
             write_picture(place / f"mask/{number + 1}.png", np.repeat(matte[..., None], 3, -1))
+            write_picture(place / f"semantic/{number + 1}.png", imavatar_classes(matte)[..., None])
             frames.append({
                 "file_path": f"./image/{number + 1}",
                 "world_mat": np.concatenate([np.eye(3), IMAVATAR_PLACE[:, None]], axis=1).tolist(),
