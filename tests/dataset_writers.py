@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import torch
 
-from dataset_scene import SIDE, Scene, draw, head_view
+from dataset_scene import SIDE, Scene, draw, head_view, projected
 from mien.rotation import matrix_from_axis_angle
 from recordings import live_link_face
 
@@ -219,8 +219,11 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
     return folder
 
 
-def write_nerf_blendshape(folder: Path, scene: Scene) -> Path:
-    """Write a person of NeRFBlendShape, from picture 7 on and with a gap."""
+def write_nerf_blendshape(folder: Path, scene: Scene, scale: float = 1.0, detected: bool = False) -> Path:
+    """Write a person of NeRFBlendShape, from picture 7 on and with a gap, in a world of another scale.
+
+    Landmarks are made up, or those of the drawn head (`detected`).
+    """
     frames = []
     for timestep in range(len(scene)):
         number = 7 + timestep + (timestep > 2)
@@ -232,10 +235,13 @@ def write_nerf_blendshape(folder: Path, scene: Scene) -> Path:
         classes[:4] = (0, 255, 0)
         write_picture(folder / f"parsing/{number}.png", classes)
         points = np.stack([np.arange(478) % SIDE, np.full(478, timestep + 0.25)], axis=1)
+        if detected:
+            points = projected(scene.marks(scene.vertices(timestep, root=False)), UNEQUAL, rotation, translation)
         (folder / f"ori_imgs/{number}.lms").write_text("\n".join(f"{x} {y}" for x, y in points))
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = rotation, translation
         pose = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] *= scale
         frames.insert(0, {"img_id": number, "transform_matrix": pose.tolist(), "exp_ori": [timestep / 10] * 46})
     content = {"h": SIDE, "w": SIDE, "fx": UNEQUAL[0, 0], "fy": UNEQUAL[1, 1], "cx": UNEQUAL[0, 2] - 0.5,
                "cy": UNEQUAL[1, 2] - 0.5, "frames": frames}  # fmt: skip
