@@ -22,6 +22,8 @@ from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.coefficients import coefficient_count
 
+Place = tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]
+"""Turn R, scale s and shift d of mien's head in the axes of other poses: x -> s R x + d."""
 _MARKS, _FACE_MARKS = "mediapipe", 468
 """The landmarks of mien's detector, and how many of them are not on the irises."""
 _FRAMES, _EVERY = 40, 6
@@ -36,22 +38,30 @@ head has about 0.1."""
 def on_coefficients(
     path: Path, sequences: Iterable[ReadSequence], face_model: FaceModel | None
 ) -> Iterator[ReadSequence]:
-    """Yield sequences with their authors' poses and coefficients, if the user named a model `coefficients-N`."""
+    """Yield sequences with their authors' poses and coefficients, if the user named a model `coefficients-N`.
+
+    They share the place of the head, which is found in the first one.
+    """
+    place = None
     for sequence in sequences:
         if face_model is None or coefficient_count(face_model.name) is None:
             yield sequence
         else:
             assert isinstance(sequence, FilmedSequence)
-            yield with_coefficients(path, sequence, face_model)
+            tracked, place = with_coefficients(path, sequence, face_model, place)
+            yield tracked
 
 
-def with_coefficients(path: Path, sequence: FilmedSequence, face_model: FaceModel) -> TrackedSequence:
-    """Return the sequence with its authors' poses and coefficients as its tracking.
+def with_coefficients(
+    path: Path, sequence: FilmedSequence, face_model: FaceModel, place: Place | None = None
+) -> tuple[TrackedSequence, Place]:
+    """Return the sequence with its authors' poses and coefficients as its tracking, and the place of the head.
 
     Args:
         path: The dataset, for messages.
         sequence: A sequence of one camera, with `expression` and `head_to_camera` among its foreign arrays.
         face_model: The face model `coefficients-N`, with as many coefficients as the sequence has.
+        place: The place of the head (`head_place`). None finds it.
 
     Raises:
         UserError: the numbers differ, or the poses do not fit the landmarks.
@@ -69,7 +79,8 @@ def with_coefficients(path: Path, sequence: FilmedSequence, face_model: FaceMode
     usable = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).round().astype(int))]
     points = face_model.landmark_positions(face_model.head_vertices(face_model.neutral()), _MARKS)[0]
     marks, seen = points[:_FACE_MARKS].double().numpy(), capture.landmarks[usable, 0, :_FACE_MARKS].astype(np.float64)
-    turn, scale, shift = head_place(marks[::_EVERY], seen[:, ::_EVERY], poses[usable], K)
+    place = head_place(marks[::_EVERY], seen[:, ::_EVERY], poses[usable], K) if place is None else place
+    turn, scale, shift = place
     rotations, translations = poses[:, :3, :3] @ turn, (poses[:, :3, :3] @ shift + poses[:, :3, 3]) / scale
     _check_places(path, marks, seen, rotations[usable], translations[usable], K)
     face = replace(
@@ -83,14 +94,14 @@ def with_coefficients(path: Path, sequence: FilmedSequence, face_model: FaceMode
     tracked = tracked_sequence(
         path, capture.name, capture.images, capture.mattes, camera, face_model, face, capture.fps
     )
-    return replace(tracked, own_split=sequence.own_split, foreign=sequence.foreign)
+    return replace(tracked, own_split=sequence.own_split, foreign=sequence.foreign), place
 
 
 def head_place(
     marks: Float[np.ndarray, "l 3"], seen: Float[np.ndarray, "t l 2"], poses: Float[np.ndarray, "t 4 4"],
     K: Float[np.ndarray, "3 3"],
-) -> tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]:  # fmt: skip
-    """Return the turn R, scale s and shift d of the head in the axes of the poses: x -> s R x + d.
+) -> Place:  # fmt: skip
+    """Return the place of the head in the axes of the poses.
 
     Args:
         marks: Landmarks of the head at rest, in metres.
