@@ -79,7 +79,7 @@ class Command:
             run_import_stage(dataset, self.path, workspace, run, self.face_model, self.retrack, self.resume)
 
     def _is_there(self, findings: Findings) -> bool:
-        """Whether there is nothing to do. Without --resume, no sequence may be there, which is checked before reading."""
+        """Whether there is nothing to do. Without --resume, no sequence may be there, which is checked first."""
         folders = [Workspace(self.out).sequence_dir(clip.name) for clip in findings.clips]
         if not self.resume:
             for folder in folders:

@@ -1,8 +1,7 @@
-"""Sequences with poses and coefficients of a head model that is not published, on a head that the coefficients do not
-move (`mien.face.coefficients`).
+"""Sequences with poses and coefficients of a head model that is not published.
 
-The poses are in that model's own axes and unit. One turn, one shift and one scale for the whole sequence lead to them
-from mien's head frame. They are found by landmarks.
+They get a head that the coefficients do not move (`mien.face.coefficients`). The poses are in that model's own axes and
+unit. One turn, one shift and one scale lead to them from mien's head frame. They are found by landmarks.
 """
 
 from collections.abc import Iterable, Iterator
@@ -141,6 +140,6 @@ def _check_places(
     apart = float(np.median(distances) / max(np.median(eyes), 1e-6))
     if not apart < _MAX_DISTANCE:
         raise UserError(
-            f"{path}: by its poses, landmarks are {apart:.0%} of the distance of the eyes beside those in the pictures; "
+            f"{path}: by its poses, landmarks are {apart:.0%} of the distance of the eyes off; "
             f"{REMEDY}, or track the pictures instead (--retrack)"
         )

@@ -247,8 +247,11 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "baselines": {name: mean_scores(scores[name]) for name in (MEAN_FRAME, MESH) if name in scores},
         "as_tracked": mean_scores(scores.get(AS_TRACKED, own_rows)),
         **_fitted_content(scores, settings),
-        **{name: {**mean_scores(scores[name]), "frames": len(scores[name])} for name in (OPENED, UNCLOTHED)
-           if name in scores},
+        **{
+            name: {**mean_scores(scores[name]), "frames": len(scores[name])}
+            for name in (OPENED, UNCLOTHED)
+            if name in scores
+        },
         "per_frame": {
             "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
             "timestep": [frame.timestep for frame in evaluation.frames],

@@ -171,6 +171,7 @@ def _of_training(key: str) -> bool:
 
 def _steps(inputs: list[str], dataset: bool, methods: Sequence[str], options: dict[str, list[str]]) -> list[list[str]]:
     """The commands of a row: tracked once, trained by each method."""
+
     def typed(wanted: Callable[[str], bool]) -> list[str]:
         return [word for key, words in options.items() if wanted(key) for word in _typed(key, words)]
 
