@@ -110,8 +110,8 @@ def imavatar_classes(matte: np.ndarray) -> np.ndarray:
     """Return the classes of a picture of IMavatar: a necklace and cloth in the lower rows, skin above them."""
     classes = np.where(matte > 127, 1, 0).astype(np.uint8)
     rows = np.arange(len(matte))[:, None]
-    classes[(rows > 0.8 * SIDE) & (matte > 127)] = 16
-    classes[(rows > 0.75 * SIDE) & (classes == 1)] = 15
+    classes[(rows > 0.62 * SIDE) & (matte > 127)] = 16
+    classes[(rows > 0.58 * SIDE) & (classes == 1)] = 15
     return classes
 
 

@@ -78,7 +78,11 @@ def with_coefficients(
     usable = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).round().astype(int))]
     points = face_model.landmark_positions(face_model.head_vertices(face_model.neutral()), _MARKS)[0]
     marks, seen = points[:_FACE_MARKS].double().numpy(), capture.landmarks[usable, 0, :_FACE_MARKS].astype(np.float64)
-    place = head_place(marks[::_EVERY], seen[:, ::_EVERY], poses[usable], K) if place is None else place
+    if place is None:
+        try:
+            place = head_place(marks[::_EVERY], seen[:, ::_EVERY], poses[usable], K)
+        except (cv2.error, ValueError, np.linalg.LinAlgError):  # of numbers that are finite and no poses of a head
+            raise UserError(f"{path}: no place of the head fits its poses and landmarks; {REMEDY}") from None
     turn, scale, shift = place
     rotations, translations = poses[:, :3, :3] @ turn, (poses[:, :3, :3] @ shift + poses[:, :3, 3]) / scale
     _check_places(path, marks, seen, rotations[usable], translations[usable], K)
@@ -110,6 +114,7 @@ def head_place(
     """
     from scipy.optimize import least_squares
 
+    marks, seen = np.ascontiguousarray(marks), np.ascontiguousarray(seen)
     found = [cv2.solvePnP(marks, each, K, None, flags=cv2.SOLVEPNP_SQPNP) for each in seen]
     turns = np.stack([cv2.Rodrigues(turn)[0] for _, turn, _ in found])
     places = np.stack([place[:, 0] for _, _, place in found])
