@@ -226,7 +226,9 @@ def test_the_protocol_of_imavatar_scores_drawings_that_are_opened_and_without_cl
     with_split(run, "dataset")
     for folder in folders:
         imported(folder, "imavatar")
-    settings = EvaluationSettings(perceptual=False, baselines=False, video_frames=0, protocol="imavatar")
+    settings = EvaluationSettings(
+        perceptual=False, baselines=False, video_frames=0, edges="filmed", protocol="imavatar"
+    )
     plain = evaluate(run, folders, settings)["protocols"]["self_reenactment_sequence"]
     assert "without_clothes" not in plain, "nothing tells where clothes are"
     t, _, height, width = read_capture(folders[1] / "capture").mattes.shape

@@ -117,14 +117,15 @@ def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: 
     assert np.allclose(face.expression[:, 45], np.arange(6) / 10)
     assert 0.8 < float(-face.head_translation[:, 2].mean()) < 1.0, "metres"
     drawn = camera.project(model.landmark_positions(model(face), "mediapipe"))[0].numpy()
-    mattes, mesh = sequence.capture.mattes, model(face)
+    mattes, mesh, above = sequence.capture.mattes, model(face), model.faces[~model.region_mask("neck")]
     for timestep in range(len(scene)):
         marks = scene.marks(scene.vertices(timestep, root=False))
         expected = projected(marks, UNEQUAL, *head_view(timestep))
         apart = np.linalg.norm(drawn[timestep] - expected, axis=1)
         assert np.median(apart) < 0.12 * np.linalg.norm(expected[33] - expected[263]), timestep
-        covered = (rasterize_mesh(mesh[timestep], model.faces, camera).face_index >= 0).numpy()
-        assert (covered & (mattes[timestep, 0] > 127)).sum() / covered.sum() > 0.9
+        covered = (rasterize_mesh(mesh[timestep], above, camera).face_index >= 0).numpy()
+        inside = (covered & (mattes[timestep, 0] > 127)).sum() / covered.sum()
+        assert inside > 0.85, "the mean head has another shape, but no other place"
     turned = matrix_from_axis_angle(face.head_rotation).double().numpy()
     for timestep in range(1, len(scene)):
         views = [np.diag([1.0, -1, -1]) @ head_view(each)[0] for each in (0, timestep)]
