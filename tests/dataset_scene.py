@@ -45,6 +45,12 @@ class Scene:
         coefficients = np.concatenate([self.shape[:identities], self.expr[timestep, :expressions]])
         return posed_as_flame(self.arrays, pose, coefficients, shift)
 
+    def marks(self, vertices: np.ndarray) -> np.ndarray:
+        """Return MediaPipe's landmarks [478, 3] on these vertices."""
+        marks = self.model.landmarks["mediapipe"]
+        corners = vertices[self.model.faces.numpy()[marks.faces.numpy()]]
+        return (corners * marks.barycentric.double().numpy()[..., None]).sum(1)
+
     def __len__(self) -> int:
         """Return the number of timesteps."""
         return len(self.expr)

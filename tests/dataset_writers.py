@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import torch
 
-from dataset_scene import SIDE, Scene, draw, head_view
+from dataset_scene import SIDE, Scene, draw, head_view, projected
 from mien.rotation import matrix_from_axis_angle
+from recordings import live_link_face
 
 OFF_CENTRE = np.array([[155.0, 0, 66.3], [0, 155.0, 61.9], [0, 0, 1]])
 """Intrinsics with square pixels, whose principal point is off the centre in both axes."""
@@ -66,8 +67,8 @@ def seen_by_tracker(scene: Scene, timestep: int, K: np.ndarray) -> tuple[np.ndar
     return draw(scene, scene.vertices(timestep, root=False, neck=False), K, *head_view(timestep))
 
 
-def write_insta(folder: Path, scene: Scene, checkpoints: bool = True) -> Path:
-    """Write a subject of INSTA, with a gap in the numbers of the frames."""
+def write_insta(folder: Path, scene: Scene, checkpoints: bool = True, held_out: int = 0) -> Path:
+    """Write a subject of INSTA, with a gap in the numbers of the frames. Its test split has the last ones."""
     frames = []
     for timestep in range(len(scene)):
         number = timestep + (timestep > 2)
@@ -85,6 +86,8 @@ def write_insta(folder: Path, scene: Scene, checkpoints: bool = True) -> Path:
     content = {"w": SIDE, "h": SIDE, "fl_x": OFF_CENTRE[0, 0], "fl_y": OFF_CENTRE[1, 1], "cx": OFF_CENTRE[0, 2],
                "cy": OFF_CENTRE[1, 2], "integer_depth_scale": 0.001, "frames": frames}  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps(content))
+    if held_out:
+        (folder / "transforms_test.json").write_text(json.dumps({**content, "frames": frames[-held_out:]}))
     return folder
 
 
@@ -103,6 +106,15 @@ IMAVATAR_PLACE = np.array([0.03, -0.02, -3.7])
 """Place of FLAME's origin before the camera, in units of a quarter of a metre, with OpenGL's axes."""
 
 
+def imavatar_classes(matte: np.ndarray) -> np.ndarray:
+    """Return the classes of a picture of IMavatar: a necklace and cloth in the lower rows, skin above them."""
+    classes = np.where(matte > 127, 1, 0).astype(np.uint8)
+    rows = np.arange(len(matte))[:, None]
+    classes[(rows > 0.62 * SIDE) & (matte > 127)] = 16
+    classes[(rows > 0.58 * SIDE) & (classes == 1)] = 15
+    return classes
+
+
 def write_imavatar(folder: Path, scene: Scene, clips: tuple[str, ...] = ("MVI_1810", "MVI_1812")) -> Path:
     """Write a subject of IMavatar, whose frames are divided among the clips. Rays go through whole pixels."""
     share = len(scene) // len(clips)
@@ -115,6 +127,7 @@ def write_imavatar(folder: Path, scene: Scene, clips: tuple[str, ...] = ("MVI_18
             image, matte = draw(scene, vertices, UNEQUAL, rotation, shift)
             write_picture(place / f"image/{number + 1}.png", image)
             write_picture(place / f"mask/{number + 1}.png", np.repeat(matte[..., None], 3, -1))
+            write_picture(place / f"semantic/{number + 1}.png", imavatar_classes(matte)[..., None])
             frames.append({
                 "file_path": f"./image/{number + 1}",
                 "world_mat": np.concatenate([np.eye(3), IMAVATAR_PLACE[:, None]], axis=1).tolist(),
@@ -206,8 +219,11 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
     return folder
 
 
-def write_nerf_blendshape(folder: Path, scene: Scene) -> Path:
-    """Write a person of NeRFBlendShape, from picture 7 on and with a gap."""
+def write_nerf_blendshape(folder: Path, scene: Scene, scale: float = 1.0, detected: bool = False) -> Path:
+    """Write a person of NeRFBlendShape, from picture 7 on and with a gap, in a world of another scale.
+
+    Landmarks are made up, or those of the drawn head (`detected`).
+    """
     frames = []
     for timestep in range(len(scene)):
         number = 7 + timestep + (timestep > 2)
@@ -219,10 +235,13 @@ def write_nerf_blendshape(folder: Path, scene: Scene) -> Path:
         classes[:4] = (0, 255, 0)
         write_picture(folder / f"parsing/{number}.png", classes)
         points = np.stack([np.arange(478) % SIDE, np.full(478, timestep + 0.25)], axis=1)
+        if detected:
+            points = projected(scene.marks(scene.vertices(timestep, root=False)), UNEQUAL, rotation, translation)
         (folder / f"ori_imgs/{number}.lms").write_text("\n".join(f"{x} {y}" for x, y in points))
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = rotation, translation
         pose = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] *= scale
         frames.insert(0, {"img_id": number, "transform_matrix": pose.tolist(), "exp_ori": [timestep / 10] * 46})
     content = {"h": SIDE, "w": SIDE, "fx": UNEQUAL[0, 0], "fy": UNEQUAL[1, 1], "cx": UNEQUAL[0, 2] - 0.5,
                "cy": UNEQUAL[1, 2] - 0.5, "frames": frames}  # fmt: skip
@@ -242,14 +261,21 @@ def benchmark_vertices(scene: Scene, timestep: int, angles: np.ndarray, shift: n
     return BENCHMARK_SCALE * scene.vertices(timestep, root=False) @ turn.T + shift
 
 
-def write_benchmark(folder: Path, scene: Scene, serials: tuple[str, ...] = (FRONTAL,), tracked: bool = True) -> Path:
-    """Write a person of the NeRSemble benchmark, with one test sequence that has a tracking only."""
+def write_benchmark(
+    folder: Path, scene: Scene, serials: tuple[str, ...] = (FRONTAL,), tracked: bool = True,
+    clips: tuple[str, ...] = ("EXP-2-eyes",),
+) -> Path:  # fmt: skip
+    """Write a person of the NeRSemble benchmark. The frames are divided among the clips.
+
+    If it is tracked, FREE is a test sequence that has a tracking only.
+    """
     from mien.capture.video import write_video
 
-    place = folder / "sequences" / "EXP-2-eyes"
     random = np.random.default_rng(8)
     angles, shifts = random.uniform(-0.3, 0.3, (len(scene), 3)), random.uniform(-0.03, 0.03, (len(scene), 3))
     poses, intrinsics = {}, {}
+    share = len(scene) // len(clips)
+    parts = {clip: slice(index * share, (index + 1) * share) for index, clip in enumerate(clips)}
     for index, serial in enumerate(serials):
         rotation, translation = head_view(2 + index, 1.0)
         poses[serial] = np.eye(4)
@@ -259,21 +285,23 @@ def write_benchmark(folder: Path, scene: Scene, serials: tuple[str, ...] = (FRON
             draw(scene, benchmark_vertices(scene, t, angles[t], shifts[t]), UNEQUAL, rotation, translation)
             for t in range(len(scene))
         ]
-        write_video(place / f"images/cam_{serial}.mp4", iter([image for image, _ in drawn]), 24.3, crf=1)
         mattes = [np.repeat(matte[..., None], 3, -1) for _, matte in drawn]
-        write_video(place / f"alpha_maps/cam_{serial}.mp4", iter(mattes), 24.3, crf=1)
+        for clip, part in parts.items():
+            place = folder / "sequences" / clip
+            write_video(place / f"images/cam_{serial}.mp4", iter([image for image, _ in drawn[part]]), 24.3, crf=1)
+            write_video(place / f"alpha_maps/cam_{serial}.mp4", iter(mattes[part]), 24.3, crf=1)
     calibration = {"world_2_cam": {serial: pose.tolist() for serial, pose in poses.items()}, "intrinsics": intrinsics}
     (folder / "calibration").mkdir()
     (folder / "calibration/camera_params.json").write_text(json.dumps(calibration))
     turns = np.stack([np.linalg.multi_dot([rotation_of(np.eye(3)[axis] * angle[axis]) for axis in range(3)])
                       for angle in angles])  # fmt: skip
-    arrays = {
-        "shape": scene.shape[None], "expression": scene.expr, "rotation": angles, "rotation_matrices": turns,
-        "translation": shifts, "scale": np.array([[BENCHMARK_SCALE]]), "jaw": scene.pose[:, 2],
-        "neck": scene.pose[:, 1],
-        "eyes": scene.pose[:, 3:].reshape(-1, 6), "frames": np.arange(len(scene)),
-    }  # fmt: skip
-    for name in ("EXP-2-eyes", "FREE") if tracked else ():
+    for name, part in {**parts, "FREE": slice(None)}.items() if tracked else ():
+        arrays = {
+            "expression": scene.expr[part], "rotation": angles[part], "rotation_matrices": turns[part],
+            "translation": shifts[part], "jaw": scene.pose[part, 2], "neck": scene.pose[part, 1],
+            "eyes": scene.pose[part, 3:].reshape(-1, 6), "frames": np.arange(len(scene))[part],
+            "shape": scene.shape[None], "scale": np.array([[BENCHMARK_SCALE]]),
+        }  # fmt: skip
         file = folder / f"sequences/{name}/tracking/flame2023_tracking_v2.npz"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(npz({key: array.astype(np.float32) for key, array in arrays.items()}))
@@ -293,4 +321,15 @@ def write_nersemble(folder: Path, serials: tuple[str, ...] = ("222200036", FRONT
             place = folder / "sequences" / name
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_bytes(b"0")
+    return folder
+
+
+def write_take(folder: Path) -> Path:
+    """Write a take of Live Link Face: a table of coefficients and an empty video."""
+    folder.mkdir(parents=True, exist_ok=True)
+    table = live_link_face(folder, [{"jawOpen": 0.1 * index, "eyeBlinkLeft": 0.5} for index in range(6)])
+    table.rename(folder / "Me_3_iPhone_cal.csv")
+    (folder / "Me_3_iPhone.mov").write_bytes(b"0")
+    (folder / "take.json").write_text(json.dumps({"slate": "Me", "takeNumber": 3, "rate": [60, 1.5]}))
+    (folder / "frame_log.csv").write_text("V,0,12:00:00:00.451\nV,1,12:00:00:02.451\n")
     return folder

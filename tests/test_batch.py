@@ -101,6 +101,10 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
         ("video\nann.mp4,3", "more cells than the heading"),
         ("video,memory_gb\nann.mp4,lots", "gigabytes above 0"),
         ("", "has no rows"),
+        ("video,protocol\nann.mp4,insta", "column 'protocol' is for datasets"),
+        ("video,retrack\nann.mp4,yes", "column 'retrack' is for datasets"),
+        ("dataset,capture.size\nann.mp4,256", "column 'capture.size' is for videos"),
+        ("dataset,video\nann.mp4,bob.mp4", "a video or a dataset, and not both"),
     ],
 )
 def test_mistakes_in_a_table_are_named_before_any_work(table: Path, text: str, words: str):
@@ -109,6 +113,32 @@ def test_mistakes_in_a_table_are_named_before_any_work(table: Path, text: str, w
         read_table(table)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def subjects(tmp_path: Path) -> Path:
+    """Return a folder with ten people of IMavatar's layout."""
+    for number in range(10):
+        clip = tmp_path / "data" / f"subject{number}" / f"subject{number}" / "MVI_1810"
+        clip.mkdir(parents=True)
+        (clip / "flame_params.json").write_text('{"frames": [{"world_mat": []}]}')
+    return tmp_path / "data"
+
+
+def test_datasets_are_imported_trained_and_scored(subjects: Path):
+    table = subjects / "people.csv"
+    head = "dataset,face_model,method,split,protocol,steps,training.resolution,age\n"
+    table.write_text(head + "".join(f"subject{n},flame,headgas,dataset,imavatar,30,96,{n}\n" for n in range(10)))
+    rows = read_table(table)
+    assert [row.name for row in rows] == [f"subject{n}" for n in range(10)]
+    assert rows[3].labels == {"age": "3"}
+    place = str(subjects / "subject3")
+    assert rows[3].steps == (
+        ("import", place, "--out", "{workspace}", "--resume", "--face-model", "flame"),
+        ("train", "{workspace}", "--method", "headgas", "--split", "dataset", "--steps", "30",
+         "--training.resolution", "96"),
+        ("evaluate", "{workspace}", "--run", "headgas", "--protocol", "imavatar"),
+    )  # fmt: skip
 
 
 def test_shards_share_all_rows_out():

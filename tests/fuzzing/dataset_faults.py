@@ -94,6 +94,8 @@ def _not_a_number(root: Path, canary: Path, dice: Random) -> str | None:
     odd = dice.choice([float("nan"), float("inf"), -float("inf"), 1e30, 1e9])
 
     def changed(value: Any) -> Any:
+        if isinstance(value, str):
+            return str(odd)
         if not _is_array(value):
             return odd
         array = value.astype(np.float64)
@@ -168,7 +170,7 @@ def _pick(root: Path, dice: Random, suffixes: tuple[str, ...]) -> Path | None:
 
 def _in_values(root: Path, dice: Random, fits: Callable[[Any], bool], changed: Callable[[Any], Any]) -> str | None:
     """Change one value of a json file, an archive or a checkpoint."""
-    file = _pick(root, dice, (".json", ".npy", *_ARCHIVES))
+    file = _pick(root, dice, (".json", ".npy", ".csv", *_ARCHIVES))
     if file is None:
         return None
     content = _read(file)
@@ -184,6 +186,8 @@ def _in_values(root: Path, dice: Random, fits: Callable[[Any], bool], changed: C
         _write_frame(file, whole, 2)
     elif file.suffix == ".npy":
         np.save(file, whole)
+    elif file.suffix == ".csv":
+        file.write_text("\n".join(",".join(row) for row in whole))
     else:
         np.savez(file, **whole)
     return f"{key!r} of {file.relative_to(root)}"
@@ -205,6 +209,8 @@ def _read(file: Path) -> Any:
         return pickle.loads(_members(file)["archive/data.pkl"])
     if file.suffix == ".npy":
         return np.load(file)
+    if file.suffix == ".csv":
+        return [line.split(",") for line in file.read_text().splitlines()]
     with np.load(file) as arrays:
         return dict(arrays)
 
@@ -245,4 +251,6 @@ def _is_array(value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
+    if isinstance(value, str):  # a cell of a table
+        return value.replace(".", "", 1).isdigit()
     return isinstance(value, int | float) and not isinstance(value, bool)

@@ -8,7 +8,7 @@ import tyro
 
 from mien.commands.help_text import Described
 from mien.commands.stages.names import check_new_run, check_new_sequence, run_name
-from mien.datasets import Dataset, find_dataset, known_datasets, recognised
+from mien.datasets import Dataset, Findings, find_dataset, known_datasets, recognised
 from mien.errors import UserError
 from mien.workspace import Workspace, check_new_workspace
 
@@ -35,6 +35,9 @@ class Command:
     """Only say what was found: sequences, frames, cameras, face model, split, and what is missing."""
     retrack: bool = False
     """Leave out the tracking of the dataset's authors, and track the pictures with mien's own model instead."""
+
+    resume: bool = False
+    """Leave sequences that are there already as they are, and read the others, as after a stop."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -66,14 +69,22 @@ class Command:
             findings = dataset.survey(self.path)
             for line in findings_lines(findings):
                 say(line)
-            if not self.dry_run:
-                for clip in findings.clips:  # now, because reading takes long
-                    check_new_sequence(Workspace(self.out).sequence_dir(clip.name))
+            if not self.dry_run and self._is_there(findings):
+                say(f"{self.out}: all sequences are there already")
+                return
         if not self.dry_run:
             from mien.commands.stages.importing import run_import_stage
 
             workspace, run = Workspace(self.out), self._run(dataset)
-            run_import_stage(dataset, self.path, workspace, run, self.face_model, self.retrack)
+            run_import_stage(dataset, self.path, workspace, run, self.face_model, self.retrack, self.resume)
+
+    def _is_there(self, findings: Findings) -> bool:
+        """Whether there is nothing to do. Without --resume, no sequence may be there, which is checked first."""
+        folders = [Workspace(self.out).sequence_dir(clip.name) for clip in findings.clips]
+        if not self.resume:
+            for folder in folders:
+                check_new_sequence(folder)
+        return not self.retrack and bool(folders) and all(folder.exists() for folder in folders)
 
     def _found(self) -> tuple[Dataset, str | None]:
         """The dataset, and what it found; None if the user names the dataset."""

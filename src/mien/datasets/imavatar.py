@@ -30,6 +30,8 @@ _TEST = ("MVI_1812", "MVI_1802", "test", "wlz0318_test")
 _TAIL = 350
 """Number of frames at the end that SplattingAvatar holds out of its one clip."""
 _ENDINGS = (".png", ".jpg", "")
+_CLOTHES = (15, 16)
+"""Classes of `semantic` that MonoGaussianAvatar leaves out of its second set of figures: necklace and cloth."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,11 @@ def _survey(path: Path) -> Findings:
         split = f"the clip {', '.join(whole)} is held out"
     elif held:
         split = f"the last {_TAIL} frames are held out (SplattingAvatar)"
-    missing = () if held else ("a split: no clip has the name of a test clip",)
-    return Findings(tuple(Clip(clip.name, len(clip.frames)) for clip in clips), "FLAME 2020", split, missing)
+    missing = [] if held else ["a split: no clip has the name of a test clip"]
+    bare = [clip.name for clip in clips if not (clip.file.parent / "semantic").is_dir()]
+    if bare:
+        missing.append(f"semantic of {', '.join(bare)}: figures without clothes need it")
+    return Findings(tuple(Clip(clip.name, len(clip.frames)) for clip in clips), "FLAME 2020", split, tuple(missing))
 
 
 def camera_from_imavatar(intrinsics: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
@@ -134,6 +139,23 @@ def _pictures(clip: _Clip, root: Path) -> "tuple[np.ndarray, np.ndarray]":
     return collect(len(places), 1, size, read, f"read {clip.name}")
 
 
+def _clothes(clip: _Clip, root: Path, size: tuple[int, int]) -> "dict[str, np.ndarray]":
+    """Packed masks of clothes by the pictures of classes; nothing if the clip has none."""
+    import numpy as np
+
+    from mien.datasets.pictures import read_matte
+    from mien.training.footage import packed_clothes
+
+    if not (clip.file.parent / "semantic").is_dir():
+        return {}
+    masks = []
+    for frame in clip.frames:
+        name = inner(clip.file, root, frame.get("file_path"), _ENDINGS).with_suffix(".png").name
+        classes = read_matte(inner(clip.file, root, f"semantic/{name}"), size)
+        masks.append(packed_clothes(np.isin(classes, _CLOTHES)[None]))
+    return {name: np.concatenate([mask[name] for mask in masks]) for name in masks[0]}
+
+
 def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     import numpy as np
 
@@ -160,7 +182,8 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
         K = camera_from_imavatar(numbers(file, clip.content, "intrinsics", (4,)), size)
         camera = {"0": camera_of(K, FRONT, size)}
         sequence = tracked_sequence(file, clip.name, images, mattes, camera, model, face, _FPS)
-        yield _with_split(check_overlay(file, sequence, _VERSION), held)
+        sequence = replace(check_overlay(file, sequence, _VERSION), foreign=_clothes(clip, path, size))
+        yield _with_split(sequence, held)
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
@@ -174,7 +197,8 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         size = images.shape[3], images.shape[2]
         K = camera_from_imavatar(numbers(clip.file, clip.content, "intrinsics", (4,)), size)
         camera = {"0": camera_of(K, FRONT, size)}
-        yield _with_split(filmed_sequence(clip.file, clip.name, images, mattes, camera, _FPS), held)
+        sequence = filmed_sequence(clip.file, clip.name, images, mattes, camera, _FPS)
+        yield _with_split(replace(sequence, foreign=_clothes(clip, path, size)), held)
 
 
 def _with_split(sequence: Any, held: dict[str, tuple[tuple[int, int], ...]]) -> ReadSequence:

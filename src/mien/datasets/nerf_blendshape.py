@@ -56,7 +56,8 @@ def _frames(path: Path) -> tuple[dict[str, Any], list[tuple[int, dict[str, Any]]
 
 def _survey(path: Path) -> Findings:
     frames = _frames(path)[1]
-    missing = ["the basis of its 46 coefficients, which is not published: use `mien track`"]
+    missing = ["the basis of its 46 coefficients, which is not published: use `mien track`, or for HeadGaS "
+               "--face-model coefficients-46"]  # fmt: skip
     if not (path / "parsing").is_dir():
         missing.append("parsing: mattes are made by mien")
     long = len(frames) > _TAIL
@@ -141,7 +142,9 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    return _read_pictures(path)
+    from mien.datasets.coefficients import on_coefficients
+
+    return on_coefficients(path, _read_pictures(path), face_model)
 
 
 NERF_BLENDSHAPE = Dataset(

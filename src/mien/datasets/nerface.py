@@ -64,7 +64,8 @@ def _in_time(path: Path, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _survey(path: Path) -> Findings:
     clips = _clips(path)
-    missing = ["the basis of its 76 coefficients, which is not published: use `mien track`",
+    missing = ["the basis of its 76 coefficients, which is not published: use `mien track`, or for HeadGaS "
+               "--face-model coefficients-76",
                "the place in time of val's pictures, which are left out"]  # fmt: skip
     if not (path / "index_map.npy").exists():
         missing.append("index_map.npy, so the order of the training pictures in time is not known")
@@ -146,7 +147,9 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    return _read_pictures(path)
+    from mien.datasets.coefficients import on_coefficients
+
+    return on_coefficients(path, _read_pictures(path), face_model)
 
 
 NERFACE = Dataset(

@@ -14,9 +14,7 @@ from mien.inside import remove_tree
 from mien.storage import replace_folder, write_arrays
 from mien.tracking import make_scoring, write_scoring, write_tracking
 from mien.training import read_sequence, write_own_split
-
-FOREIGN = "foreign.safetensors"
-"""Arrays of the dataset for which mien has no place."""
+from mien.training.footage import FOREIGN
 
 
 def write_sequence(folder: Path, sequence: TrackedSequence | FilmedSequence, dataset: Dataset, source: Path) -> None:

@@ -34,13 +34,16 @@ class DatasetProtocol:
     """Which windows of SSIM count at the border of a picture."""
     lpips: tuple[str, ...] = (_ALEX, _VGG)
     """Trunks with which LPIPS is reported. Both, if papers differ or say nothing."""
+    opened: bool = False
+    """Whether the authors erode and dilate their drawings, and score a second time without clothes. Both are further
+    figures, beside those of the drawings as they are."""
     cut_at_line: tuple[str, ...] = ()
     """Those of the datasets that have no mattes of the head. Their pictures are cut at GaussianAvatars' neck line."""
 
 
 DATASET_PROTOCOLS = (
     DatasetProtocol("insta", ("insta",), lpips=(_VGG,)),
-    DatasetProtocol("imavatar", ("imavatar",), border="inside", lpips=(_ALEX,)),
+    DatasetProtocol("imavatar", ("imavatar",), border="inside", lpips=(_ALEX,), opened=True),
     DatasetProtocol("nersemble", ("vhap", "nersemble"), (NAMED_SPLIT, OWN_SPLIT), cut_at_line=("nersemble",)),
     DatasetProtocol(BENCHMARK_SPLIT, ("nersemble-benchmark", "nersemble", "vhap"), (BENCHMARK_SPLIT, OWN_SPLIT)),
     DatasetProtocol("vhap", ("vhap",)),

@@ -138,7 +138,7 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
         settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone, settings.edges,
     ]  # fmt: skip
     if settings.protocol is not None:
-        content.append(settings.protocol)
+        content += [settings.protocol, settings.opened]
     if settings.lpips_weights is not None:
         content.append(load_lpips(settings.lpips_weights).backbone)
     if settings.fit_faces:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
@@ -16,7 +16,7 @@ from mien.pictures import Box
 from mien.render import close_holes, rasterize
 from mien.render.validation import drawable
 from mien.tracking import Scoring
-from mien.training.footage import Frame, Sequence, composite, foreground_colors
+from mien.training.footage import Frame, Sequence, clothes_mask, composite, foreground_colors
 
 FaceSource = Literal["as_tracked", "corrected"]
 """Face parameters of held-out frames: as the tracker left them, or corrected by what training changed in neighbouring
@@ -48,6 +48,8 @@ class Experiment:
     edges: Edges = "cleaned"
     whole_mattes: bool = False
     """Whether the scored pixels are those of the capture's mattes, without mien's cut at the neck."""
+    clothes: tuple[UInt8[np.ndarray, "t h p"] | None, ...] = ()
+    """Packed masks of clothes of each sequence, where its dataset has some. Empty if no protocol asks for them."""
     digests: tuple[dict[str, str], ...] = ()
     """The hashes of the `pictures` and the `mask` of each sequence. Empty if nothing was read from disk."""
 
@@ -70,6 +72,11 @@ class Experiment:
         face_model = self.avatar.face_model
         vertices = face_model(self.sequences[frame.sequence].tracking.face[frame.timestep])[0]
         return part_boxes(face_model, vertices, self.camera(frame))
+
+    def clothes_of(self, frame: Frame) -> Bool[np.ndarray, "h w"] | None:
+        """Where a picture shows clothes, or None if nothing tells."""
+        packed = self.clothes[frame.sequence] if self.clothes else None
+        return None if packed is None else clothes_mask(packed, frame.timestep, self.camera(frame).width)
 
     def face(self, frame: Frame) -> FaceParams:
         """The face parameters of one timestep."""

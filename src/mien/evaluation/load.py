@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from mien.avatar import load_avatar
 from mien.capture import read_capture_hash
@@ -16,7 +17,7 @@ from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.tracking import read_scoring, read_scoring_hash
 from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_run_config
-from mien.training.footage import Frame, held_out_of, sequence_of, training_frames
+from mien.training.footage import Frame, clothes_digest, held_out_of, read_clothes, sequence_of, training_frames
 
 
 def load_experiments(
@@ -54,6 +55,13 @@ def load_experiments(
         if _digests(folder) != digest:
             raise UserError(f"{folder}: was changed while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
+    clothes = _clothes(sequence_dirs, sequences) if rules is not None and rules.opened else ()
+    if whole:
+        digests = tuple({**each, "mask": "matte"} for each in digests)
+    digests = tuple(
+        each if packed is None else {**each, "clothes": clothes_digest(packed)}
+        for each, packed in zip(digests, clothes or (None,) * len(digests), strict=True)
+    )
     avatar = load_avatar(run_dir)
     for folder, sequence in zip(sequence_dirs, sequences, strict=True):
         check_face_params(avatar.face_model, sequence.tracking.face, str(folder), "track it again")
@@ -69,7 +77,8 @@ def load_experiments(
         split=settings.split,
         edges=edges,
         whole_mattes=whole,
-        digests=tuple({**each, "mask": "matte"} for each in digests) if whole else digests,
+        clothes=clothes,
+        digests=digests,
     )
     found = held_out_by_protocol(sequences, settings)
     if rules is not None:
@@ -78,6 +87,14 @@ def load_experiments(
         name: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
         for name, (split, frames) in found.items()
     }
+
+
+def _clothes(folders: Items[Path], sequences: Items[Sequence]) -> tuple[UInt8[np.ndarray, "t h p"] | None, ...]:
+    """The packed masks of clothes of each sequence."""
+    shapes = (sequence.capture.mattes.shape for sequence in sequences)
+    return tuple(
+        read_clothes(folder, (t, height, width)) for folder, (t, _, height, width) in zip(folders, shapes, strict=True)
+    )
 
 
 def _digests(folder: Path) -> dict[str, str]:

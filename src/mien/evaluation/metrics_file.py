@@ -86,8 +86,9 @@ def _check_protocol(entry: Mapping[str, Any]) -> None:
         _number(entry, "covered_frames", whole=True)
     if entry["face_params"] != "as_tracked":
         _check_row(entry["as_tracked"])
-    if "fitted" in entry:
-        _check_row(entry["fitted"])
+    for name in ("fitted", "opened", "without_clothes"):
+        if name in entry:
+            _check_row(entry[name])
     for name, row in entry["baselines"].items():
         _require(name in BASELINE_NAMES, "a baseline's name")
         _check_row(row)

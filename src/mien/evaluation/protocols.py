@@ -6,6 +6,10 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Annotated, Any
 
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
@@ -34,6 +38,7 @@ from mien.ranges import Range
 from mien.training.footage import Frame, spread_frames
 
 AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"
+OPENED, UNCLOTHED = "opened", "without_clothes"
 _MAX_TRAINING_FRAMES = 200
 _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
 """Figures that every frame has."""
@@ -66,6 +71,11 @@ class EvaluationSettings(ScoreSettings):
     """Number of optimiser steps of that fit, for each timestep."""
 
     @property
+    def opened(self) -> bool:
+        """Whether drawings are scored eroded and dilated as well, and without clothes."""
+        return self.protocol is not None and dataset_protocol(self.protocol).opened
+
+    @property
     def border(self) -> Border:
         """Windows of SSIM at the border of a picture."""
         return "zeros" if self.protocol is None else dataset_protocol(self.protocol).border
@@ -78,7 +88,8 @@ class Evaluation:
     frames: tuple[Frame, ...]
     scores: dict[str, tuple[Scores, ...]]
     """Figures by subject, with one entry per frame: `avatar`; `as_tracked`, if the avatar's faces are corrected;
-    `fitted`, if asked for; and, with baselines, `mean_frame` and `mesh`."""
+    `fitted`, if asked for; `opened` and `without_clothes`, if the protocol has them; and, with baselines, `mean_frame`
+    and `mesh`."""
     seconds_per_frame: float
     """Median time to pose and render the avatar."""
     baselines: Baselines | None
@@ -107,6 +118,7 @@ def evaluate_frames(
     subjects = {AVATAR} | ({AS_TRACKED} if experiment.face_source != "as_tracked" else set())
     subjects |= {FITTED} if settings.fit_faces else set()
     subjects |= {MEAN_FRAME, MESH} if settings.baselines else set()
+    subjects |= {OPENED} if settings.opened else set()
     kept = partial.read() if partial is not None else {}
     done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
     metric, lpips = perceptual_metric(settings), lpips_metric(settings)
@@ -120,29 +132,35 @@ def evaluate_frames(
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
         truth, crop = target_image(experiment, frame), experiment.crop(frame)
         judges = (metric, lpips) if frame in judged else (None, None)
-        scores = score_pictures(pictures, truth, crop, judges[0], experiment.parts(frame), judges[1], settings.border)
+        parts, border = experiment.parts(frame), settings.border
+        clothes = experiment.clothes_of(frame) if OPENED in pictures else None
+        scores = score_pictures(pictures, truth, crop, judges[0], parts, judges[1], border)
+        if clothes is not None:
+            bare = {UNCLOTHED: without(pictures[OPENED], clothes)}
+            scores |= score_pictures(bare, without(truth, clothes), crop, judges[0], parts, judges[1], border)
         return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
-        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines, fitted)
+        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines, fitted, settings.opened)
         for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:
                 partial.add(frame, row, seconds)
             advance(status=f"PSNR {fmean(r[AVATAR]['psnr'] for r, _ in done.values()):.2f}")
     rows = [done[frame][0] for frame in frames]
-    scores = {subject: tuple(row[subject] for row in rows) for subject in rows[0]}
+    # Sequences without masks of clothes have no figures without clothes.
+    scores = {subject: tuple(row[subject] for row in rows if subject in row) for subject in _figure_names(rows)}
     seconds = sorted(done[frame][1] for frame in frames)
     return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, _training_psnr(experiment, threads))
 
 
 def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
     """Whether all subjects are scored, with every figure that each frame must have."""
-    return scores.keys() == subjects and all(row.keys() >= _ALWAYS for row in scores.values())
+    return scores.keys() - {UNCLOTHED} == subjects and all(row.keys() >= _ALWAYS for row in scores.values())
 
 
 def _drawn(
-    experiment: Experiment, frames: list[Frame], baselines: Baselines | None, fitted: FittedFaces | None
+    experiment: Experiment, frames: list[Frame], baselines: Baselines | None, fitted: FittedFaces | None, opens: bool
 ) -> Iterator[tuple[Frame, dict[str, Tensor], float]]:
     """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar."""
     as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
@@ -154,10 +172,22 @@ def _drawn(
             drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
         if fitted is not None:
             drawn[FITTED] = avatar_image(experiment, frame, fitted.face(frame))
+        if opens:
+            drawn[OPENED] = opened(drawn[AVATAR] if fitted is None else drawn[FITTED])
         if baselines is not None:
             drawn[MEAN_FRAME] = baselines.mean_frame_image(experiment, frame)
             drawn[MESH] = baselines.mesh_image(experiment, frame)
         yield frame, drawn, seconds
+
+
+def opened(picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """The picture eroded and then dilated by 3x3 pixels, each channel by itself, as MonoGaussianAvatar scores it."""
+    return torch.from_numpy(cv2.morphologyEx(picture.numpy(), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
+
+
+def without(picture: Float[Tensor, "h w 3"], clothes: Bool[np.ndarray, "h w"]) -> Float[Tensor, "h w 3"]:
+    """The picture with clothes painted white."""
+    return torch.where(torch.from_numpy(clothes)[..., None], 1.0, picture)
 
 
 def _as_tracked(experiment: Experiment) -> Experiment:
@@ -217,6 +247,11 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "baselines": {name: mean_scores(scores[name]) for name in (MEAN_FRAME, MESH) if name in scores},
         "as_tracked": mean_scores(scores.get(AS_TRACKED, own_rows)),
         **_fitted_content(scores, settings),
+        **{
+            name: {**mean_scores(scores[name]), "frames": len(scores[name])}
+            for name in (OPENED, UNCLOTHED)
+            if name in scores
+        },
         "per_frame": {
             "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
             "timestep": [frame.timestep for frame in evaluation.frames],
@@ -240,7 +275,7 @@ def _fitted_content(scores: Mapping[str, Sequence[Scores]], settings: Evaluation
     return {FITTED: {**mean_scores(scores[FITTED]), "fit": {"steps": settings.fit_steps, "loss": LOSS}}}
 
 
-def _figure_names(rows: Sequence[Scores]) -> list[str]:
+def _figure_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """The names of all figures that any frame has. A frame in which the eyes are not seen has no figures of them."""
     return list(dict.fromkeys(name for row in rows for name in row))
 

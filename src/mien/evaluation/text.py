@@ -8,6 +8,8 @@ from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NA
 from mien.terminal import printable
 
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
+_FURTHER = {"opened": "eroded and dilated", "without_clothes": "the same without clothes"}
+"""Words for further figures of a dataset's protocol, by their keys in metrics.json."""
 _PARTS = ((None, "whole frame"), ("head", "head crop"))
 
 
@@ -29,6 +31,9 @@ def dataset_line(entry: Mapping[str, Any]) -> str:
     text = f"by the protocol of {entry['dataset_protocol']}: whole frame {_figures(entry)}"
     if entry.get("lpips") is not None:
         text += f" ({entry['lpips_backbone']})"
+    for name, words in _FURTHER.items():
+        if name in entry:
+            text += f"; {words} {_figures(entry[name])}"
     return f"{text}; pixels: {entry['mask']}; SSIM: {entry['ssim_window']}"
 
 

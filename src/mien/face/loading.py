@@ -17,6 +17,7 @@ from mien.face.anny import bake_anny
 from mien.face.anny_source import anny_tag
 from mien.face.cache import cache_folder
 from mien.face.checks import check_face_model
+from mien.face.coefficients import BASE, coefficient_count, coefficient_head
 from mien.face.model import FaceModel, Landmarks
 from mien.inside import is_one_line, is_plain_name
 from mien.limits import are_indices, is_moderate
@@ -75,6 +76,9 @@ def load_face_model(name: str = "anny") -> FaceModel:
 
 def load_face_model_without_landmarks(name: str) -> FaceModel:
     """Load a face model without landmarks, for the code that makes them."""
+    count = coefficient_count(name)
+    if count is not None:
+        return coefficient_head(load_face_model_without_landmarks(BASE), count)
     if name not in _SOURCES:
         return _read_added(name)
     source = _SOURCES[name]
@@ -101,7 +105,7 @@ def available_face_models() -> list[FaceModelInfo]:
 
 def is_built_in(name: str) -> bool:
     """Whether a face model of that name comes with mien."""
-    return name in _SOURCES
+    return name in _SOURCES or coefficient_count(name) is not None
 
 
 def add_face_model(model: FaceModel, source: Path, source_sha256: str, licence: str | None = None) -> None:
@@ -178,6 +182,7 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
+    name = name if coefficient_count(name) is None else BASE
     file = _shipped_landmarks(name) if name in _SOURCES else _landmark_file(_added_file(name))
     return _read_landmark_file(file, name, model) if file.is_file() else {}
 

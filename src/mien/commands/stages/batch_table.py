@@ -6,7 +6,7 @@ import difflib
 import io
 import json
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,9 @@ _PATHS = frozenset(
     {"calibration", "config", "face-model", "capture.mattes", "capture.landmarks", "capture.clean-plate"}
 )
 """Options that name a file. It may be given beside the table."""
-_GROUPS = ("capture", "tracking", "scoring", "method")
+_OF_IMPORT, _OF_SCORES = ("face-model", "retrack"), ("protocol",)
+"""Options of `mien import` and of `mien evaluate` that the row of a dataset may have."""
+_GROUPS = ("capture", "tracking", "scoring", "training", "method")
 _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 """Memory of a row in megabytes: at least, and for each frame. 10 minutes of video take less than 3 GiB."""
 
@@ -91,7 +93,7 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Ro
     methods = cells.get("method", []) + cells.get("methods", []) or [DEFAULT_METHOD]
     for method in methods:
         check_method(where, method)
-    known = _options()
+    known = [*_options(), *({*_OF_IMPORT, *_OF_SCORES} - {"face-model"})]
     options, labels = {}, {}
     for key, words in cells.items():
         if key in _OWN:
@@ -107,6 +109,7 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Ro
                 f"{where}: column {original[key]!r} is no option; did you mean {near[0]!r}? Labels need other names"
             )
         labels[original[key]] = ";".join(words)
+    _check_columns(options, original, bool(dataset), where)
     steps = _steps(inputs, bool(dataset), methods, options)
     _check(steps, where, kinds)
     files = [Path(word) for words in (inputs, *options.values()) for word in words if not is_url(word)]
@@ -148,23 +151,39 @@ def _options() -> list[str]:
     return sorted(name.replace("_", "-") for name in (own | train) - {*_GROUPS})
 
 
+def _check_columns(options: dict[str, list[str]], original: dict[str, str], dataset: bool, where: str) -> None:
+    """Check that each option belongs to a command of the row: videos are captured and tracked, datasets imported."""
+    for key in options:
+        if not dataset and key in (*_OF_IMPORT, *_OF_SCORES) and key != "face-model":
+            raise UserError(f"{where}: column {original[key]!r} is for datasets; leave it empty where there is a video")
+        if dataset and not (_of_training(key) or key in (*_OF_IMPORT, *_OF_SCORES)):
+            raise UserError(
+                f"{where}: column {original[key]!r} is for videos, which are captured and tracked; leave it empty "
+                "where there is a dataset"
+            )
+
+
+def _of_training(key: str) -> bool:
+    """Whether an option is one of `mien train`."""
+    own = {one.name.replace("_", "-") for one in fields(TrainOptions)}
+    return key in own or key.startswith(("method.", "training."))
+
+
 def _steps(inputs: list[str], dataset: bool, methods: Sequence[str], options: dict[str, list[str]]) -> list[list[str]]:
     """The commands of a row: tracked once, trained by each method."""
-    training = {one.name.replace("_", "-") for one in fields(TrainOptions)}
-    whole = [word for key, words in options.items() for word in _typed(key, words)]
-    trained = [
-        word
-        for key, words in options.items()
-        if key in training or key.startswith("method.")
-        for word in _typed(key, words)
-    ]
+
+    def typed(wanted: Callable[[str], bool]) -> list[str]:
+        return [word for key, words in options.items() if wanted(key) for word in _typed(key, words)]
+
+    trained = typed(_of_training)
     if dataset:
-        steps = [["import", *inputs, "--out", WORKSPACE]]
+        # A row that is tried again goes on where it stopped.
+        steps = [["import", *inputs, "--out", WORKSPACE, "--resume", *typed(lambda key: key in _OF_IMPORT)]]
     else:
-        steps = [["create", *inputs, "--out", WORKSPACE, "--method", methods[0], *whole]]
+        steps = [["create", *inputs, "--out", WORKSPACE, "--method", methods[0], *typed(lambda key: True)]]
     for method in methods if dataset else methods[1:]:
         steps.append(["train", WORKSPACE, "--method", method, *trained])
-        steps.append(["evaluate", WORKSPACE, "--run", method])
+        steps.append(["evaluate", WORKSPACE, "--run", method, *typed(lambda key: key in _OF_SCORES)])
     return steps
 
 

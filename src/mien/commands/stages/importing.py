@@ -31,8 +31,9 @@ _MARGIN = 1.15
 
 
 def run_import_stage(
-    dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None, retrack: bool = False
-) -> None:
+    dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None, retrack: bool = False,
+    resume: bool = False,
+) -> None:  # fmt: skip
     """Read a dataset, and write its avatar as a run, or its sequences.
 
     Args:
@@ -42,6 +43,7 @@ def run_import_stage(
         run: Name of the run that an avatar becomes.
         face_model: Name or file of the face model that the files belong to, if the user gives one.
         retrack: Whether to leave out the tracking of the authors, and to track the pictures with mien.
+        resume: Whether sequences that are there already stay as they are. If not, they are an error.
 
     Raises:
         UserError: the files or the face model cannot be read, or the run or a sequence is there already or cannot be
@@ -59,7 +61,7 @@ def run_import_stage(
     if isinstance(content, TrainedAvatar):
         _write_run(content, run_dir, path)
     else:
-        untracked = _write_sequences(content, workspace, dataset, path)
+        untracked = _write_sequences(content, workspace, dataset, path, resume)
         if retrack:
             run_tracking_stage(workspace, "anny", TrackingSettings())
         elif untracked:
@@ -80,7 +82,7 @@ def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
 
 
 def _write_sequences(
-    sequences: Iterable[ReadSequence], workspace: Workspace, dataset: Dataset, source: Path
+    sequences: Iterable[ReadSequence], workspace: Workspace, dataset: Dataset, source: Path, resume: bool
 ) -> list[str]:
     """Write the sequences, and return the names of those without a tracking."""
     untracked = []
@@ -88,13 +90,16 @@ def _write_sequences(
         if isinstance(sequence, Footage):
             folder = workspace.sequence_dir(sequence.name)
             with hold(folder):
-                check_new_sequence(folder)
-                write_footage(folder, sequence, dataset, source)
+                if not (resume and folder.exists()):
+                    check_new_sequence(folder)
+                    write_footage(folder, sequence, dataset, source)
             untracked.append(sequence.name)
             continue
         capture = sequence.capture
         folder = workspace.sequence_dir(capture.name)
         with hold(folder):
+            if resume and folder.exists():
+                continue
             check_new_sequence(folder)
             write_sequence(folder, sequence, dataset, source)
         cameras = counted(len(capture.camera_ids), "camera")

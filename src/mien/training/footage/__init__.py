@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         TRAINING_CAMERA,
         with_benchmark_split,
     )
+    from mien.training.footage.clothes import FOREIGN, clothes_digest, clothes_mask, packed_clothes, read_clothes
     from mien.training.footage.constants import FOOTAGE
     from mien.training.footage.coverage import (
         Coverage,
@@ -74,6 +75,7 @@ __all__ = [
     "Coverage",
     "DRIVING",
     "FOOTAGE",
+    "FOREIGN",
     "Frame",
     "FrameOrder",
     "HIDDEN_CAMERAS",
@@ -90,6 +92,8 @@ __all__ = [
     "side_random",
     "background_at",
     "camera_extent",
+    "clothes_digest",
+    "clothes_mask",
     "composite",
     "confidence_picture",
     "crop_random",
@@ -107,7 +111,9 @@ __all__ = [
     "imported_from",
     "inside_triangles",
     "measure_coverage",
+    "packed_clothes",
     "ranges_of",
+    "read_clothes",
     "read_coverage",
     "read_own_split",
     "read_sequence",
