@@ -22,7 +22,7 @@ return [buttons.length, avatar.viewer.face.expression[jaw]];
 
 def npm(folder: Path, *arguments: str | Path) -> None:
     command = [shutil.which("npm") or "npm", *map(str, arguments), "--no-audit", "--no-fund"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1000)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
 
 
