@@ -43,9 +43,7 @@ def load_experiments(
         given = ", ".join(folder.name for folder in sequence_dirs)
         raise UserError(f"{run_dir}: was trained on {', '.join(wanted)}, not on {given}; give it those sequences")
     digests = tuple(_digests(folder) for folder in sequence_dirs)
-    scorings = tuple(
-        read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
-    )
+    scorings = tuple(read_scoring(each / "scoring", read_capture_hash(each / "capture")) for each in sequence_dirs)
     rules, whole = None if protocol is None else dataset_protocol(protocol), False
     if rules is not None:
         masks = dict(zip(sequence_dirs, scorings, strict=True))
