@@ -222,13 +222,14 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
 def write_nerf_blendshape(folder: Path, scene: Scene, scale: float = 1.0, detected: bool = False) -> Path:
     """Write a person of NeRFBlendShape, from picture 7 on and with a gap, in a world of another scale.
 
-    Landmarks are made up, or those of the drawn head (`detected`).
+    Landmarks are made up, or those of the drawn head (`detected`), whose neck is then at rest as that of a rigid pose.
     """
     frames = []
     for timestep in range(len(scene)):
         number = 7 + timestep + (timestep > 2)
         rotation, translation = head_view(timestep)
-        image, matte = draw(scene, scene.vertices(timestep, root=False), UNEQUAL, rotation, translation)
+        vertices = scene.vertices(timestep, root=False, neck=not detected)
+        image, matte = draw(scene, vertices, UNEQUAL, rotation, translation)
         write_picture(folder / f"ori_imgs/{number}.jpg", image)
         classes = np.zeros((SIDE, SIDE, 3), np.uint8)
         classes[matte > 127] = (0, 0, 255)
@@ -236,7 +237,7 @@ def write_nerf_blendshape(folder: Path, scene: Scene, scale: float = 1.0, detect
         write_picture(folder / f"parsing/{number}.png", classes)
         points = np.stack([np.arange(478) % SIDE, np.full(478, timestep + 0.25)], axis=1)
         if detected:
-            points = projected(scene.marks(scene.vertices(timestep, root=False)), UNEQUAL, rotation, translation)
+            points = projected(scene.marks(vertices), UNEQUAL, rotation, translation)
         (folder / f"ori_imgs/{number}.lms").write_text("\n".join(f"{x} {y}" for x, y in points))
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = rotation, translation

@@ -14,7 +14,6 @@ from dataset_writers import (
     FRONTAL,
     UNEQUAL,
     benchmark_vertices,
-    rotation_of,
     write_benchmark,
     write_insta,
     write_nerf_blendshape,
@@ -119,7 +118,7 @@ def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: 
     drawn = camera.project(model.landmark_positions(model(face), "mediapipe"))[0].numpy()
     mattes, mesh, above = sequence.capture.mattes, model(face), model.faces[~model.region_mask("neck")]
     for timestep in range(len(scene)):
-        marks = scene.marks(scene.vertices(timestep, root=False))
+        marks = scene.marks(scene.vertices(timestep, root=False, neck=False))
         expected = projected(marks, UNEQUAL, *head_view(timestep))
         apart = np.linalg.norm(drawn[timestep] - expected, axis=1)
         assert np.median(apart) < 0.12 * np.linalg.norm(expected[33] - expected[263]), timestep
@@ -135,9 +134,7 @@ def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: 
     file = folder / "transforms.json"
     content = json.loads(file.read_text())
     for index, frame in enumerate(content["frames"]):
-        turn = np.eye(4)
-        turn[:3, :3] = rotation_of(np.array([0.0, (-1) ** index * 0.9, 0.0]))
-        frame["transform_matrix"] = (turn @ np.array(frame["transform_matrix"])).tolist()
+        frame["transform_matrix"][0][3] += (-1) ** index * 1.5  # no place of the head fits places that jump by 40 cm
     file.write_text(json.dumps(content))
     with pytest.raises(UserError, match="by its poses, landmarks are"):
         read(folder, "nerf-blendshape", model)

@@ -82,7 +82,7 @@ def test_ten_people_are_imported_trained_and_scored_by_one_table(
     """A row is a person. The row of a damaged one fails alone, and goes on where it stopped after it is mended."""
     from mien.evaluation import living
 
-    monkeypatch.setattr(living, "FPS", 1)
+    monkeypatch.setattr(living, "FPS", 3)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     scene = tiny_scene(tmp_path)
     add_face_model(scene.model, Path("tiny.npz"), "0")

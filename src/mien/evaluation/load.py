@@ -43,9 +43,7 @@ def load_experiments(
         given = ", ".join(folder.name for folder in sequence_dirs)
         raise UserError(f"{run_dir}: was trained on {', '.join(wanted)}, not on {given}; give it those sequences")
     digests = tuple(_digests(folder) for folder in sequence_dirs)
-    scorings = tuple(
-        read_scoring(folder / "scoring", read_capture_hash(folder / "capture")) for folder in sequence_dirs
-    )
+    scorings = tuple(read_scoring(each / "scoring", read_capture_hash(each / "capture")) for each in sequence_dirs)
     rules, whole = None if protocol is None else dataset_protocol(protocol), False
     if rules is not None:
         masks = dict(zip(sequence_dirs, scorings, strict=True))
@@ -56,12 +54,6 @@ def load_experiments(
             raise UserError(f"{folder}: was changed while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
     clothes = _clothes(sequence_dirs, sequences) if rules is not None and rules.opened else ()
-    if whole:
-        digests = tuple({**each, "mask": "matte"} for each in digests)
-    digests = tuple(
-        each if packed is None else {**each, "clothes": clothes_digest(packed)}
-        for each, packed in zip(digests, clothes or (None,) * len(digests), strict=True)
-    )
     avatar = load_avatar(run_dir)
     for folder, sequence in zip(sequence_dirs, sequences, strict=True):
         check_face_params(avatar.face_model, sequence.tracking.face, str(folder), "track it again")
@@ -78,7 +70,7 @@ def load_experiments(
         edges=edges,
         whole_mattes=whole,
         clothes=clothes,
-        digests=digests,
+        digests=_scored_digests(digests, whole, clothes),
     )
     found = held_out_by_protocol(sequences, settings)
     if rules is not None:
@@ -87,6 +79,17 @@ def load_experiments(
         name: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
         for name, (split, frames) in found.items()
     }
+
+
+def _scored_digests(
+    digests: Items[dict[str, str]], whole: bool, clothes: Items[UInt8[np.ndarray, "t h p"] | None]
+) -> tuple[dict[str, str], ...]:
+    """The hashes of what is scored: pictures, mask or whole matte, and clothes where a protocol asks for them."""
+    found = []
+    for each, packed in zip(digests, clothes or (None,) * len(digests), strict=True):
+        matte = {"mask": "matte"} if whole else {}
+        found.append({**each, **matte, **({} if packed is None else {"clothes": clothes_digest(packed)})})
+    return tuple(found)
 
 
 def _clothes(folders: Items[Path], sequences: Items[Sequence]) -> tuple[UInt8[np.ndarray, "t h p"] | None, ...]:
