@@ -223,7 +223,9 @@ def test_avatars_on_disk_keep_what_training_saw(tmp_path: Path) -> None:
     avatar = new_avatar(2)
     avatar.activations.seen = random(7, 2)
     write_avatar(tmp_path, avatar)
-    assert torch.equal(load_avatar(tmp_path).activations.seen, avatar.activations.seen)
+    loaded = load_avatar(tmp_path)
+    assert isinstance(loaded, GaussianAvatars)
+    assert torch.equal(loaded.activations.seen, avatar.activations.seen)
     avatar.activations.seen = random(7, 3)
     write_avatar(tmp_path, avatar)
     with pytest.raises(UserError, match="does not fit its settings"):
