@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import get_args, get_type_hints
 
+import cv2
 import numpy as np
 import pytest
 
@@ -152,6 +153,11 @@ def test_file_that_is_no_video(
     path.write_text("Dear reader")
     monkeypatch.setattr(f"mien.commands.{command}.Command.run", lambda command: pytest.fail("the work began"))
     assert "letter.mp4" in complaint(capsys, command, str(path), "--out", str(tmp_path / "out"))
+    picture = cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes()
+    for name in ("face.jpg", "face.mp4"):
+        (tmp_path / name).write_bytes(picture)
+        message = complaint(capsys, command, str(tmp_path / name), "--out", str(tmp_path / "out"))
+        assert f"{name}: is a picture; give a video" in message
 
 
 def test_video_without_a_face(faceless_video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

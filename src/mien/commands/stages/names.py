@@ -78,14 +78,16 @@ def check_videos(videos: Sequence[Path]) -> None:
     """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture.
 
     Raises:
-        UserError: a file is no video, or one that cannot be opened.
+        UserError: a file is no video, or one that cannot be opened, or a picture.
     """
     from mien.capture.video_file import open_video
 
     for video in videos:
         if video.is_file():
-            with open_video(video):
-                pass
+            with open_video(video) as (container, _):
+                # FFmpeg's names of pictures: png_pipe, jpeg_pipe.
+                if container.format.name.endswith("_pipe"):
+                    raise UserError(f"{video}: is a picture; give a video, or the folder of a video's pictures")
 
 
 def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:

@@ -89,7 +89,9 @@ def turntable_tiles(face: FaceParams, camera: Camera, center: Float[Tensor, " 3"
     """
     gaps = TURNTABLE_TILES if abs(degrees) >= 360 else TURNTABLE_TILES - 1
     angles = [degrees * (index / gaps - 0.5) for index in range(TURNTABLE_TILES)]
-    return [Tile(f"{angle:+.0f} degrees", face, orbit(camera, center, math.radians(angle))) for angle in angles]
+    names = [f"{angle:+.0f} degrees" if round(angle) else "front" for angle in angles]
+    cameras = [orbit(camera, center, math.radians(angle)) for angle in angles]
+    return [Tile(name, face, camera) for name, camera in zip(names, cameras, strict=True)]
 
 
 def draw_sheet(

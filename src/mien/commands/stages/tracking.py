@@ -294,7 +294,7 @@ def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, over
     if not shown:
         every = _stride(tracking, overlay)
         if every > 1:
-            say(f"{capture.name}: the overlay shows every {every}th frame of {len(tracking.valid)}; `--overlay all` "
+            say(f"{capture.name}: the overlay shows one frame in {every} of {len(tracking.valid)}; `--overlay all` "
                 "shows them all")  # fmt: skip
         write_overlay(folder / "tracking" / "overlay.mp4", capture, tracking, face_model, every)
 
