@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from damage import edit_json
+from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands.stages.names import doubled_videos
 from mien.errors import UserError
@@ -27,6 +28,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("empty.csv", "empty.json", "empty.mp4"):
         (place / name).write_bytes(b"")
     (place / "text.txt").write_text("Dear reader")
+    write_video(place / "short.mp4", [np.zeros((16, 16, 3), np.uint8)] * 2, 25.0)
     (place / "bytes.csv").write_bytes(bytes(range(256)))
     (place / "list.json").write_text("[]")
     (place / "cameras.json").write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": [SKEWED]}))
@@ -122,7 +124,7 @@ ODD = [
     ("track W --tracking.smoothness.rotation -1", "--tracking.smoothness.rotation -1: give a number above 0, or inf"),
     ("track W --scoring.cut line", "give --scoring.cut plane, or delete that folder"),
     ("track W --scoring.cut circle", "'circle'"),
-    ("create text.txt --out W --name clip --scoring.cut line", "give --scoring.cut plane, or delete that folder"),
+    ("create short.mp4 --out W --name clip --scoring.cut line", "give --scoring.cut plane, or delete that folder"),
     ("capture empty.mp4 --out text.txt", "is a file, but a folder"),
     ("capture /dev/null --out new", "/dev/null: is not a file"),
     ("create empty.mp4 --out new --capture.size 0", "--capture.size 0"),

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -121,7 +122,7 @@ def test_mistakes_are_told_before_any_work(
     arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clip, out = tmp_path / "clip.mp4", tmp_path / "out"
-    clip.write_bytes(b"")
+    write_video(clip, [np.zeros((16, 16, 3), np.uint8)] * 2, 25.0)
     (out / "runs" / "other").mkdir(parents=True)
     content = {
         "format": "mien.run",

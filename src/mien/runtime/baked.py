@@ -125,7 +125,7 @@ class ExpressionChanges:
     rest: Float32[np.ndarray, " i"]
     """Inputs of the person at rest: expression coefficients, then axis-angle vectors of the free joints, in radians."""
     directions: Float32[np.ndarray, "i r"]
-    seen: Float32[np.ndarray, "s _"]
+    seen: Float32[np.ndarray, "_ _"]
     """[s, r]: activations that are allowed: those of training frames that go furthest along one of these, and a fifth
     more. No rows shorten nothing."""
     color: Float32[np.ndarray, "n 3 _"] | None = None

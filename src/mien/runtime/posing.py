@@ -207,7 +207,7 @@ def _along(
     face: Face,
     rest: Float32[np.ndarray, " i"],
     directions: Float32[np.ndarray, "i r"],
-    seen: Float32[np.ndarray, "s r"] | None = None,
+    seen: Float32[np.ndarray, "_ r"] | None = None,
 ) -> Float32[np.ndarray, " r"]:
     """(inputs - rest) directions, shortened to what training saw, by the same operation as in training."""
     inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
