@@ -117,8 +117,9 @@ class FeatureChanges:
 class ExpressionChanges:
     """Changes of the raw values with the expression, of low rank. A part that is None does not change.
 
-    The activations a are (inputs - rest) directions. The furthest that a row of `seen` goes along them is l = max (seen
-    a) / |a|. If |a| is beyond l, they are shortened to the length l + m o / (m + o), with o = |a| - l and m = l / 10.
+    The activations a are (inputs - rest) directions, and d is their length. The furthest that a row of `seen` goes
+    along them is l = max (seen a) / d. If d is beyond l, they are shortened to the length l + m o / (m + o), with
+    o = d - l and m = l / 10.
     `_native.expression_activations` computes this.
     """
 
