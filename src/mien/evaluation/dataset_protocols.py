@@ -31,7 +31,7 @@ class DatasetProtocol:
     splits: tuple[str, ...] = (OWN_SPLIT,)
     """Splits that the run may be trained with."""
     border: Border = "zeros"
-    """Which windows of SSIM count at the border of a picture."""
+    """This says which windows of SSIM count at the border of a picture."""
     lpips: tuple[str, ...] = (_ALEX, _VGG)
     """Trunks with which LPIPS is reported. Both, if papers differ or say nothing."""
     opened: bool = False

@@ -74,7 +74,7 @@ class Experiment:
         return part_boxes(face_model, vertices, self.camera(frame))
 
     def clothes_of(self, frame: Frame) -> Bool[np.ndarray, "h w"] | None:
-        """Where a picture shows clothes, or None if nothing tells."""
+        """Return where a picture shows clothes, or None if nothing tells."""
         packed = self.clothes[frame.sequence] if self.clothes else None
         return None if packed is None else clothes_mask(packed, frame.timestep, self.camera(frame).width)
 

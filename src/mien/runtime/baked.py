@@ -119,8 +119,7 @@ class ExpressionChanges:
 
     The activations a are (inputs - rest) directions, and d is their length. The furthest that a row of `seen` goes
     along them is l = max (seen a) / d. If d is beyond l, they are shortened to the length l + m o / (m + o), with
-    o = d - l and m = l / 10.
-    `_native.expression_activations` computes this.
+    o = d - l and m = l / 10. `_native.expression_activations` computes this.
     """
 
     rest: Float32[np.ndarray, " i"]

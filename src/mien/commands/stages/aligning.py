@@ -22,7 +22,7 @@ from mien.tracking import Tracking, read_tracking, write_tracking
 from mien.training import AlignmentSettings, Sequence, TrainSettings, align, outdated_sequences
 from mien.workspace import Workspace
 
-_RECIPE = 2
+_RECIPE = 3
 """Version of the alignment. It is raised whenever the same tracking would be aligned differently."""
 _KEY = "aligned"
 """Entry of a tracking's settings that says how it was aligned."""

@@ -1,4 +1,4 @@
-"""Where a picture of an imported sequence shows clothes, for protocols that score without them."""
+"""Masks of clothes in the pictures of imported sequences are kept here, for protocols that score without them."""
 
 import hashlib
 from collections.abc import Mapping
