@@ -31,6 +31,17 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+STAGES = """
+import ast, importlib
+from pathlib import Path
+from mien.commands import create
+
+for node in ast.walk(ast.parse(Path(create.__file__).read_text(encoding="utf-8"))):
+    if isinstance(node, ast.ImportFrom) and node.module.startswith("mien.commands.stages"):
+        print(importlib.import_module(node.module).__name__)
+"""
+
+
 def mien_without(missing: set[str], *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a command where some packages are missing."""
     code = WITHOUT.format(missing=sorted(missing))
@@ -47,6 +58,14 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("file") / "me.mien"
     runtime.write_portable(path, make_portable(new_avatar("gaussian_avatars"), toy_camera(32), "toy"))
     return path
+
+
+def test_create_needs_no_package_of_another_extra():
+    missing = {module for module, extra in extras.EXTRA_OF.items() if extra != "create"}
+    code = WITHOUT.format(missing=sorted(missing)).split("from mien.cli")[0] + STAGES
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "mien.commands.stages.training" in done.stdout.split()
 
 
 def test_the_base_install_asks_for_five_packages():

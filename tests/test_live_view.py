@@ -111,14 +111,14 @@ def test_a_viewer_follows_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             runtime.write_portable(file, make_portable(avatar, toy_camera(32), "toy"))
         if turn == 4:
             assert session.avatar is not before
-            monkeypatch.setenv(live_view.PARENT, "1")
+            monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
 
     monkeypatch.setattr(viewing.time, "sleep", sleep)
     monkeypatch.setattr(viewing.os, "kill", lambda process, number: signals.append((process, number)))
-    monkeypatch.setenv(live_view.PARENT, str(os.getppid()))
+    monkeypatch.setenv(live_view.PARENT_VARIABLE, str(os.getppid()))
     with pytest.raises(StopIteration):
         viewing._follow(session, file)
-    monkeypatch.setenv(live_view.PARENT, "1")
+    monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
     monkeypatch.setattr(viewing.time, "sleep", lambda _: None)
     viewing._follow(session, file)
     assert signals == [(os.getpid(), signal.SIGTERM)]

@@ -24,6 +24,8 @@ SIGNATURE_AT = 1 if IS_WINDOWS else 0
 """Offset of the text in a lock file. A lock of Windows is of the first byte, which then nobody else can read."""
 
 _LOOKS, _LOOK_SECONDS = 5, 0.01
+PARENT_VARIABLE = "MIEN_VIEWER_OF"
+"""Environment variable of a viewer with the process whose end also ends it."""
 _MIB = 1 << 20
 
 

@@ -11,11 +11,10 @@ from pathlib import Path
 
 from mien.avatar import Avatar, make_portable
 from mien.camera import Camera
-from mien.commands.stages.viewing import PARENT
 from mien.errors import UserError
 from mien.progress import say
 from mien.runtime import write_portable
-from mien.system import lower_priority
+from mien.system import PARENT_VARIABLE, lower_priority
 
 _LEAST_SECONDS = 2.0
 """Least time between two pictures of the state."""
@@ -72,7 +71,7 @@ class LiveView:
 
 def _start(file: Path) -> "subprocess.Popen[bytes]":
     """Start a viewer of a file, with one thread and lower priority. Its first line is the address to open."""
-    environment = {**os.environ, PARENT: str(os.getpid()), "MIEN_THREADS": "1"}
+    environment = {**os.environ, PARENT_VARIABLE: str(os.getpid()), "MIEN_THREADS": "1"}
     command = [sys.executable, "-m", "mien.cli", "view", str(file), "--follow"]
     viewer = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL)
     lower_priority(viewer.pid, _NICE)

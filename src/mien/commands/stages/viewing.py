@@ -18,14 +18,12 @@ from mien.errors import UserError
 from mien.progress import say
 from mien.runtime import MeshBound, PortableAvatar, read_portable
 from mien.stops import Terminated
-from mien.system import end_this_process
+from mien.system import PARENT_VARIABLE, end_this_process
 from mien.viewer import CameraSwitch, Door, Mesh, Session, is_loopback, serve
 
 if TYPE_CHECKING:
     import mien.face
 
-PARENT = "MIEN_VIEWER_OF"
-"""Environment variable with the process whose end also ends the viewer."""
 _FOLLOW_SECONDS = 0.5
 
 
@@ -126,7 +124,7 @@ def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwit
 
     Other machines must not turn it on, nor other users of this one.
     """
-    if not devices() or not is_loopback(place.host) or not place.token or os.environ.get(PARENT) is not None:
+    if not devices() or not is_loopback(place.host) or not place.token or os.environ.get(PARENT_VARIABLE) is not None:
         return None
     try:
         from mien.commands.stages.viewing_motions import switch_of_first_camera
@@ -137,7 +135,7 @@ def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwit
 
 def _follow(session: Session, path: Path) -> None:
     """Show the file whenever it changes. If a training started this viewer and is gone, end it."""
-    parent, seen = os.environ.get(PARENT), _changed_at(path)
+    parent, seen = os.environ.get(PARENT_VARIABLE), _changed_at(path)
     while True:
         time.sleep(_FOLLOW_SECONDS)
         if parent is not None and str(os.getppid()) != parent:
