@@ -70,7 +70,8 @@ def test_the_queue_gives_the_targets_of_the_steps(resolution: int, background: s
     sequence = toy_sequence(6, 32)[1]
     settings = replace(SETTINGS, background=background)
     order = FrameOrder(training_frames([sequence], settings), 0)
-    with targets_ahead(order, [Targets(sequence, resolution)], settings) as queue:
+    targets = [Targets(sequence, resolution)]
+    with targets_ahead(order, lambda _: targets, settings) as queue:
         for step in (*range(9), *range(30, 40), 3, 4):  # as a run that resumes, too
             found, own = queue.target(step), one_by_one(order, [Targets(sequence, resolution)], settings, step)
             assert found.box == own.box
@@ -85,7 +86,7 @@ def test_no_more_targets_wait_than_the_next_few_steps(monkeypatch: pytest.Monkey
     targets = Targets(sequence, 0)
     composed = targets.composed
     monkeypatch.setattr(targets, "composed", lambda *arguments: made.append(arguments) or composed(*arguments))
-    with targets_ahead(order, [targets], SETTINGS) as queue:
+    with targets_ahead(order, lambda _: [targets], SETTINGS) as queue:
         for step in range(SETTINGS.steps):
             queue.target(step)
             assert len(made) <= step + 1 + _AHEAD
@@ -142,7 +143,7 @@ def test_the_pictures_of_a_long_capture_are_never_held_at_once(monkeypatch: pyte
     settings = replace(SETTINGS, steps=160, background="white")
     order = FrameOrder(training_frames([sequence], settings), 0)
     targets = Targets(sequence, 0)
-    with allocating_at_most(10 * MIB), targets_ahead(order, [targets], settings) as queue:
+    with allocating_at_most(10 * MIB), targets_ahead(order, lambda _: [targets], settings) as queue:
         for step in range(settings.steps):
             queue.target(step)
 

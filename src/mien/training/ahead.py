@@ -16,6 +16,8 @@ from mien.training.footage import FrameOrder, Target, Targets, background_at
 from mien.training.settings import TrainSettings
 
 Result = TypeVar("Result")
+TargetsAt = Callable[[int], Items[Targets]]
+"""Gives the targets of a step, one entry per sequence."""
 
 _AHEAD = 4
 """Number of steps whose pictures are prepared in advance. It bounds the memory: each has 4 bytes a pixel."""
@@ -27,7 +29,7 @@ class TargetQueue:
     Frame and background of a step are known functions of its number, so a target does not depend on when it is made.
     """
 
-    def __init__(self, order: FrameOrder, targets: Items[Targets], settings: TrainSettings, worker: ThreadPoolExecutor):
+    def __init__(self, order: FrameOrder, targets: TargetsAt, settings: TrainSettings, worker: ThreadPoolExecutor):
         # The order remembers the epoch that it was asked for last, and the trainer asks for earlier steps.
         self._order, self._targets, self._settings, self._worker = copy.copy(order), targets, settings, worker
         self._next = 0
@@ -61,7 +63,7 @@ class TargetQueue:
 
     def _planned(self, step: int) -> Target | Future[Target]:
         frame, _ = self._order.at(step)
-        targets, background = self._targets[frame.sequence], background_at(self._settings, step)
+        targets, background = self._targets(step)[frame.sequence], background_at(self._settings, step)
         kept = targets.kept(frame.timestep, frame.camera, background)
         if kept is not None:
             return kept
@@ -70,8 +72,8 @@ class TargetQueue:
 
 
 @contextmanager
-def targets_ahead(order: FrameOrder, targets: Items[Targets], settings: TrainSettings) -> Iterator[TargetQueue]:
-    """A queue whose worker ends with the block, also after an error."""
+def targets_ahead(order: FrameOrder, targets: TargetsAt, settings: TrainSettings) -> Iterator[TargetQueue]:
+    """A queue whose worker ends with the block, also after an error. `targets` gives the targets of a step."""
     cv2_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # OpenCV's own threads and those of the step would wait for each other.
     # torch limits the threads of its operations for each thread apart.

@@ -89,6 +89,7 @@ def align(
         training,
         steps=settings.template_steps,
         resolution=settings.resolution,
+        coarse=0.0,
         background="white",
         edges="cleaned",
         unseen="trained",

@@ -20,6 +20,7 @@ from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
 from mien.training.ahead import TargetQueue
 from mien.training.checkpoint import TrainingState
+from mien.training.constants import TRAINING
 from mien.training.footage import (
     FOOTAGE,
     Frame,
@@ -45,8 +46,15 @@ class TrainingData:
     """Extent of the training cameras, in metres."""
     representative: tuple[Frame, ...] = ()
     """A few frames that show the head from all the sides that were filmed."""
+    coarse: tuple[Targets, ...] = ()
+    """The targets of the first `coarse_steps` steps, at half the size."""
+    coarse_steps: int = 0
     ahead: TargetQueue | None = None
     """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""
+
+    def targets_at(self, step: int) -> tuple[Targets, ...]:
+        """The targets of a step, one entry per sequence."""
+        return self.coarse if step < self.coarse_steps else self.targets
 
     def camera(self, frame: Frame) -> Camera:
         """The camera of a frame, at training resolution."""
@@ -55,7 +63,7 @@ class TrainingData:
     def target(self, step: int, settings: TrainSettings) -> Target:
         """The target of a step. It does not depend on `ahead`."""
         frame, _ = self.order.at(step)
-        targets = self.targets[frame.sequence]
+        targets = self.targets_at(step)[frame.sequence]
         if self.ahead is not None:
             return targets.moved(self.ahead.target(step))
         background = background_at(settings, step)
@@ -71,6 +79,12 @@ class TrainingData:
         )
 
 
+def coarse_steps(targets: Items[Targets], settings: TrainSettings) -> int:
+    """Number of steps at the start of a run whose pictures are halved: none if some of the pictures are small."""
+    large = all(max(one.width, one.height) >= TRAINING.least_halved for one in targets)
+    return round(settings.coarse * settings.steps) if large else 0
+
+
 def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings) -> list[BatchFrame]:
     """The frames of the next step: as many as the avatar asks for and the run has left."""
     perceptual = state.avatar.config.photometric.perceptual
@@ -79,12 +93,14 @@ def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings
         frame, _ = data.order.at(number)
         target, due = data.target(number, settings), perceptual.due(number, settings.steps)
         goal = data.goal(target, perceptual, number, settings) if due else None
-        batch.append(BatchFrame(number, frame, state.track.index_of(frame.sequence, frame.timestep), target, goal))
+        camera = data.targets_at(number)[frame.sequence].camera(frame.camera)
+        index = state.track.index_of(frame.sequence, frame.timestep)
+        batch.append(BatchFrame(number, frame, index, camera, target, goal))
     return batch
 
 
 def draw(
-    state: TrainingState, data: TrainingData, batch: Items[BatchFrame], progress: Progress
+    state: TrainingState, batch: Items[BatchFrame], progress: Progress
 ) -> tuple[Posed, list[Posed], list[Rendering]]:
     """The Gaussians of all frames, posed together; the same frame by frame, as they are drawn; and their pictures."""
     faces = [state.track.face(one.index) for one in batch]
@@ -92,10 +108,7 @@ def draw(
     each = [posed] if len(batch) == 1 else [replace(posed, gaussians=own) for own in posed.gaussians.timesteps()]
     for part in state.parts:
         each = [part.posed(own, one) for one, own in zip(batch, each, strict=True)]
-    views = [
-        (own.gaussians.timestep(0), data.targets[one.frame.sequence].camera(one.frame.camera))
-        for one, own in zip(batch, each, strict=True)
-    ]
+    views = [(own.gaussians.timestep(0), one.camera) for one, own in zip(batch, each, strict=True)]
     backgrounds = [one.target.background for one in batch]
     whole = each[0] if len(batch) == 1 else posed
     if len(batch) == 1 or len(batch) < _native.thread_count():  # A view that is drawn alone uses all threads.

@@ -27,6 +27,10 @@ class TrainingConstants:
     aligned_tuning: float = 0.2
     """Share of the learning rates of faces in a training on aligned faces. Measured: the log, 11-27."""
 
+    # batch.py
+    least_halved: int = 384
+    """Least longer side of pictures that are halved at the start of a run, in pixels. Not varied."""
+
     # camera_colors.py
     camera_colors_last_rate: float = 0.1
     """Learning rate of the cameras' colours at the last step, as a share of that at the first. Not varied."""

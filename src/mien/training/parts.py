@@ -31,6 +31,8 @@ class BatchFrame:
     frame: Frame
     index: int
     """Its timestep in the track."""
+    camera: Camera
+    """Its camera, at the size of the target."""
     target: Target
     goal: Callable[[], PerceptualGoal] | None
     """Makes the goal of the perceptual loss. None if the frame is compared without that loss."""

@@ -10,7 +10,7 @@ from mien.bounded import MAX_SIDE
 from mien.config import overlay
 from mien.devices import DeviceName
 from mien.errors import UserError
-from mien.ranges import NOT_NEGATIVE, POSITIVE, Range, check_ranges
+from mien.ranges import FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars", "nersemble-benchmark", "dataset"]
 """Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
@@ -79,6 +79,9 @@ class TrainSettings:
     Gaussians to triangles have no such Gaussians."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
+    coarse: Annotated[float, FRACTION] = 0.0
+    """Share of the run, from its start, that trains on pictures of half that size. Such steps take less time. Pictures
+    whose longer side has fewer than 384 pixels are not halved."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
     threads: Annotated[int, Range(0, 256)] = 0
@@ -185,6 +188,7 @@ PRESETS = {
             "paper",
             {
                 "background": "white",
+                "coarse": 0.0,
                 "edges": "filmed",
                 "inside": "free",
                 "mesh": "tracked",

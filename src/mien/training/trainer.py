@@ -38,7 +38,16 @@ from mien.stops import stops_put_off
 from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.ahead import targets_ahead
-from mien.training.batch import TrainingData, compare, compare_features, draw, face_groups, next_batch, seen
+from mien.training.batch import (
+    TrainingData,
+    coarse_steps,
+    compare,
+    compare_features,
+    draw,
+    face_groups,
+    next_batch,
+    seen,
+)
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.constants import TRAINING
@@ -117,14 +126,16 @@ def train(
             settings = part.settings(settings)
         settings = resolved(settings, filled=False)
         cleaned = settings.edges == "cleaned"
-        targets = [
+        targets = tuple(
             Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside, cleaned=cleaned)
             for sequence in sequences
-        ]
+        )
+        coarse = coarse_steps(targets, settings)
+        halved = tuple(one.halved() for one in targets) if coarse else ()
         faces = [sequence.tracking.face for sequence in sequences]
         looked = TRAINING.representative_frames
         representative = representative_frames(faces, sequences, frames, looked, looked)
-        data = TrainingData(order, tuple(targets), extent, tuple(representative))
+        data = TrainingData(order, targets, extent, tuple(representative), halved, coarse)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
         write_results(run_dir, state, state.covered or measure_coverage(face_model, sequences, faces, frames))
     return state.avatar
@@ -144,7 +155,7 @@ def _train_to_the_end(
         one_torch_thread(),
         _native_threads(settings.threads),
         stops_put_off() as stop,
-        targets_ahead(data.order, data.targets, settings) as ahead,
+        targets_ahead(data.order, data.targets_at, settings) as ahead,
     ):
         data = replace(data, ahead=ahead)
         pretrain(state, settings, progress, stop.follow)
@@ -299,7 +310,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     now = Step(avatar, state.track, state.density, settings, tuple(batch), progress, data.camera, data.representative)
     for part in parts:
         part.before_step(now)
-    whole, posed, renderings = draw(state, data, batch, progress)
+    whole, posed, renderings = draw(state, batch, progress)
     shown = seen(state, batch, renderings)
     losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
     losses |= compare_features(state, batch, shown)

@@ -61,7 +61,7 @@ def waiting_rows(face_model: FaceModel, count: int, size: tuple[int, int], secon
     """
     settings = replace(SETTINGS, background="random")
     state, data = training_case(face_model, count, *size)
-    with targets_ahead(data.order, data.targets, settings) as ahead:
+    with targets_ahead(data.order, data.targets_at, settings) as ahead:
         for name, own in (("wait_for_target", replace(data, ahead=ahead)), ("make_target", data)):
             waits, processors = [], []
             end = time.perf_counter() + seconds

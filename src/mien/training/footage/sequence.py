@@ -162,7 +162,7 @@ class Targets:
         self.height = max(1, round(sequence.capture.height * scale))
         cameras = (camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
         self.cameras = tuple(camera.to(like) for camera in cameras)
-        self._like = like
+        self._like, self._share = like, share
         self._on_cpu = is_native(like)
         self._cache: dict[tuple[int, int, bytes], Target] = {}
         self._soft: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
@@ -172,6 +172,12 @@ class Targets:
         self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...], Tensor | None]] = {}
         """Boxes of the mattes and of the parts, and hidden triangles, by timestep and camera."""
         self._max_cached = _CACHE_BYTES // (share * self.width * self.height * 4)
+
+    def halved(self) -> "Targets":
+        """The same pictures at half the size."""
+        half = (max(self.width, self.height) + 1) // 2
+        how = (self._share, self._like, self._face_model, self._inside)
+        return Targets(self._sequence, half, *how, cleaned=self._cleaned)
 
     def camera(self, camera: int) -> Camera:
         """A camera at training resolution."""

@@ -67,9 +67,9 @@ class WholeHead:
         if side_views is None or not due:
             return {}
         one = due[0]
-        camera, random = step.camera(one.frame), side_random(step.settings, one.number)
+        random = side_random(step.settings, one.number)
         face = step.track.face(one.index)
-        return {"side_views": side_views.loss(step.avatar, face, camera, step.progress, one.number, random)}
+        return {"side_views": side_views.loss(step.avatar, face, one.camera, step.progress, one.number, random)}
 
     def _after_backward(self, step: Step, renderings: Items[Rendering]) -> None:
         if self.hair is not None and self._surface is not None:
