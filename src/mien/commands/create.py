@@ -84,7 +84,7 @@ class Command:
         from mien.commands.stages.capturing import check_camera_ids
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
-        from mien.commands.stages.showing import show_avatar
+        from mien.commands.stages.showing import name_next_commands, show_avatar
         from mien.commands.stages.tracking import check_masks
         from mien.progress import say, whole_command
         from mien.training import check_run, check_untouched
@@ -105,8 +105,9 @@ class Command:
                 say(f"warning: {warning}")
         with whole_command(self._overall(settings)):
             self._run_stages(workspace, run, method, settings)
-        say(f"Done in {time.monotonic() - began:.0f} s.")
         show_avatar(workspace, run)
+        say(f"Done in {time.monotonic() - began:.0f} s.")
+        name_next_commands(workspace, run)
 
     def _overall(self, settings: TrainSettings) -> Overall:
         """What is to be done, with expected times."""

@@ -67,7 +67,8 @@ def expected_pieces(
     for count in frames:
         if overlay != "none":
             every = overlay_stride(count) if overlay == "auto" else 1
-            pieces.append(Piece("tracking", "Overlay", _OVERLAY * count / every))
+            stage = "tracking" if alignment is None else "alignment"  # It shows the final tracking.
+            pieces.append(Piece(stage, "Overlay", _OVERLAY * count / every))
     pieces.append(Piece("training", "training", _STEP * settings.steps))
     if settings.holds_out:
         seconds = _SCORE * scored + _PERCEPTUAL * min(scored, _PERCEPTUAL_FRAMES)

@@ -22,12 +22,11 @@ _SECONDS = 8.0
 
 
 def show_avatar(workspace: Workspace, run: str) -> None:
-    """Write DIR/me.html and DIR/me.mp4 of a run, and name what to do next.
+    """Write DIR/me.html and DIR/me.mp4 of a run.
 
     An avatar that may not be passed on, or that pages cannot draw, gets no page, with a message.
     """
     root, run_dir = workspace.root, workspace.run_dir(run)
-    which = ["--run", run] if len(workspace.run_names()) > 1 else []
     try:
         film = run_dir / FILM
         if not film.is_file():
@@ -47,6 +46,11 @@ def show_avatar(workspace: Workspace, run: str) -> None:
         say(f"{root / PAGE}: the living avatar, {page.size / 1e6:.1f} MB; open it in a browser, or send it")
     except UserError as error:
         say(f"no page: {error}")
+
+
+def name_next_commands(workspace: Workspace, run: str) -> None:
+    """Name what can be done with the avatar of a run."""
+    root, which = workspace.root, ["--run", run] if len(workspace.run_names()) > 1 else []
     for command, does in (
         (["view", str(root), *which], "turn it, and move its face"),
         (["drive", str(root), *which, "--by", "camera"], "your own face drives it"),
