@@ -5,13 +5,14 @@ import shutil
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from evaluation_case import make_experiment
-from mien.avatar import Moments, ParameterGroup, Rate
+from mien.avatar import Avatar, Moments, ParameterGroup, Rate, move_avatar
 from mien.cli import main
 from mien.commands.create import Command as Create
 from mien.commands.options import TrainOptions
@@ -19,7 +20,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import l1
 from mien.face import FaceParams
 from mien.tracking import read_tracking
-from mien.training import AlignmentSettings, TrainSettings, align
+from mien.training import AlignmentSettings, TrainSettings, align, train
 from mien.training.alignment import TRAINING, _Descent, align_faces, steadier
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
@@ -169,6 +170,26 @@ def test_held_out_frames_do_not_reach_the_template(tmp_path: Path) -> None:
     clean, absurd = found
     assert absurd.expression[:4].equal(clean.expression[:4])
     assert not absurd.expression[4].equal(clean.expression[4])
+
+
+@pytest.mark.parametrize("device", ["float64", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_a_template_of_another_device_aligns_on_the_processor(
+    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    face_model, sequence = toy_sequence(10, 32)
+    training = TrainSettings(split="tail", device="cuda" if device == "cuda" else "cpu")
+
+    def elsewhere(*arguments: Any) -> Avatar:
+        avatar = train(*arguments)
+        if device == "float64":
+            move_avatar(avatar, torch.zeros((), dtype=torch.float64))
+        return avatar
+
+    usual = align([sequence], face_model, QUICK, replace(training, device="cpu"), tmp_path / "usual")[0]
+    monkeypatch.setattr("mien.training.alignment.train", elsewhere)
+    found = align([sequence], face_model, QUICK, training, tmp_path / "elsewhere")[0]
+    for name in ("expression", "head_rotation", "head_translation"):
+        torch.testing.assert_close(getattr(found, name), getattr(usual, name), atol=1e-3, rtol=0)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mien.avatar import DEFAULT_METHOD, Avatar, FaceTuning, Moments, ParameterGroup, Rate, frozen
+from mien.avatar import DEFAULT_METHOD, Avatar, FaceTuning, Moments, ParameterGroup, Rate, frozen, move_avatar
 from mien.config import overlay
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, concatenate
@@ -100,6 +100,7 @@ def align(
         return progress(f"template: {title}", total, completed)
 
     template = train(sequences, face_model, config, how, folder, titled)
+    move_avatar(template, torch.zeros(()))  # It may have been trained on a GPU.
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     starts = _split(read_face_track(folder, face_model), lengths)
     known = training_frames(sequences, how)
