@@ -9,7 +9,9 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from batch_stub import PROGRAM, do_stub, stub_row
 from mien.batch import (
@@ -27,6 +29,8 @@ from mien.batch import (
     write_results,
     write_wall,
 )
+from mien.batch.steps import _write_strip
+from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands.stages.batch_table import read_table
 from mien.errors import UserError
@@ -309,3 +313,12 @@ def test_status_and_table_on_the_command_line(tmp_path: Path, capsys: pytest.Cap
     assert "| sun | 2 |" in capsys.readouterr().out
     assert main(["batch", "status", str(tmp_path / "gone")]) == 2
     assert "is not the folder of a batch" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_a_film_of_any_length_has_a_thumbnail(count: int, tmp_path: Path):
+    pictures = (np.full((32, 32, 3), 6 * index, np.uint8) for index in range(count))
+    write_video(tmp_path / "film.mp4", pictures, 25)
+    _write_strip(tmp_path / "film.mp4", tmp_path / "strip.jpg")
+    with Image.open(tmp_path / "strip.jpg") as strip:
+        assert strip.size == (12 * 160, 160)

@@ -217,12 +217,16 @@ def test_a_clip_is_trimmed_at_both_ends(face_clip, tmp_path):
 def test_bad_requests_are_refused(face_clip, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
+    film = tmp_path / "film"
+    film.mkdir()
+    (film / "me.MOV").touch()
     blocked = tmp_path / "file"
     blocked.touch()
     settings = CaptureSettings()
     cases = [
         (tmp_path / "missing.mp4", tmp_path / "out", settings, "no such file"),
-        (empty, tmp_path / "out", settings, "holds no images"),
+        (empty, tmp_path / "out", settings, "holds no images; give a video or a folder"),
+        (film, tmp_path / "out", settings, "holds no images; give .*me.MOV itself"),
         (face_clip[0], blocked, settings, "is a file"),
         (face_clip[0], blocked / "out", settings, "cannot be written"),
         (face_clip[0], face_clip[0].parent, settings, "holds something that is not part of a capture"),

@@ -86,7 +86,7 @@ def _write_strip(film: Path, path: Path) -> None:
 
     with av.open(str(film)) as container:
         frames = [frame.to_image() for frame in container.decode(video=0)]
-    chosen = [frames[round(index * len(frames) / _VIEWS)] for index in range(_VIEWS)]
+    chosen = [frames[index * len(frames) // _VIEWS] for index in range(_VIEWS)]
     strip = Image.new("RGB", (_SIDE * _VIEWS, _SIDE))
     for index, frame in enumerate(chosen):
         strip.paste(frame.resize((_SIDE, _SIDE)), (index * _SIDE, 0))

@@ -20,6 +20,7 @@ from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.errors import UserError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
+_VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi"})
 
 
 @dataclass(frozen=True)
@@ -179,9 +180,11 @@ def list_images(folder: Path) -> list[Path]:
     """
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     if not images:
-        rig = any(path.is_dir() for path in folder.iterdir())
-        cameras = "; if its folders are of calibrated cameras, add --calibration FILE" if rig else ""
-        raise UserError(f"{folder}: holds no images; give a video or a folder of .png or .jpg files{cameras}")
+        videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in _VIDEO_SUFFIXES)
+        rig = len(videos) > 1 or any(path.is_dir() for path in folder.iterdir())
+        cameras = "; if it holds those of calibrated cameras, add --calibration FILE" if rig else ""
+        remedy = f"give {videos[0]} itself" if videos else "give a video or a folder of .png or .jpg files"
+        raise UserError(f"{folder}: holds no images; {remedy}{cameras}")
     return sorted(images, key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path.name)])
 
 
