@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from mien.camera import Camera, camera_from_fov
 from mien.cli import main
 from mien.commands.stages.sheets import (
     TURNTABLE_TILES,
+    Tile,
     draw_sheet,
     expression_tiles,
     filmed_tiles,
     named_picture,
+    nearer_tiles,
     turntable_tiles,
 )
 from mien.driving import ARKIT_NAMES
@@ -97,6 +100,28 @@ def test_a_sheet_fits_a_screen_its_names_are_legible_and_its_gaps_have_the_colou
     rows = np.flatnonzero(np.abs(bar - blue).sum(-1).max(1) > 300)
     assert np.ptp(rows) > 0.03 * 512, "letters are as large as their picture asks for, and light over a dark colour"
     assert (sheet[:, 512:516] == blue).all()
+
+
+def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:
+    """A ball below the middle of the picture is magnified, and the picture ends where it ended before."""
+    gray = (90, 90, 90)
+
+    def ball(_: object, camera: Camera) -> np.ndarray:
+        at = camera.K @ torch.tensor([0.0, 0.1, 1.0])
+        drawn = np.full((camera.height, camera.width, 3), gray, np.uint8)
+        radius = round(0.05 * float(camera.K[0, 0]))
+        return cv2.circle(drawn, (round(float(at[0])), round(float(at[1]))), radius, (255, 0, 0), -1)
+
+    start = camera_from_fov(0.8, 200, 200, torch.eye(4))
+    tiles = [Tile("one", make_small_face_model().neutral(), start)]
+    near = nearer_tiles(tiles, ball, gray)[0].camera
+    shown = (ball(None, near) != gray).any(-1)
+    assert 0.7 < max(np.ptp(np.flatnonzero(shown.any(axis))) / 200 for axis in (0, 1)) < 0.98
+    corner = torch.linalg.inv(start.K) @ torch.tensor([100.0, 200.0, 1.0])
+    assert float((near.K @ corner)[1]) >= 199.99, "the picture's lower border stays at the border or beyond"
+    assert (
+        nearer_tiles(tiles, lambda _, camera: np.full((camera.height, camera.width, 3), gray, np.uint8), gray) == tiles
+    )
 
 
 @pytest.mark.parametrize("options", [["expressions"], ["filmed", "--strength", "1.5"], ["turntable", "--span", "180"]])

@@ -66,8 +66,8 @@ class Command:
     right if negative."""
     pitch: float = 0.0
     """The same upwards, or downwards if negative."""
-    zoom: float = 1.0
-    """Magnification. 1 shows what the camera saw in training."""
+    zoom: float | None = None
+    """Magnification. 1 shows what the camera saw in training (default: 1, and on a sheet as much as the head fits)."""
     sequence: str | None = None
     """Name of a sequence whose motion the avatar plays, one frame per timestep (`mien drive` can do more)."""
     own_motion: bool = False
@@ -157,6 +157,10 @@ class Command:
         if covered is not None:
             say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
 
+    @property
+    def _magnification(self) -> float:
+        return 1.0 if self.zoom is None else self.zoom
+
     def _is_file(self) -> bool:
         """Whether the avatar comes from a file."""
         return self.workspace.suffix.lower() == ".mien" and not self.workspace.is_dir()
@@ -186,7 +190,9 @@ class Command:
         from mien.commands.stages.file_pictures import View, render_file
 
         frames = self._frames(None)
-        view = View(self.yaw, self.pitch, self.zoom, lambda camera, center: self._file_path(camera, center, frames))
+        view = View(
+            self.yaw, self.pitch, self._magnification, lambda camera, center: self._file_path(camera, center, frames)
+        )
         render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
 
     def _file_path(
@@ -211,7 +217,7 @@ class Command:
         options = self.picture
         if self.sheet in ("expressions", "filmed") and options.size is None:
             options = replace(options, size=SMALL_TILE)
-        camera, center = view(options, run_camera(run_dir), self.zoom), subject.head_translation[0]
+        camera, center = view(options, run_camera(run_dir), self._magnification), subject.head_translation[0]
         return turned_camera(camera, center, math.radians(self.yaw), math.radians(self.pitch))
 
     def _draw_sheet(
@@ -223,7 +229,13 @@ class Command:
     ) -> None:
         from mien.avatar import move_avatar
         from mien.commands.stages.pictures import draw, posed_softly
-        from mien.commands.stages.sheets import draw_sheet, expression_tiles, filmed_tiles, turntable_tiles
+        from mien.commands.stages.sheets import (
+            draw_sheet,
+            expression_tiles,
+            filmed_tiles,
+            nearer_tiles,
+            turntable_tiles,
+        )
         from mien.export.pictures import write_pictures
         from mien.progress import say
         from mien.training import filmed_range
@@ -243,6 +255,8 @@ class Command:
             return draw(self.picture, pose(face.to(like)), camera, avatar.extras.closing)
 
         red, green, blue = (round(255 * value) for value in self.picture.color())
+        if self.zoom is None:
+            tiles = nearer_tiles(tiles, picture, (red, green, blue))
         write_pictures(output, [draw_sheet(tiles, picture, (red, green, blue))], self.fps)
         say(f"{self.out}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
 
@@ -262,8 +276,8 @@ class Command:
             raise UserError(f"--frames {self.frames}: give 1 or more")
         if not 0 < self.fps <= 1000:
             raise UserError(f"--fps {self.fps:g}: give a number above 0, at most 1000")
-        if not 0.01 <= self.zoom <= 100:
-            raise UserError(f"--zoom {self.zoom:g}: give a number from 0.01 to 100")
+        if not 0.01 <= self._magnification <= 100:
+            raise UserError(f"--zoom {self._magnification:g}: give a number from 0.01 to 100")
         if not math.isfinite(self.span):
             raise UserError(f"--span {self.span:g}: give a number of degrees")
         for name, angle, limit in (("yaw", self.yaw, 180), ("pitch", self.pitch, 89)):
@@ -314,7 +328,7 @@ class Command:
             return None
         name = workspace.pick_sequence(self.sequence)
         stored = read_tracking(workspace.sequence_dir(name) / "tracking").cameras
-        cameras = [view(self.picture, camera, self.zoom) for camera in stored]
+        cameras = [view(self.picture, camera, self._magnification) for camera in stored]
         if self._is_still():
             return cameras[:1]
         return cameras if timesteps is None else [cameras[i * len(cameras) // timesteps] for i in range(timesteps)]

@@ -26,6 +26,9 @@ _WIDEST = 1800
 """Width in pixels that a sheet of several columns stays below."""
 SMALL_TILE = 288
 """Width and height of the pictures on a sheet of expressions without --size, in pixels."""
+_GLANCE, _FAINT, _MARGIN = 0.25, 24, 0.04
+"""Size of the pictures that tell where the head is, as a share of the tile's; the difference to the background from
+which a pixel belongs to it, of 255; and what stays free around it, as a share of the tile."""
 _GAP = 4
 _BAR, _SMALLEST_BAR = 0.09, 22
 """Height of the bar with a name, as a part of the picture's width, and at least, in pixels."""
@@ -92,6 +95,36 @@ def turntable_tiles(face: FaceParams, camera: Camera, center: Float[Tensor, " 3"
     names = [f"{angle:+.0f} degrees" if round(angle) else "front" for angle in angles]
     cameras = [orbit(camera, center, math.radians(angle)) for angle in angles]
     return [Tile(name, face, camera) for name, camera in zip(names, cameras, strict=True)]
+
+
+def nearer_tiles(
+    tiles: Sequence[Tile],
+    picture: Callable[[FaceParams, Camera], UInt8[np.ndarray, "h w 3"]],
+    background: tuple[int, int, int],
+) -> list[Tile]:
+    """The same tiles, magnified alike so that what they show fills them but for a margin. They are never made smaller.
+
+    Small pictures of all tiles tell where that is.
+    """
+    first = tiles[0].camera
+    width, height = (max(1, round(side * _GLANCE)) for side in (first.width, first.height))
+    glances = [picture(tile.face, tile.camera.resized(width, height)) for tile in tiles]
+    shown = np.any([np.abs(one.astype(int) - background).max(-1) > _FAINT for one in glances], axis=0)
+    left, top, wide, high = cv2.boundingRect(shown.astype(np.uint8))
+    if not wide:
+        return list(tiles)
+    scale = max(1.0, (1 - 2 * _MARGIN) * min(width / wide, height / high))
+    x = _inside((left + wide / 2) / width * first.width, first.width, scale)
+    y = _inside((top + high / 2) / height * first.height, first.height, scale)
+    shift = [first.width / 2 - scale * x, first.height / 2 - scale * y]
+    move = torch.tensor([[scale, 0.0, shift[0]], [0.0, scale, shift[1]], [0.0, 0.0, 1.0]])
+    return [replace(tile, camera=replace(tile.camera, K=move.to(tile.camera.K) @ tile.camera.K)) for tile in tiles]
+
+
+def _inside(center: float, side: int, scale: float) -> float:
+    """The centre of a magnified picture along one side, moved so that nothing beyond the picture is shown."""
+    half = side / scale / 2
+    return min(max(center, half), side - half)
 
 
 def draw_sheet(
