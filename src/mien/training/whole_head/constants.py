@@ -175,6 +175,15 @@ class WholeHeadConstants:
     """Weight of the mean square of all shifts in metres, against the mean pull. It makes the smallest change win.
     Measured: 2 leaves 0.2 to 0.5 % of the mesh outside on s18, d14 and d6, 0.5 leaves 0.1 to 0.3 %, 0.1 leaves 0.02 to
     0.1 % and moves an ear by 12 mm (log, 11-26)."""
+    outline_bend_weight: float = 4.0
+    """Weight of the mean square of how far a point of the scalp moves from what is around it, in metres. Measured on
+    s18, where a crown of 12 mm was cut flat: 2 leaves it a little flat, 8 leaves 0.05 instead of 0.01 % of the mesh
+    outside. The other six clips do not change (log, 11-27)."""
+    outline_scalp_reach: float = 0.04
+    """Distance in metres over which points of the scalp count as around each other (standard deviation of a Gaussian).
+    Not varied."""
+    outline_scalp_held: float = 0.1
+    """Share of `outline_shift_weight` that holds the scalp. Not varied."""
 
     # unseen.py
     unseen_confidence: float = 0.02

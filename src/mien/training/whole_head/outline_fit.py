@@ -3,7 +3,8 @@
 A tracked skull can stand out beyond the hair, ears can hang lower than the person's, and a neck can be wider. What no
 picture shows of them is filled at the mesh, so every picture contradicts it there, and nothing takes it away. Each
 vertex that lies outside of the matte is therefore drawn to it, in all frames together, by smooth offsets of the mesh.
-What lies inside stays where tracking put it: hair and hanging things stand out beyond a mesh that is right.
+What lies inside stays where tracking put it: hair and hanging things stand out beyond a mesh that is right. Only the
+scalp moves as a whole. Pictures from the front show its highest points alone, and without them it would be cut flat.
 """
 
 from collections.abc import Sequence as Items
@@ -89,9 +90,10 @@ def fit_to_outlines(
     """
     given = faces[0].vertex_offsets
     start = torch.zeros_like(face_model.template) if given is None else given.detach()
-    weights = smooth_weights(
-        face_model.rest_vertices(faces[0]).detach(), WHOLE_HEAD.outline_reach, WHOLE_HEAD.outline_spacing
-    )
+    rest = face_model.rest_vertices(faces[0]).detach()
+    chosen = spread_points(rest, WHOLE_HEAD.outline_spacing)
+    weights = smooth_weights(rest, rest[chosen], WHOLE_HEAD.outline_reach)
+    scalp = _Scalp.of(face_model, rest, chosen)
     outer = _outer_vertices(face_model)
     own = weights[outer]
 
@@ -110,9 +112,7 @@ def fit_to_outlines(
         shifts = shifts.detach().requires_grad_()
         moved = own @ shifts
         pulls = torch.stack([views[one].pull(moved) for one in drawn])
-        (gradient,) = torch.autograd.grad(
-            WHOLE_HEAD.outline_shift_weight * shifts.square().sum(1).mean() + pulls.mean(), shifts
-        )
+        (gradient,) = torch.autograd.grad(scalp.cost(shifts) + pulls.mean(), shifts)
         first, second = torch.lerp(gradient, first, _FIRST), torch.lerp(gradient.square(), second, _SECOND)
         scale = (second / (1 - _SECOND**number)).sqrt() + 1e-12
         rate = WHOLE_HEAD.outline_rate * (1 - number / rounds) / (1 - _FIRST**number)
@@ -120,21 +120,57 @@ def fit_to_outlines(
     return start + weights @ shifts
 
 
-def smooth_weights(vertices: Float[Tensor, "v 3"], reach: float, spacing: float) -> Float[Tensor, "v a"]:
-    """Return the share of each of a spread points in each vertex: Gaussians of the distance, with the sum 1.
+@dataclass(frozen=True, eq=False)
+class _Scalp:
+    """What shifts of the points cost. On the scalp, it counts how far they differ from those around them."""
 
-    Args:
-        vertices: A mesh, in metres.
-        reach: Standard deviation of the Gaussians, in metres.
-        spacing: No vertex is further from all points than this, in metres.
-    """
+    inside: Float[Tensor, " a"]
+    """1 for points on the scalp, 0 elsewhere."""
+    around: Float[Tensor, "a a"]
+    """The share of each other point in what is around a point."""
+
+    @staticmethod
+    def of(face_model: FaceModel, vertices: Float[Tensor, "v 3"], chosen: list[int]) -> "_Scalp":
+        """The costs for some of the vertices as points."""
+        inside = torch.ones(len(vertices), dtype=torch.bool)
+        inside[face_model.faces[~head_parts(face_model).scalp].long().flatten()] = False
+        points = vertices[chosen]
+        around = _gaussians(points, points, WHOLE_HEAD.outline_scalp_reach).fill_diagonal_(0)
+        return _Scalp(inside[chosen].to(vertices), around / around.sum(1, keepdim=True))
+
+    def cost(self, shifts: Float[Tensor, "a 3"]) -> Float[Tensor, ""]:
+        """The cost of shifts in metres. The scalp follows what is around it, and does not pull at it."""
+        near = torch.where(self.inside[:, None] > 0, shifts, shifts.detach())
+        bent = (self.inside * (shifts - self.around @ near).square().sum(1)).mean()
+        held = 1 - (1 - WHOLE_HEAD.outline_scalp_held) * self.inside
+        moved = (held * shifts.square().sum(1)).mean()
+        return WHOLE_HEAD.outline_shift_weight * moved + WHOLE_HEAD.outline_bend_weight * bent
+
+
+def spread_points(vertices: Float[Tensor, "v 3"], spacing: float) -> list[int]:
+    """Return indices of spread vertices, from which no vertex is further than `spacing`, in metres."""
     chosen, away = [0], torch.linalg.vector_norm(vertices - vertices[0], dim=1)
     while float(away.max()) > spacing:
         chosen.append(int(away.argmax()))
         away = torch.minimum(away, torch.linalg.vector_norm(vertices - vertices[chosen[-1]], dim=1))
-    apart = torch.cdist(vertices, vertices[chosen], compute_mode="donot_use_mm_for_euclid_dist")
-    weights = torch.exp(-0.5 * (apart / reach).square())
+    return chosen
+
+
+def smooth_weights(vertices: Float[Tensor, "v 3"], points: Float[Tensor, "a 3"], reach: float) -> Float[Tensor, "v a"]:
+    """Return the share of each point in each vertex: Gaussians of the distance, with the sum 1.
+
+    Args:
+        vertices: A mesh, in metres.
+        points: Some points, in metres.
+        reach: Standard deviation of the Gaussians, in metres.
+    """
+    weights = _gaussians(vertices, points, reach)
     return weights / weights.sum(1, keepdim=True)
+
+
+def _gaussians(first: Float[Tensor, "v 3"], second: Float[Tensor, "a 3"], reach: float) -> Float[Tensor, "v a"]:
+    apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.exp(-0.5 * (apart / reach).square())
 
 
 def _outer_vertices(face_model: FaceModel) -> Bool[Tensor, " v"]:
