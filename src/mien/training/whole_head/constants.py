@@ -134,8 +134,8 @@ class WholeHeadConstants:
     """Difference of colour (0..1) between an avatar and the completed mesh that costs nothing in raised expressions.
     The mesh knows neither hair nor pores. Not varied."""
     raised_change_weight: float = 16.0
-    """Factor on the method's penalty of changes with the expression, in raised ones. Measured on d3, with views twice as
-    often and half of it: without it, skin is blotched; 80 has 0.35 dB less in front (log, 11-26)."""
+    """Factor on the method's penalty of changes with the expression, in raised ones. Measured on d3, with views and
+    half the factor twice as often: without it, skin is blotched; 80 has 0.35 dB less in front (log, 11-26)."""
     side_views_outline_weight: float = 3.0
     """Weight of the difference of alpha from the side against that of colours. Most errors from the side are at the
     outline. Measured: 10 has 0.4 dB less at 30 degrees, 1 has 0.3 less at 90 (log, 11-24)."""
