@@ -43,12 +43,17 @@ def with_soft_cut(portable: PortableAvatar, avatar: Avatar) -> PortableAvatar:
 
 @torch.no_grad()
 def shares_left(avatar: Avatar) -> Float[Tensor, " n"]:
-    """For each Gaussian of an avatar, the share of its opacity that the soft cut leaves, 0..1."""
-    model, rest = avatar.face_model, avatar.subject
-    vertices, gaussians = model(rest)[0], avatar.pose(rest).gaussians.timestep(0)
+    """For each Gaussian of an avatar, the share of its opacity that the soft cut leaves, 0..1.
+
+    It is computed on the CPU, and comes with the device and the dtype of the avatar.
+    """
+    gaussians = avatar.pose(avatar.subject).gaussians.timestep(0)
+    on_cpu = torch.zeros((), dtype=gaussians.means.dtype)
+    model, rest = avatar.face_model.to(on_cpu), avatar.subject.to(on_cpu)
+    vertices = model(rest)[0]
     cut = fit_neck_cut(NeckParts.of(model), vertices, rest.T_world_head[0, :3, 1])
     head = vertices[model.faces[~model.region_mask("neck")].unique()]
-    return opacity_shares(world_means(gaussians), cut, head)
+    return opacity_shares(world_means(gaussians).to(on_cpu), cut, head).to(gaussians.means)
 
 
 def opacity_shares(centers: Float[Tensor, "n 3"], cut: NeckCut, head: Float[Tensor, "m 3"]) -> Float[Tensor, " n"]:
