@@ -45,6 +45,14 @@ def test_the_first_half_of_a_run_sees_pictures_of_half_the_size(
     assert sizes_of(tmp_path, monkeypatch) == [(16, 16, 16)] * 5 + [(32, 32, 32)] * 5
 
 
+@pytest.mark.usefixtures("_halved")
+def test_halved_pictures_are_forgotten_after_their_last_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    forgotten, forget = [], Targets.forget
+    monkeypatch.setattr(Targets, "forget", lambda self: forgotten.append(self.width) or forget(self))
+    sizes_of(tmp_path, monkeypatch)
+    assert forgotten == [16]
+
+
 def test_small_pictures_keep_their_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert sizes_of(tmp_path, monkeypatch) == [(32, 32, 32)] * 10
 

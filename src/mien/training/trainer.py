@@ -167,6 +167,9 @@ def _train_to_the_end(
                 except CannotDrawError as error:
                     raise _diverged(run_dir, state, str(error)) from None
                 advance(state.step - before, status)
+                if before < data.coarse_steps <= state.step:
+                    for halved in data.coarse:
+                        halved.forget()
                 if watch is not None:
                     watch(state.avatar)
                 if passed(before, state.step, settings.checkpoint_every) or stop.asked():

@@ -179,6 +179,11 @@ class Targets:
         how = (self._share, self._like, self._face_model, self._inside)
         return Targets(self._sequence, half, *how, cleaned=self._cleaned)
 
+    def forget(self) -> None:
+        """Free the cached pictures."""
+        self._cache.clear()
+        self._soft.clear()
+
     def camera(self, camera: int) -> Camera:
         """A camera at training resolution."""
         return self.cameras[camera]
