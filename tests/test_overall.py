@@ -82,7 +82,7 @@ def test_stages_come_in_order_and_current_ones_take_no_time() -> None:
     assert overall.begin("training", 0.5)  # capture and tracking are current; the run resumes
     assert overall.stage() == 3
     assert overall.remaining() == pytest.approx(
-        12_000 * 0.036 / 2 + sum(p.seconds for p in pieces if p.stage == "scoring")
+        12_000 * 0.042 / 2 + sum(p.seconds for p in pieces if p.stage == "scoring")
     )
     clock.now += 100.0
     overall.advance(0.75)

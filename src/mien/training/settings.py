@@ -64,7 +64,7 @@ class TrainSettings:
     beyond the person's mattes, such as a skull above the hair or an ear that hangs too low, is drawn into them. Auto:
     fitted where sides are filled (`--training.unseen`), where a fill would stand out like a cap or a grey lobe, else
     tracked."""
-    side_weight: Annotated[float, NOT_NEGATIVE] = 0.2
+    side_weight: Annotated[float, NOT_NEGATIVE] = 0.1
     """Weight of the views from the side and of raised expressions, in which filled heads are compared with the
     completed mesh."""
     hair_rate: Annotated[float, Range(0, 0.01)] = 6e-4
@@ -79,10 +79,9 @@ class TrainSettings:
     Gaussians to triangles have no such Gaussians."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
-    coarse: Annotated[float | None, FRACTION] = None
-    """Share of the run, from its start, that trains on pictures of half that size. Such steps take less time. Pictures
-    whose longer side has fewer than 384 pixels are not halved (default: 0.3 where sides are filled
-    (`--training.unseen`), else 0)."""
+    coarse: Annotated[float, FRACTION] = 0.0
+    """Share of the run, from its start, that trains on pictures of half that size. Such steps take less time, and
+    details get a little softer. Pictures whose longer side has fewer than 384 pixels are not halved."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
     threads: Annotated[int, Range(0, 256)] = 0
@@ -189,7 +188,6 @@ PRESETS = {
             "paper",
             {
                 "background": "white",
-                "coarse": 0.0,
                 "edges": "filmed",
                 "inside": "free",
                 "mesh": "tracked",

@@ -54,9 +54,6 @@ class FootageConstants:
     """Least extent of the training cameras, in metres. A single fixed camera has an extent of 0: centres would not
     move, and every Gaussian would be too large. Geometry: half a metre is less than a ring of cameras around a head,
     and more than the head. One metre would be above the rig of GaussianAvatars' paper."""
-    coarse_share: float = 0.3
-    """Share of a run at half the size where sides are filled. Measured on wojtek: 0.3, up to where the perceptual loss
-    begins, costs nothing; 0.5 costs 0.3 dB of eyes (log, 11-27)."""
     mixed_share: float = 0.3
     """Share of the steps in which a mixed background has a random colour. Measured on wojtek and d3 (3,000 steps, log,
     11-26): white in all steps has 0.62 and 0.18 dB more in front than random in all, and white dots on hair and ears

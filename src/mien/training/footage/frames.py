@@ -190,14 +190,9 @@ class FrameOrder:
 
 
 def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
-    """The settings without `auto`.
-
-    Filled sides have mixed backgrounds, cleaned edges and a coarse start, others white, filmed and none.
-    """
+    """The settings without `auto`: filled sides have mixed backgrounds and cleaned edges, others white and filmed."""
     if settings.background == "auto":
         settings = replace(settings, background="mixed" if filled else "white")
-    if settings.coarse is None:
-        settings = replace(settings, coarse=FOOTAGE.coarse_share if filled else 0.0)
     return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
 
 
