@@ -21,9 +21,7 @@ from mien.training import TrainSettings
 
 def plain_run(**changes: Any) -> TrainSettings:
     """Settings of a run that trains every side on what was filmed, over white."""
-    plain = TrainSettings(
-        background="white", coarse=0.0, edges="filmed", inside="free", mesh="tracked", unseen="trained"
-    )
+    plain = TrainSettings(background="white", edges="filmed", inside="free", mesh="tracked", unseen="trained")
     return replace(plain, **changes)
 
 

@@ -28,7 +28,7 @@ from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
 RUN, STANDARD = TrainSettings(), GaussianAvatarsConfig()
-OPEN = TrainSettings(background="white", coarse=0.0, edges="filmed", inside="free", mesh="tracked", unseen="trained")
+OPEN = TrainSettings(background="white", edges="filmed", inside="free", mesh="tracked", unseen="trained")
 """Settings of a run by the preset `paper`."""
 
 Choices = tuple[MethodConfig, TrainSettings]
