@@ -17,10 +17,10 @@ from mien.capture.deinterlacing import Deinterlace
 from mien.capture.lens import Lens
 from mien.capture.picture import decode_picture
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
+from mien.capture.video_file import VIDEO_SUFFIXES
 from mien.errors import UserError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
-_VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi"})
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def list_images(folder: Path) -> list[Path]:
     """
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     if not images:
-        videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in _VIDEO_SUFFIXES)
+        videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
         rig = len(videos) > 1 or any(path.is_dir() for path in folder.iterdir())
         cameras = "; if it holds those of calibrated cameras, add --calibration FILE" if rig else ""
         remedy = f"give {videos[0]} itself" if videos else "give a video or a folder of .png or .jpg files"

@@ -25,7 +25,7 @@ from mien.errors import UserError
 MAX_FRAME_PIXELS = 8192 * 4608
 """Largest number of pixels of a video's pictures: 8K of every kind. A decoder holds up to 17 pictures at a time."""
 TOO_MANY_PIXELS = f"more than the {MAX_FRAME_PIXELS:,} pixels (8192x4608) that a video may have"
-_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 _CONTAINERS = (
     "mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf", "ogg", "mxf", "gxf",
     "nut", "dv", "gif", "apng", "ivf", "obu", "av1", "h261", "h263", "h264", "hevc", "vvc", "vc1", "dirac", "dnxhd",
@@ -181,7 +181,7 @@ def _why_not(path: Path, error: av.error.FFmpegError | OSError, kind: str) -> st
         return "is a file of a kind that mien does not open; convert it to .mp4 or .mov"
     if kind == "sound":
         return f"cannot be read as sound ({error.strerror or error}); convert it to .wav or .mp3"
-    named_so = path.suffix.lower() in _VIDEO_ENDINGS
+    named_so = path.suffix.lower() in VIDEO_SUFFIXES
     remedy = "incomplete? copy it again" if named_so else "give a video file, such as .mp4 or .mov"
     return f"cannot be read as a video ({error.strerror or error}); {remedy}"
 

@@ -116,9 +116,8 @@ def nearer_tiles(
     scale = max(1.0, (1 - 2 * _MARGIN) * min(width / wide, height / high))
     x = _inside((left + wide / 2) / width * first.width, first.width, scale)
     y = _inside((top + high / 2) / height * first.height, first.height, scale)
-    shift = [first.width / 2 - scale * x, first.height / 2 - scale * y]
-    move = torch.tensor([[scale, 0.0, shift[0]], [0.0, scale, shift[1]], [0.0, 0.0, 1.0]])
-    return [replace(tile, camera=replace(tile.camera, K=move.to(tile.camera.K) @ tile.camera.K)) for tile in tiles]
+    shift, size = (scale * (x - first.width / 2), scale * (y - first.height / 2)), (first.width, first.height)
+    return [replace(tile, camera=tile.camera.fitted(*size, scale).cropped(*shift, *size)) for tile in tiles]
 
 
 def _inside(center: float, side: int, scale: float) -> float:

@@ -122,7 +122,7 @@ def fit_to_outlines(
 
 @dataclass(frozen=True, eq=False)
 class _Scalp:
-    """What shifts of the points cost. On the scalp, it counts how far they differ from those around them."""
+    """Computes the cost of shifts of the points. On the scalp, it grows with their difference to those around them."""
 
     inside: Float[Tensor, " a"]
     """1 for points on the scalp, 0 elsewhere."""
