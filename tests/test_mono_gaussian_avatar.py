@@ -390,11 +390,23 @@ def test_nearest_vertices() -> None:
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     points = torch.tensor([[0.6, 0.1, 0], [0.1, 0.1, 5], [0.4, 0.55, 0]])
     assert nearest_vertices(points, vertices).tolist() == [1, 0, 2]
+    assert nearest_vertices(points.double(), vertices.double()).tolist() == [1, 0, 2]
+
+
+def test_nearest_vertices_on_a_cpu_take_no_distances_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = torch.Generator().manual_seed(0)
+    points, vertices = torch.randn(1000, 3, generator=random), torch.randn(50, 3, generator=random)
+    expected = (points[:, None] - vertices).norm(dim=-1).argmin(1)
+    monkeypatch.delattr(torch, "addmm")
+    assert torch.equal(nearest_vertices(points, vertices), expected)
+    points[0, 0] = float("nan")
+    assert torch.equal(nearest_vertices(points, vertices)[1:], expected[1:])
 
 
 def test_nearest_vertices_of_many_points_take_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is no tree, as on a GPU, points are looked at in parts."""
     random = torch.Generator().manual_seed(0)
-    points, vertices = torch.randn(1000, 3, generator=random), torch.randn(50, 3, generator=random)
+    points, vertices = (torch.randn(n, 3, generator=random, dtype=torch.float64) for n in (1000, 50))
     monkeypatch.setattr(motion, "_POINTS_AT_ONCE", 64)
     sizes: list[int] = []
     addmm = torch.addmm
