@@ -209,7 +209,7 @@ def test_docs_have_all_values_of_headgas() -> None:
 
 def mono_table() -> dict[str, str]:
     page = PAGE.read_text()
-    own = page.split("\n## MonoGaussianAvatar\n")[1].split("\n## ")[0]
+    own = page.split("\n## MonoGaussianAvatar\n")[1].split("\n### ")[0]
     rows = re.findall(r"^\| (`[a-z_., `]+) \|(.*)\|$", own, flags=re.MULTILINE)
     return {name: words for names, words in rows for name in re.findall(r"`([a-z_.]+)`", names)}
 
@@ -294,6 +294,35 @@ def test_docs_have_the_counts_and_radii_of_both_schedules() -> None:
                 epoch,
                 name,
             )
+
+
+def updates_of(paper: Any, steps: int) -> int:
+    """The number of optimiser steps of a run, whose frames a step are fewer the more points there are."""
+    schedule, done, updates = Schedule(paper.schedule, paper.epochs, paper.points), 0, 0
+    times = schedule.rounds()
+    while done < steps:
+        passed = sum(max(1, round(time * steps)) <= done for time in times)
+        points = paper.points if passed == 0 else min(paper.max_points, schedule.points_at(times[passed - 1]))
+        done, updates = done + max(1, min(paper.frames_per_step, paper.points_per_step // points)), updates + 1
+    return updates
+
+
+def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_points() -> None:
+    method, small, paper = "mono_gaussian_avatar", PRESETS["paper-cpu"], PRESETS["paper"]
+    config: Any = small.config(method)
+    assert replace(config, max_points=100_000) == paper.config(method)
+    settings = small.settings_of(method)
+    assert replace(settings, steps=300_000) == paper.settings_of(method)
+    assert [name for name in METHODS if "paper-cpu" in METHODS[name].presets] == [method]
+    own = PAGE.read_text().split("\n### On a processor\n")[1].split("\n## ")[0]
+    rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*) \|$", own, flags=re.MULTILINE))
+    assert rows == {
+        "steps": f"300,000: 2,500 frames an epoch | {settings.steps:,}: {settings.steps // config.epochs} frames an epoch",
+        "max_points": f"100,000 | {config.max_points:,}",
+    }
+    (written, of_paper) = (int(number.replace(",", "")) for number in re.findall(r"about ([\d,]+)", own))
+    assert updates_of(config, settings.steps) == pytest.approx(written, rel=0.01)
+    assert updates_of(paper.config(method), 300_000) == pytest.approx(of_paper, rel=0.01)
 
 
 # -- the extent of the cameras ----------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.overall import Overall
 from mien.tracking import ScoringSettings, TrackingSettings
-from mien.training import BENCHMARK_SPLIT, NAMED_SPLIT, OWN_SPLIT, AlignmentSettings, TrainSettings
+from mien.training import BENCHMARK_SPLIT, NAMED_SPLIT, OWN_SPLIT, PRESETS, AlignmentSettings, TrainSettings
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -126,7 +126,7 @@ class Command:
 
     def _aligns(self, several_cameras: bool) -> bool:
         """Whether new trackings are aligned."""
-        auto = not several_cameras and self.options.preset != "paper"
+        auto = not several_cameras and not PRESETS[self.options.preset].published
         auto = auto and self.options.settings().steps >= self.alignment.template_steps
         return self.alignment.when == "always" or (self.alignment.when == "auto" and auto)
 

@@ -47,8 +47,8 @@ class TrainOptions:
     file, and the file overrides the preset."""
     preset: PresetName = "standard"
     """How thorough the training is. draft takes minutes; standard has the defaults, and gives the figures of
-    docs/results.md; paper repeats the method's paper, if the method has it (docs/paper_preset.md), and takes days on a
-    processor."""
+    docs/results.md; paper repeats the method's paper in days on a processor, and paper-cpu does so in a small size, if
+    the method has them (docs/paper_preset.md)."""
     split: Split = "blocks"
     """Frames held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing (none).
     gaussian-avatars: the sequence and the camera that the paper holds out, for its subjects (docs/using.md)."""

@@ -143,8 +143,14 @@ _PAPER: dict[str, Any] = {
     "face_points": 100_000,
 }
 """The paper's settings (docs/paper_preset.md)."""
+_CPU_FRAMES = 30
+"""Frames of an epoch in `paper-cpu`, with which a run takes about an hour on one core."""
 
 PRESETS: dict[str, Differences] = {
     "paper": {"method": _PAPER, "settings": {"steps": _PAPER_EPOCHS * _PAPER_FRAMES}},
+    "paper-cpu": {
+        "method": _PAPER | {"max_points": 20_000},
+        "settings": {"steps": _PAPER_EPOCHS * _CPU_FRAMES},
+    },
 }
 """How presets differ from the defaults. A draft is only a shorter run."""
