@@ -14,6 +14,7 @@ from dataset_scene import SIDE, Scene, make_scene, projected
 from dataset_writers import UNEQUAL, rotation_of
 from exported_captures import (
     CAMERAS,
+    EXACT,
     HELD_OUT,
     TIMESTEPS,
     TOLERANCE,
@@ -142,7 +143,7 @@ def test_nerface_is_read_back(single: Sequence, scene: Scene, tmp_path: Path) ->
         assert np.array_equal(sequence.capture.images[:, 0], over_white)
         assert (over_white[:, :5] == 255).all(), "no filmed background is left"
         K = sequence.capture.calibration[0].K.numpy()
-        assert np.abs(K - UNEQUAL).max() / 150 < 1e-6
+        assert np.abs(K - UNEQUAL).max() < EXACT
         foreign = sequence.foreign["expression"]
         expressions = single.tracking.face.expression.shape[1]
         assert np.allclose(foreign[:, :expressions], scene.expr[list(timesteps), :expressions], atol=1e-6)
