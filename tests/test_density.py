@@ -115,6 +115,42 @@ def test_faint_and_huge_ones_go() -> None:
     assert len(early) == 1, "size is judged only after a reset that follows the start"
 
 
+def test_a_round_prunes_first_so_that_what_goes_does_not_grow() -> None:
+    """The published code of GaussianAvatars grows first (docs/paper_preset.md)."""
+    store = make_store([0.001, 0.001, 0.004])
+    store.assign("opacity_logits", torch.logit(torch.tensor([0.004, 0.5, 0.004])))
+    strategy = control(store)
+    strategy.observe(pose(store), rendering([ABOVE, ABOVE, ABOVE]))
+    strategy.adapt(store, pose(store), Progress(0, 100), random)
+    assert store["face_index"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(("axis", "side"), [(0, WIDTH), (1, HEIGHT)])
+def test_gradients_weigh_by_the_pictures_own_width_and_height(axis: int, side: int) -> None:
+    store, drawn = make_store([0.001, 0.001]), rendering([0.0, 0.0])
+    strategy, threshold = control(store), EVERY_STEP.grow_gradient / (side / 2)
+    drawn.means2d_offset.grad = torch.zeros(2, 2)
+    drawn.means2d_offset.grad[:, axis] = torch.tensor([0.99 * threshold, 1.01 * threshold])
+    strategy.observe(pose(store), drawn)
+    strategy.adapt(store, pose(store), Progress(0, 100), random)
+    assert store["face_index"].tolist() == [0, 1, 1]
+
+
+def test_wide_ones_go_unless_that_rule_is_off() -> None:
+    """Radii of 20 pixels are judged after a reset that follows the start, as in the preset `paper`."""
+    for on, expected in ((True, [0]), (False, [0, 1])):
+        store = make_store([0.001, 0.001])
+        rules = replace(EVERY_STEP.rules, prune_wide=on)
+        settings = replace(EVERY_STEP, opacity_resets=(0.0, 0.5), prune_radius=20.0, rules=rules)
+        strategy = control(store, settings)
+        strategy.observe(pose(store), rendering([0.0, 0.0], radii=[20, 21]))
+        strategy.adapt(store, pose(store), Progress(10, 100), random)
+        assert store["face_index"].tolist() == [0, 1], "before the reset"
+        strategy.observe(pose(store), rendering([0.0, 0.0], radii=[20, 21]))
+        strategy.adapt(store, pose(store), Progress(60, 100), random)
+        assert store["face_index"].tolist() == expected
+
+
 def test_an_avatar_keeps_one_gaussian_whatever_is_pruned() -> None:
     store = make_store([0.001] * 3)
     store.assign("opacity_logits", torch.logit(torch.tensor([0.1, 0.3, 0.2])))

@@ -147,6 +147,58 @@ def test_docs_have_values_that_differ_from_the_default() -> None:
         assert table[name].split(" | ") == [f" {getattr(default, name)}", f"{value} "], name
 
 
+def test_every_method_has_the_preset() -> None:
+    assert all("paper" in method.presets for method in METHODS.values())
+
+
+def test_docs_have_all_values_of_gaussian_avatars() -> None:
+    density, tuning = PAPER.density, PAPER.face_tuning
+    all_rounds, all_resets = rounds(STEPS), resets(STEPS)
+    judged_from = min(step for step in all_resets if step > all_rounds[0])
+
+    def number(value: float) -> str:
+        return f"{value:g}".replace("0.", ".")
+
+    def power(rate: Rate) -> str:
+        assert rate.end is None
+        return f"{rate.start:.0e}".replace("e-0", "e-")
+
+    assert (PAPER.means_rate, PAPER.sh_degree, PAPER.sh_warmup) == (Rate(5e-3, 5e-5), 3, 4 / 600)
+    assert (PAPER.means_times_extent, density.size_unit) == (True, "extent")
+    assert density.size_start is None, "sizes are judged from the first reset after the first round"
+    assert density.rules.prune_wide
+    assert not (tuning.keep_mean_pose or tuning.keep_turns)
+    expected = {
+        "steps": f"{STEPS:,}",
+        "sh_degree": f"{PAPER.sh_degree}",
+        "sh_warmup": "1/150 of the run: degrees 1, 2, 3 from steps 1,000, 2,000, 3,000",
+        "means_rate": "5e-3 to 5e-5, log-linear",
+        "means_times_extent": "rate times E",
+        "density.start": f"step {all_rounds[0]:,}",
+        "density.rounds": f"{len(all_rounds)} rounds, one every {all_rounds[1] - all_rounds[0]:,} steps",
+        "density.stop": f"step {all_rounds[-1]:,}",
+        "density.grow_gradient": f"{density.grow_gradient:.0e}".replace("e-0", "e-"),
+        "density.size_unit": "extent",
+        "density.split_size": f"{number(density.split_size)} E",
+        "density.prune_size": f"{number(density.prune_size)} E, from step {judged_from:,}",
+        "density.prune_radius": f"{density.prune_radius:g} pixels, from step {judged_from:,}",
+        "density.prune_opacity": number(density.prune_opacity),
+        "density.opacity_resets": f"the same, to step {all_resets[-1]:,}",
+        "density.max_gaussians": f"{density.max_gaussians:,}",
+        "photometric": "the same",
+        "expression_rank": f"{PAPER.expression_rank}",
+        "appearance": PAPER.appearance,
+        "position_weight, position_threshold": f"{number(PAPER.position_weight)}, {PAPER.position_threshold:g}",
+        "scale_weight, scale_threshold": f"{PAPER.scale_weight:g}, {number(PAPER.scale_threshold)}",
+        "face_tuning.expression": power(tuning.expression),
+        "face_tuning.joints": power(tuning.joints),
+        "face_tuning.head_rotation": power(tuning.head_rotation),
+        "face_tuning.head_translation": power(tuning.head_translation),
+        "face_tuning.keep_mean_pose, face_tuning.keep_turns": "no",
+    }
+    assert values_of("GaussianAvatars") == expected
+
+
 # -- HeadGaS -----------------------------------------------------------------------------------------------------------
 
 
@@ -323,6 +375,52 @@ def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_po
     (written, of_paper) = (int(number.replace(",", "")) for number in re.findall(r"about ([\d,]+)", own))
     assert updates_of(config, settings.steps) == pytest.approx(written, rel=0.01)
     assert updates_of(paper.config(method), 300_000) == pytest.approx(of_paper, rel=0.01)
+
+
+# -- PointAvatar -------------------------------------------------------------------------------------------------------
+
+
+def test_docs_have_all_values_of_point_avatar() -> None:
+    paper: Any = PRESETS["paper"].config("point_avatar")
+    steps, photometric, tuning = (
+        PRESETS["paper"].settings_of("point_avatar").steps,
+        paper.photometric,
+        paper.face_tuning,
+    )
+    assert (paper.first_radius, paper.radius_factor) == (0.0375, 0.75)
+    weights = (paper.face_skinning_weight, paper.face_expression_weight, paper.face_correctives_weight)
+    assert weights == (1, 1_000, 1_000)
+    assert (photometric.ssim_weight, photometric.perceptual.every, photometric.perceptual.start) == (0, 1, 0)
+    assert paper.face_points >= paper.max_points
+    for rate in (tuning.expression, tuning.joints, tuning.head_rotation):
+        assert (rate.start, round(rate.begin * paper.epochs), rate.end) == (5e-4, 10, None)
+    expected = {
+        "steps": f"{steps:,}",
+        "frames_per_step": f"{paper.frames_per_step}",
+        "start, points, sphere_radius": f"{paper.start}, {paper.points}, {paper.sphere_radius}",
+        "pretraining": f"{paper.pretraining}",
+        "max_points, growth_epochs, epochs": f"{paper.max_points:,}, {paper.growth_epochs}, {paper.epochs}",
+        "first_radius, radius_factor": "the same",
+        "normals": paper.normals,
+        "surface_width, surface_layers, encoding_bands": f"{paper.surface_width}, {paper.surface_layers}, "
+        f"{paper.encoding_bands}",
+        "deformation_width": f"{paper.deformation_width}",
+        "shading_width": f"{paper.shading_width}",
+        "means_rate, network_rate": ", ".join(
+            f"{rate.start:g}".replace("e-0", "e-").replace("0.0001", "1e-4")
+            for rate in (paper.means_rate, paper.network_rate)
+        ),
+        "face_skinning_weight, face_expression_weight, face_correctives_weight": "the same",
+        "face_points": "all points",
+        "distance_weight, slope_weight": f"{paper.distance_weight:g}, {paper.slope_weight:g}",
+        "photometric": f"L1 + {photometric.perceptual.weight:g} features + {photometric.alpha_weight:g} alpha".replace(
+            "0.1", ".1"
+        ),
+        "face_tuning": "5e-4 from epoch 10",
+        "closing": f"{paper.closing} pixel in every direction",
+    }
+    assert values_of("PointAvatar") == expected
+    assert f"takes {paper.epochs} epochs of\n{steps // paper.epochs:,} frames" in PAGE.read_text()
 
 
 # -- the extent of the cameras ----------------------------------------------------------------------------------------
