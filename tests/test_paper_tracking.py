@@ -10,7 +10,7 @@ import torch
 from mien.adam import Moments
 from mien.tracking import Tracking, TrackingSettings, track, track_subject
 from mien.tracking.constants import TRACKING
-from mien.tracking.descent import epochs
+from mien.tracking.descent import epochs, frames
 from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent
 from mien.tracking.descent.scene import first_state, paper_scene
@@ -52,6 +52,96 @@ def test_all_of_it_from_landmarks(case, by_landmarks):
     alone = track(case.capture, case.model, settings)
     assert wobble(case, alone) < 0.25 * wobble(case, by_landmarks)
     assert turn_error(case, alone) < 0.9 * turn_error(case, by_landmarks)
+
+
+def test_the_first_frame_has_turns_until_it_no_longer_gets_better(case, monkeypatch):
+    """The first frame is fitted to convergence: turns end when the cost falls by less than a hundredth."""
+    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks", first_steps=4))
+    descent, costs, given = _descent(case, settings), [], iter((100.0, 90.0, 80.0, 79.5, 1.0))
+
+    def turn(*_: object, **__: object) -> float:
+        costs.append(next(given))
+        return costs[-1]
+
+    monkeypatch.setattr(frames, "_turn_of_first", turn)
+    frames._fit_first(descent, descent.targets(0, 0), first_of_all=True)
+    assert costs == [100.0, 90.0, 80.0, 79.5]
+
+
+def test_a_turn_of_the_first_frame_lowers_its_cost(case):
+    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
+    descent = _descent(case, settings)
+    targets = descent.targets(0, 0)
+    first = frames._turn_of_first(descent, targets, 20, appearance_first=True)
+    assert frames._turn_of_first(descent, targets, 20, appearance_first=False) < first
+
+
+def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
+    """The first camera may see a head from behind."""
+    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
+    descent, used = _descent(case, settings), []
+    (target,) = descent.targets(0, 0)
+    behind, camera = replace(target, camera=1), descent.scene.camera(0, 0, descent.state.log_focals)
+    away = replace(camera, viewmat=_turned_away(camera.viewmat))
+    monkeypatch.setattr(type(descent.scene), "camera", lambda _, __, index, focals: camera if index == 0 else away)
+    monkeypatch.setattr(frames, "guess_texture", lambda _, one, *__: used.append(one.camera))
+    monkeypatch.setattr(frames, "_turn_of_first", lambda *_, **__: 1.0)
+    frames._fit_first(descent, [behind, target], first_of_all=True)
+    assert used == [0]
+
+
+def test_every_camera_of_a_timestep_counts_in_every_step(case):
+    """Colours are the mean over the pictures, so that a step of two cameras weighs as one of a single camera."""
+    settings = replace(LANDMARKS, schedule="paper", paper=QUICK)
+    descent = _descent(case, settings)
+    (target,) = descent.targets(0, 3)
+    dark = replace(target, image=0 * target.image)
+    moving, weights = descent.moving(target, ())[0], descent.scene.used
+    one, other, both = (float(descent.frame_cost(some, moving, weights, None)) for some in
+                        ([target], [dark], [target, dark]))  # fmt: skip
+    assert other > one
+    assert both == pytest.approx((one + other) / 2, rel=1e-5)
+
+
+def test_the_frame_pass_can_be_smooth_in_both_directions(case):
+    """A frame's neighbours are those before it, as fitted, and those after it, as they are expected."""
+    settings = replace(LANDMARKS, schedule="paper", paper=QUICK)
+    descent = _descent(case, settings)
+    assert TRACKING.descent.pass_smoothness == 0, "it is worse with smoothness (docs/log.md)"
+    rows, start = descent.state.frames[0], descent.start[0]
+    rows[:4] = descent.within(rows[:4] + 0.01)
+    around = frames._expected_around(descent, 0, 3)
+    torch.testing.assert_close(around[:4], rows[:4])
+    torch.testing.assert_close(around[4:], descent.within(rows[3] + start[4:] - start[3]))
+    target = descent.targets(0, 3)
+    moving = descent.moving(target[0], ())[0]
+    alone, smooth = (float(descent.frame_cost(target, moving, descent.scene.used, some)) for some in (None, around))
+    assert smooth > alone
+    half = float(descent.frame_cost(target, moving, descent.scene.used, around, 0.5))
+    assert half == pytest.approx((alone + smooth) / 2, rel=1e-5)
+
+
+def test_defaults_are_the_supplements():
+    assert (PaperSettings().steps, PaperSettings().epochs) == (50, 30)
+
+
+def _turned_away(viewmat: torch.Tensor) -> torch.Tensor:
+    """A camera on the other side of the world's origin, which the head is between, at the same height."""
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    around[2, 3] = -1.2  # the head is 0.6 m away
+    return viewmat @ around
+
+
+def _descent(case: PhotometricCase, settings: TrackingSettings) -> Descent:
+    """The state before any step, at the true pose."""
+    shot, layout = shot_of(case.capture, settings), layout_of(case.model)
+    model = reduce_face_model(case.model, layout)
+    state = torch.cat([case.face.head_rotation, case.face.head_translation], dim=1).double()
+    fit = Fit(unknown_subject(model), (SequenceFit(shot.cameras, widen(state, layout)),))
+    scene = paper_scene(model, [shot], lenses_of([case.capture], settings), fit, settings)
+    descent = Descent(scene, first_state(scene, fit, [None]))
+    descent.state.visibility += 1
+    return descent
 
 
 def test_it_says_how_it_was_made(by_descent):

@@ -107,7 +107,8 @@ class PaperSettings:
     quicker. landmarks: as in the supplement, the first frame is fitted to convergence, then each next frame from the
     one before it, then the epochs run."""
     first_steps: Annotated[int, COUNT_OR_NONE] = 500
-    """Optimiser steps at the first frame, half of them for texture and light alone. Only with start `landmarks`."""
+    """Optimiser steps of a turn at the first frame, half of those of the first turn for texture and light alone. Turns
+    follow until the cost falls by less than a hundredth. Only with start `landmarks`."""
     steps: Annotated[int, COUNT_OR_NONE] = 50
     """Optimiser steps for each next frame, which starts from the frame before it. Only with start `landmarks`."""
     epochs: Annotated[int, COUNT_OR_NONE] = 30

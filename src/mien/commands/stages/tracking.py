@@ -41,7 +41,7 @@ _TRACKING_RECIPE = 12
 """Version of the tracking. It is raised whenever the same captures would be tracked differently, so that old trackings
 no longer count as current."""
 
-_DESCENT_RECIPE = "descent 2"
+_DESCENT_RECIPE = "descent 3"
 """The same for what only the schedule `paper` does."""
 
 DEFAULT_SCORING = ScoringSettings()

@@ -39,11 +39,10 @@ _AT_ONCE = 16
 
 @dataclass(frozen=True)
 class _Place:
-    """One picture of a batch."""
+    """One timestep of a batch."""
 
     sequence: int
     row: int
-    camera: int
 
 
 class Descent:
@@ -72,7 +71,7 @@ class Descent:
             {k: v for k, v in tensors.items() if k.startswith("rows/")}, "rows/"
         ).items():
             sequence, row = (int(part) for part in name.split("/"))
-            stepper = self.stepper(sequence, row, past_only=False)
+            stepper = self.stepper(sequence, row)
             self._steppers[sequence, row] = replace(
                 stepper, whitening=tensors[f"rows/{name}/whitening"], moments=moments
             )
@@ -87,18 +86,15 @@ class Descent:
         if self.done >= self.frames * (2 + epoch):
             return
         pairs = [(sequence, row) for sequence, rows in enumerate(self.state.frames) for row in range(len(rows))]
-        random = np.random.default_rng((7, epoch))
-        drawn = []
-        for index in random.permutation(len(pairs)):
-            sequence, row = pairs[index]
-            drawn.append(_Place(sequence, row, int(random.choice(self.cameras(sequence, row)))))
+        order = np.random.default_rng((7, epoch)).permutation(len(pairs))
+        drawn = [_Place(*pairs[index]) for index in order]
         batches = np.array_split(np.arange(len(drawn)), min(known.most_batches, len(drawn)))
         scale = known.global_rate * known.epoch_decay**epoch
         texture_gradient, seen = torch.zeros_like(self.state.texture), 0
         for batch in batches:
             gradients = self._step_frames([drawn[index] for index in batch], scale)
             texture_gradient, seen = texture_gradient + gradients.pop("texture"), seen + len(batch)
-            self._step_shared(gradients, scale, 1 / len(batches), len(batch))
+            self.step_shared(gradients, scale, 1 / len(batches), len(batch))
             if seen >= known.texture_every:
                 roughness = roughness_gradient(self.scene, self.state.texture)
                 mean = texture_gradient / seen + roughness / known.texture_every
@@ -115,7 +111,7 @@ class Descent:
             for place, gradients in zip(some, map_in_threads(partial(self._gradients, weights), some), strict=True):
                 key = (place.sequence, place.row)
                 if key not in self._steppers:
-                    self._steppers[key] = self.stepper(*key, past_only=False)
+                    self._steppers[key] = self.stepper(*key)
                 self._steppers[key].step(gradients.pop("row"), scale * self.scene.settings.rates.frame)
                 light = torch.zeros_like(self.state.lights)
                 light[place.sequence] = gradients.pop("light")
@@ -124,22 +120,22 @@ class Descent:
         return total
 
     def _gradients(self, weights: Float[Tensor, " f"], place: _Place) -> dict[str, Tensor]:
-        """Gradients of one frame's cost by all parameters that it depends on."""
+        """Gradients of one timestep's cost by all parameters that it depends on."""
         names = ["row", "identity", "texture", "light"]
         names += ["offsets"] if self.scene.settings.offset_sigma > 0 else []
         names += ["log_focals"] if len(self.state.log_focals) else []
-        target = read_target(self.scene, place.sequence, place.row, place.camera)
+        targets = self.targets(place.sequence, place.row)
         with torch.enable_grad():
-            moving, leaves = self.moving(target, names)
-            target = without_smooth_difference(self.scene, target, moving, weights)
-            cost = self.frame_cost(target, moving, weights, past_only=False)
+            moving, leaves = self.moving(targets[0], names)
+            targets = [without_smooth_difference(self.scene, target, moving, weights) for target in targets]
+            cost = self.frame_cost(targets, moving, weights, self.state.frames[place.sequence])
             found = torch.autograd.grad(cost, list(leaves.values()), allow_unused=True)
         return {
             name: torch.zeros_like(leaf) if gradient is None else gradient
             for (name, leaf), gradient in zip(leaves.items(), found, strict=True)
         }
 
-    def _step_shared(self, gradients: dict[str, Tensor], scale: float, share: float, frames: int) -> None:
+    def step_shared(self, gradients: dict[str, Tensor], scale: float, share: float, frames: int) -> None:
         """Move the shared parameters by a batch's summed gradients and its share of the priors' gradients."""
         state, rates = self.state, self.scene.settings.rates
         leaves = {name: getattr(state, name).clone().requires_grad_() for name in gradients}
@@ -155,16 +151,30 @@ class Descent:
             apply_adam(self._moments.setdefault(name, Moments.zeros(value)), value, gradient, rate)
 
     def frame_cost(
-        self, target: Target, moving: Moving, weights: Float[Tensor, " f"], past_only: bool
+        self,
+        targets: Sequence[Target],
+        moving: Moving,
+        weights: Float[Tensor, " f"],
+        around: Float[Tensor, "t p"] | None,
+        smoothness: float = 1.0,
     ) -> Float[Tensor, ""]:
-        """The cost of a timestep in one picture: colours, landmarks, prior, and smoothness unless `past_only`."""
-        scene = self.scene
+        """The cost of a timestep: the mean of its pictures' colours, landmarks, prior, and smoothness.
+
+        Args:
+            targets: Pictures of one timestep.
+            moving: The parameters.
+            weights: Weights of the triangles.
+            around: The rows of the sequence, of which those around the timestep count for smoothness. None leaves
+                smoothness out. The past alone would continue steady motion against the pictures.
+            smoothness: Factor of the cost of smoothness.
+        """
+        scene, own = self.scene, targets[0]
         vertices, _ = pose_vertices(scene, moving)
-        own, rows = scene.sequences[target.sequence], self.state.frames[target.sequence]
-        cost = color_term(scene, target, moving, vertices, weights) + landmark_terms(scene, target, moving)
-        cost = cost + prior_term(scene, moving.row)
-        # Smoothness with the past alone would continue steady motion against the pictures: heads drifted by degrees.
-        return cost if past_only else cost + smoothness_term(own, rows, target.row, moving.row)
+        colors = [color_term(scene, target, moving, vertices, weights) for target in targets]
+        cost = torch.stack(colors).mean() + landmark_terms(scene, own, moving) + prior_term(scene, moving.row)
+        if around is None or smoothness == 0:
+            return cost
+        return cost + smoothness * smoothness_term(scene.sequences[own.sequence], around, own.row, moving.row)
 
     def moving(self, target: Target, names: Sequence[str]) -> tuple[Moving, dict[str, Tensor]]:
         """The parameters for a picture, and those in `names` as leaves for gradients."""
@@ -179,14 +189,18 @@ class Descent:
         layout = self.scene.layout
         return torch.minimum(torch.maximum(row, layout.lower.to(row)), layout.upper.to(row))
 
-    def stepper(self, sequence: int, row: int, past_only: bool) -> RowStepper:
-        """A new stepper for a timestep's parameters."""
+    def stepper(self, sequence: int, row: int, smoothness: float = 1.0) -> RowStepper:
+        """A new stepper for a timestep's parameters, whose cost has smoothness by this factor."""
         values = self.state.frames[sequence][row]
         layout = self.scene.layout
         linked = torch.cat([torch.zeros(1), self.scene.sequences[sequence].smoothness.linked, torch.zeros(1)])
-        around = linked[row : row + 3] * torch.tensor([0.0, 0.0, 0.0] if past_only else [1.0, 4.0, 1.0])
+        around = linked[row : row + 3] * (smoothness * torch.tensor([1.0, 4.0, 1.0]))
         whitening = self.scene.whitening(sequence, row, values, float(around.sum()))
         return RowStepper(values, whitening, Moments.zeros(values), (layout.lower.float(), layout.upper.float()))
+
+    def targets(self, sequence: int, row: int) -> list[Target]:
+        """The pictures of a timestep in all cameras that found a face in it."""
+        return [read_target(self.scene, sequence, row, camera) for camera in self.cameras(sequence, row)]
 
     def cameras(self, sequence: int, row: int) -> list[int]:
         """The cameras that found a face at a timestep."""

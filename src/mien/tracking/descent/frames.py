@@ -1,12 +1,16 @@
 """The steps before the global epochs of the `paper` schedule: the pass along the frames, then texture and light."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mien.adam import Moments
+from mien.face import most_frontal_camera
 from mien.progress import Advance
 from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import apply_adam
@@ -18,7 +22,6 @@ from mien.tracking.descent.terms import (
     landmark_terms,
     light_term,
     pose_vertices,
-    read_target,
     roughness_gradient,
     visibility_of,
     without_smooth_difference,
@@ -32,17 +35,13 @@ def fit_appearance(descent: Descent) -> None:
     moments: dict[str, Moments] = {}
     order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), TRACKING.descent.texture_rounds))
     for number, index in enumerate(order):
-        sequence, row = chosen[index]
-        cameras = descent.cameras(sequence, row)
-        target = read_target(descent.scene, sequence, row, cameras[number % len(cameras)])
-        _step_appearance(descent, target, moments, _fading(number, len(order)))
+        _step_appearance(descent, descent.targets(*chosen[index]), moments, _fading(number, len(order)))
 
 
 def measure_visibility(descent: Descent) -> None:
     """Measure how frontally the frames see each triangle, and keep the best in the state."""
     for sequence, row in _some_frames(descent):
-        for camera in descent.cameras(sequence, row):
-            target = read_target(descent.scene, sequence, row, camera)
+        for target in descent.targets(sequence, row):
             visibility = visibility_of(descent.scene, target, descent.moving(target, ())[0])
             descent.state.visibility = torch.maximum(descent.state.visibility, visibility)
 
@@ -56,11 +55,12 @@ def _some_frames(descent: Descent) -> list[tuple[int, int]]:
     return chosen
 
 
-def _step_appearance(descent: Descent, target: Target, moments: dict[str, Moments], rate: float) -> None:
-    scene, state = descent.scene, descent.state
+def _step_appearance(descent: Descent, targets: Sequence[Target], moments: dict[str, Moments], rate: float) -> None:
+    scene, state, target = descent.scene, descent.state, targets[0]
     moving, leaves = descent.moving(target, ("texture", "light"))
     vertices, _ = pose_vertices(scene, moving)
-    loss = color_term(scene, target, moving, vertices, descent.trusted()) + light_term(scene, moving.light)
+    colors = [color_term(scene, one, moving, vertices, descent.trusted()) for one in targets]
+    loss = torch.stack(colors).mean() + light_term(scene, moving.light)
     by_texture, by_light = torch.autograd.grad(loss, list(leaves.values()))
     rates, light = scene.settings.rates, state.lights[target.sequence]
     with torch.no_grad():
@@ -81,17 +81,17 @@ def fit_sequence(
     rows, start = descent.state.frames[sequence], descent.start[sequence]
     before = sum(len(own) for own in descent.state.frames[:sequence])
     for row in range(max(descent.done - before, 0), len(rows)):
-        target = [read_target(descent.scene, sequence, row, camera) for camera in descent.cameras(sequence, row)]
+        targets = descent.targets(sequence, row)
         if row == 0 and not known_person:
-            _fit_first(descent, target[0], first_of_all=sequence == 0)
+            _fit_first(descent, targets, first_of_all=sequence == 0)
         else:
             if not known_person:
                 rows[row] = descent.within(rows[row - 1] + start[row] - start[row - 1])
-            _fit_row(descent, target, descent.scene.settings.steps)
-            if _is_lost(descent, target[0]):
+            _fit_row(descent, targets, descent.scene.settings.steps)
+            if _is_lost(descent, targets[0]):
                 rows[row] = start[row]
                 descent.lost.append((sequence, row))
-        for one in [] if known_person else target:
+        for one in [] if known_person else targets:
             _learn_texture(descent, one)
         descent.done += 1
         advance(status=f"frame {row + 1} of {len(rows)}")
@@ -118,43 +118,68 @@ def _is_lost(descent: Descent, target: Target) -> bool:
     return now - then > TRACKING.descent.lost_landmarks**2 * weight
 
 
-def _fit_first(descent: Descent, target: Target, first_of_all: bool) -> None:
-    scene = descent.scene
-    settings, weights = scene.settings, scene.used
-    if first_of_all:
-        guess_texture(scene, target, descent.moving(target, ())[0], descent.state.texture)
-    steps = settings.first_steps if first_of_all else settings.first_steps // TRACKING.descent.further_start_divisor
+def _fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -> None:
+    """Fit the first frame of a sequence. The very first one has turns until its cost no longer falls."""
+    known, settings = TRACKING.descent, descent.scene.settings
+    if not first_of_all:
+        _turn_of_first(descent, targets, settings.first_steps // known.further_start_divisor, appearance_first=True)
+        return
+    _, face = pose_vertices(descent.scene, descent.moving(targets[0], ())[0])
+    cameras = [descent.scene.camera(one.sequence, one.camera, descent.state.log_focals) for one in targets]
+    frontal = targets[most_frontal_camera(cameras, face)]
+    guess_texture(descent.scene, frontal, descent.moving(frontal, ())[0], descent.state.texture)
+    before = math.inf
+    for turn in range(known.first_most_turns):
+        cost = _turn_of_first(descent, targets, settings.first_steps, appearance_first=turn == 0)
+        if cost > (1 - known.first_converged) * before:
+            break
+        before = cost
+
+
+def _turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appearance_first: bool) -> float:
+    """Fit a first frame with texture and light, and return the mean cost of the last tenth of the steps."""
+    scene, target, costs = descent.scene, targets[0], []
     appearance = {"texture": descent.state.texture, "light": descent.state.lights[target.sequence]}
     moments = {name: Moments.zeros(value) for name, value in appearance.items()}
-    stepper = descent.stepper(target.sequence, target.row, past_only=True)
+    stepper = descent.stepper(target.sequence, target.row, smoothness=0.0)
     for step in range(steps):
         rate = _fading(step, steps)
-        names = ("row", "texture", "light") if 2 * step >= steps else ("texture", "light")
+        names = ("texture", "light") if appearance_first and 2 * step < steps else ("row", "texture", "light")
         moving, leaves = descent.moving(target, names)
-        loss = descent.frame_cost(target, moving, weights, past_only=True) + light_term(scene, moving.light)
+        loss = descent.frame_cost(targets, moving, scene.used, None) + light_term(scene, moving.light)
         gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+        costs.append(float(loss.detach()))
         with torch.no_grad():
             gradients["texture"] = gradients["texture"] + roughness_gradient(scene, moving.texture)
             for name, value in appearance.items():
-                apply_adam(moments[name], value, gradients[name], rate * getattr(settings.rates, name))
+                apply_adam(moments[name], value, gradients[name], rate * getattr(scene.settings.rates, name))
             if "row" in leaves:
-                stepper.step(gradients["row"], rate * settings.rates.frame)
+                stepper.step(gradients["row"], rate * scene.settings.rates.frame)
+    last = costs[-max(1, steps // 10) :]
+    return sum(last) / max(len(last), 1)
 
 
-def _fit_row(descent: Descent, target: Sequence[Target], steps: int) -> None:
-    rate, stepper = (
-        descent.scene.settings.rates.frame,
-        descent.stepper(target[0].sequence, target[0].row, past_only=True),
-    )
-    weights, even = descent.trusted(), list(target)
+def _fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
+    sequence, row = targets[0].sequence, targets[0].row
+    rate, smoothness = descent.scene.settings.rates.frame, TRACKING.descent.pass_smoothness
+    stepper = descent.stepper(sequence, row, smoothness)
+    weights, even, around = descent.trusted(), list(targets), _expected_around(descent, sequence, row)
     for step in range(steps):
-        index = step % len(target)
-        moving, leaves = descent.moving(target[index], ("row",))
-        if step % (TRACKING.descent.light_every * len(target)) < len(target):
-            even[index] = without_smooth_difference(descent.scene, target[index], moving, weights)
-        loss = descent.frame_cost(even[index], moving, weights, past_only=True)
+        moving, leaves = descent.moving(targets[0], ("row",))
+        if step % TRACKING.descent.light_every == 0:
+            even = [without_smooth_difference(descent.scene, target, moving, weights) for target in targets]
+        loss = descent.frame_cost(even, moving, weights, around, smoothness)
         (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
         stepper.step(gradient, rate * _fading(step, steps))
+
+
+def _expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, "t p"]:
+    """The rows for a frame's smoothness: as fitted before it, and as its start says from the frame on.
+
+    With the past alone, heads drifted by degrees.
+    """
+    rows, start = descent.state.frames[sequence], descent.start[sequence]
+    return torch.cat([rows[: row + 1], descent.within(rows[row] + start[row + 1 :] - start[row])])
 
 
 def _learn_texture(descent: Descent, target: Target) -> None:
