@@ -167,7 +167,7 @@ def test_docs_have_all_values_of_gaussian_avatars() -> None:
     assert (PAPER.means_times_extent, density.size_unit) == (True, "extent")
     assert density.size_start is None, "sizes are judged from the first reset after the first round"
     assert density.rules.prune_wide
-    assert not (tuning.keep_mean_pose or tuning.keep_turns)
+    assert (tuning.keep_mean_pose, tuning.keep_turns) == (False, False)
     expected = {
         "steps": f"{STEPS:,}",
         "sh_degree": f"{PAPER.sh_degree}",
@@ -368,8 +368,9 @@ def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_po
     assert [name for name in METHODS if "paper-cpu" in METHODS[name].presets] == [method]
     own = PAGE.read_text().split("\n### On a processor\n")[1].split("\n## ")[0]
     rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*) \|$", own, flags=re.MULTILINE))
+    frames = settings.steps // config.epochs
     assert rows == {
-        "steps": f"300,000: 2,500 frames an epoch | {settings.steps:,}: {settings.steps // config.epochs} frames an epoch",
+        "steps": f"300,000: 2,500 frames an epoch | {settings.steps:,}: {frames} frames an epoch",
         "max_points": f"100,000 | {config.max_points:,}",
     }
     (written, of_paper) = (int(number.replace(",", "")) for number in re.findall(r"about ([\d,]+)", own))
