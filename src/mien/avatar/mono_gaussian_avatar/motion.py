@@ -199,10 +199,10 @@ def nearest_vertices(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "v 3"
     at in parts: all 100,000 of the paper at once would need 1.8 GB for their distances.
     """
     if is_native(points, vertices):
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         # A tree refuses numbers that are not finite, which the run reports later, in words for users.
-        _, nearest = cKDTree(vertices.numpy()).query(points.nan_to_num().numpy())
+        _, nearest = KDTree(vertices.numpy()).query(points.nan_to_num().numpy())
         return torch.from_numpy(nearest)
     # |p - v|^2 less |p|^2, which is the same for all vertices, and half of that.
     own, across = vertices.square().sum(-1) / 2, vertices.T
