@@ -136,21 +136,6 @@ def test_gradients_weigh_by_the_pictures_own_width_and_height(axis: int, side: i
     assert store["face_index"].tolist() == [0, 1, 1]
 
 
-def test_wide_ones_go_unless_that_rule_is_off() -> None:
-    """Radii of 20 pixels are judged after a reset that follows the start, as in the preset `paper`."""
-    for on, expected in ((True, [0]), (False, [0, 1])):
-        store = make_store([0.001, 0.001])
-        rules = replace(EVERY_STEP.rules, prune_wide=on)
-        settings = replace(EVERY_STEP, opacity_resets=(0.0, 0.5), prune_radius=20.0, rules=rules)
-        strategy = control(store, settings)
-        strategy.observe(pose(store), rendering([0.0, 0.0], radii=[20, 21]))
-        strategy.adapt(store, pose(store), Progress(10, 100), random)
-        assert store["face_index"].tolist() == [0, 1], "before the reset"
-        strategy.observe(pose(store), rendering([0.0, 0.0], radii=[20, 21]))
-        strategy.adapt(store, pose(store), Progress(60, 100), random)
-        assert store["face_index"].tolist() == expected
-
-
 def test_an_avatar_keeps_one_gaussian_whatever_is_pruned() -> None:
     store = make_store([0.001] * 3)
     store.assign("opacity_logits", torch.logit(torch.tensor([0.1, 0.3, 0.2])))
