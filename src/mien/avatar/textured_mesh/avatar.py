@@ -88,9 +88,10 @@ class TexturedMesh(Avatar):
         rest = self._rest()
         own = face.vertex_offsets
         face = replace(face, vertex_offsets=rest.offsets if own is None else own + rest.offsets)
-        colors = self._world_colors(face, rest.albedo) if rest.colors is None else rest.colors
-        sh = sh_from_rgb(colors)[..., None, :]
+        sh = sh_from_rgb(rest.albedo if rest.colors is None else rest.colors)[:, None]
         gaussians = pose_bound_gaussians(self.face_model, face, rest.local, sh, in_head=True)
+        if rest.colors is None:
+            gaussians = replace(gaussians, sh=sh_from_rgb(self._world_colors(face, rest.albedo))[..., None, :])
         return Posed(gaussians, {"offsets": rest.offsets})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
@@ -210,11 +211,7 @@ class TexturedMesh(Avatar):
         """Unit normals at the surfels of a posed mesh, bent by the normal map along the axes of triangles."""
         faces, surfels = self.face_model.faces, self._surfels
         smooth = surfels.at_corners(vertex_normals(vertices, faces)[..., faces.long(), :])
-        with torch.no_grad():
-            along, across = (
-                surfels.at_triangles(triangle_frames(vertices, faces).R[..., ::2].flatten(-2))
-                .unflatten(-1, (3, 2))
-                .unbind(-1)
-            )
+        axes = surfels.at_triangles(triangle_frames(vertices, faces).R[..., ::2].flatten(-2))
+        along, across = axes.unflatten(-1, (3, 2)).unbind(-1)
         slopes = self.store["slopes"]
         return normalize(smooth + along * slopes[:, :1] + across * slopes[:, 1:], dim=-1)
