@@ -273,18 +273,19 @@ def test_gradients_are_those_of_finite_differences(light: str) -> None:
             torch.testing.assert_close(slope, (above - below) / (2 * step), rtol=1e-4, atol=1e-6, msg=name)
 
 
-def test_penalties_are_those_of_rough_offsets_bent_normals_and_colored_light() -> None:
+def test_penalties_are_of_rough_offsets_and_albedo_and_of_bent_normals_and_of_light_that_is_not_white() -> None:
     avatar = new_avatar(disturbed=1.0)
     posed = avatar.pose(toy_face(5)[1])
     losses = avatar.regularizers(posed, rendered(), Progress(1, 2))
-    offsets, near = 1000 * posed.aux["offsets"], neighbours_of(avatar.face_model.template, avatar.face_model.faces)
-    rough = (offsets - near.means(offsets)).square().sum() / len(offsets)
-    torch.testing.assert_close(losses["smoothness"], PLAIN.smoothness_weight * rough)
-    torch.testing.assert_close(
-        losses["normals"], PLAIN.normal_weight * avatar.store["slopes"].square().sum() / len(avatar.store)
-    )
-    grey = avatar.light.mean(1, keepdim=True)
-    torch.testing.assert_close(losses["light"], PLAIN.light_weight * (avatar.light - grey).square().mean())
+    near, store = neighbours_of(avatar.face_model.template, avatar.face_model.faces), avatar.store
+    offsets, albedo = avatar._averaged()
+    rough = [(x - near.means(x)).square().sum() / len(x) for x in (1000 * offsets, albedo)]
+    detail, slopes = (store[name].square().sum() / len(store) for name in ("albedo", "slopes"))
+    torch.testing.assert_close(losses["offsets"], PLAIN.offset_weight * rough[0])
+    torch.testing.assert_close(losses["albedo"], PLAIN.albedo_weight * (rough[1] + detail))
+    torch.testing.assert_close(losses["normals"], PLAIN.normal_weight * slopes)
+    white = torch.tensor([math.sqrt(4 * math.pi), *[0.0] * 8])[:, None]
+    torch.testing.assert_close(losses["light"], PLAIN.light_weight * (avatar.light - white).square().mean())
 
 
 def test_files_whose_surfels_are_elsewhere_are_refused(tmp_path: Path) -> None:

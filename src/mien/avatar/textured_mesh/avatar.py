@@ -51,6 +51,7 @@ class _AtRest(NamedTuple):
     """What does not depend on the face."""
 
     offsets: Float[Tensor, "v 3"]
+    vertex_albedo: Float[Tensor, "v 3"]
     albedo: Float[Tensor, "n 3"]
     local: dict[str, Tensor]
     """Raw tensors of the surfels in the frames of their triangles."""
@@ -74,8 +75,7 @@ class TexturedMesh(Avatar):
         )
         self.vertex_means = nn.Parameter(torch.zeros_like(like))
         self.vertex_albedo = nn.Parameter(torch.zeros_like(like))
-        # A first coefficient of sqrt(4 pi) alone is white light from everywhere.
-        self.light = nn.Parameter(torch.cat([like.new_full((1, 3), math.sqrt(4 * math.pi)), like.new_zeros(8, 3)]))
+        self.light = nn.Parameter(white_light(like))
         parts = head_parts(face_model)
         outer = ~(parts.interior | torch.stack(parts.eyes).any(0)).to(faces.device)
         movable = like.new_zeros(len(like), 1)
@@ -92,17 +92,19 @@ class TexturedMesh(Avatar):
         gaussians = pose_bound_gaussians(self.face_model, face, rest.local, sh, in_head=True)
         if rest.colors is None:
             gaussians = replace(gaussians, sh=sh_from_rgb(self._world_colors(face, rest.albedo))[..., None, :])
-        return Posed(gaussians, {"offsets": rest.offsets})
+        return Posed(gaussians, {"offsets": rest.offsets, "vertex_albedo": rest.vertex_albedo})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """Penalties of offsets that differ from their neighbours', of bent normals and of coloured light."""
-        config, offsets = self.config, posed.aux["offsets"] / _MILLIMETRE
-        rough = offsets - self._neighbours.means(offsets)
-        colored = self.light - self.light.mean(1, keepdim=True)
+        """Penalties of rough offsets, rough albedo, bent normals, and light that is not white from everywhere."""
+        config, store = self.config, self.store
+        values = torch.cat([posed.aux["offsets"] / _MILLIMETRE, posed.aux["vertex_albedo"]], dim=-1)
+        offsets, albedo = (values - self._neighbours.means(values)).square().split(3, dim=-1)
+        detail = store["albedo"].square().sum(1).mean()
         return {
-            "smoothness": config.smoothness_weight * rough.square().sum(1).mean(),
-            "normals": config.normal_weight * self.store["slopes"].square().sum(1).mean(),
-            "light": config.light_weight * colored.square().mean(),
+            "offsets": config.offset_weight * offsets.sum(1).mean(),
+            "albedo": config.albedo_weight * (albedo.sum(1).mean() + detail),
+            "normals": config.normal_weight * store["slopes"].square().sum(1).mean(),
+            "light": config.light_weight * (self.light - white_light(self.light)).square().mean(),
         }
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -170,7 +172,7 @@ class TexturedMesh(Avatar):
         }
         albedo = sigmoid(store["albedo"] + albedo)
         colors = albedo * shade(self._normals(vertices), self.light) if self.config.light == "head" else None
-        return _AtRest(offsets, albedo, local, colors)
+        return _AtRest(offsets, vertex_albedo, albedo, local, colors)
 
     @property
     def _surfels(self) -> Surfels:
@@ -215,3 +217,8 @@ class TexturedMesh(Avatar):
         along, across = axes.unflatten(-1, (3, 2)).unbind(-1)
         slopes = self.store["slopes"]
         return normalize(smooth + along * slopes[:, :1] + across * slopes[:, 1:], dim=-1)
+
+
+def white_light(like: Tensor) -> Float[Tensor, "9 3"]:
+    """The coefficients of light that is 1 on every normal."""
+    return torch.cat([like.new_full((1, 3), math.sqrt(4 * math.pi)), like.new_zeros(8, 3)])

@@ -37,11 +37,14 @@ class TexturedMeshConfig(MethodConfig):
     """Learning rate of the normal map, per step."""
     light_rate: Rate = Rate(5e-3, 5e-4)
     """Learning rate of the light's coefficients, per step."""
-    smoothness_weight: Annotated[float, NOT_NEGATIVE] = 0.02
+    offset_weight: Annotated[float, NOT_NEGATIVE] = 0.02
     """Weight of the mean squared distance of a vertex's offset from the mean of its neighbours', in square
     millimetres."""
+    albedo_weight: Annotated[float, NOT_NEGATIVE] = 0.003
+    """Weight of the mean squared difference of surfels' albedos from that of the vertices, and of those from the mean
+    of their neighbours', as logits. It gives sides that no picture shows the colours of what is beside them."""
     normal_weight: Annotated[float, NOT_NEGATIVE] = 0.01
     """Weight of the mean squared slope by which the normal map bends normals."""
     light_weight: Annotated[float, NOT_NEGATIVE] = 0.01
-    """Weight of the mean squared difference of the light's coefficients from grey light. Without it, colours of skin
-    and light can be exchanged."""
+    """Weight of the mean squared difference of the light's coefficients from white light from everywhere. Without it,
+    colours of skin and light can be exchanged, and sides that no picture shows have any light."""
