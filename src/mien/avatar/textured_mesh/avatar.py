@@ -2,9 +2,10 @@
 
 It is what a renderer of meshes can do with a tracked head, and the plain baseline of all methods. The mesh is drawn as
 flat, opaque surfels that are fixed in its triangles (`mien.avatar.textured_mesh.surfels`), so that all of mien can show
-it; nothing of them is trained but colours. A colour is albedo times the light on the normal: the interpolated normal of
-the vertices, bent by the normal map. Light has nine coefficients for each channel, those of the spherical harmonics up
-to degree 2, which hold nearly all that a matt surface shows of distant light (Ramamoorthi and Hanrahan, SIGGRAPH 2001).
+it; nothing of them is trained but albedo and normals. A colour is albedo times the light on the normal: the
+interpolated normal of the vertices, bent by the normal map. Light has nine coefficients for each channel, those of the
+spherical harmonics up to degree 2, which hold nearly all that a matt surface shows of distant light (Ramamoorthi and
+Hanrahan, SIGGRAPH 2001).
 
 Offsets and a part of the albedo belong to vertices and are averaged over neighbours, as a smooth change of variables
 whose gradient is smooth as well. Teeth, tongue, eyes and the inside of the mouth have no offsets.
