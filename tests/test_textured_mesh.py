@@ -11,7 +11,7 @@ from torch import Tensor
 
 from damage import edit_json
 from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, load_avatar, move_avatar, write_avatar
-from mien.avatar.textured_mesh.surfels import Surfels, _middles, neighbours_of, place_surfels
+from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, _middles, place_surfels
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
@@ -159,7 +159,7 @@ def test_surfels_follow_offsets_exactly() -> None:
 
 def test_offsets_and_colours_are_averaged_over_neighbours() -> None:
     model = toy_face_model()
-    near = neighbours_of(model.template, model.faces)
+    near = Neighbours(model.template, model.faces)
     values = torch.randn(len(model.template), 2, dtype=torch.float64, requires_grad=True)
     matrix = torch.zeros(len(values), len(values), dtype=torch.float64)
     for a, b, c in model.faces.tolist():
@@ -277,7 +277,7 @@ def test_penalties_are_of_rough_offsets_and_albedo_and_of_bent_normals_and_of_li
     avatar = new_avatar(disturbed=1.0)
     posed = avatar.pose(toy_face(5)[1])
     losses = avatar.regularizers(posed, rendered(), Progress(1, 2))
-    near, store = neighbours_of(avatar.face_model.template, avatar.face_model.faces), avatar.store
+    near, store = Neighbours(avatar.face_model.template, avatar.face_model.faces), avatar.store
     offsets, albedo = avatar._averaged()
     rough = [(x - near.means(x)).square().sum() / len(x) for x in (1000 * offsets, albedo)]
     detail, slopes = (store[name].square().sum() / len(store) for name in ("albedo", "slopes"))

@@ -138,14 +138,13 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     avatar.gaussian_store().resize(gaussians)
     try:
         avatar.load_state_dict(state)
+    except UserError as error:
+        raise UserError(f"{source}: {error}; train it again") from None
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{source}: does not fit its settings ({reason}); train it again") from None
     # A few avatars have no record, and only drawing them can tell.
-    try:
-        fault = baked_fault(avatar.bake()) if avatar.extras.unbaked is None else None
-    except UserError as error:
-        raise UserError(f"{source}: {error}; train it again") from None
+    fault = baked_fault(avatar.bake()) if avatar.extras.unbaked is None else None
     if fault is not None:
         raise UserError(f"{source}: cannot be posed ({fault}); train it again")
 

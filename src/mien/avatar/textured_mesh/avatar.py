@@ -33,7 +33,7 @@ from mien.avatar.ops.triangle_frames import corners_in_frames, ellipses_of_corne
 from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.store import GaussianStore
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
-from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, neighbours_of, place_surfels
+from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, head_poses
 from mien.face.head_parts import head_parts
@@ -82,7 +82,10 @@ class TexturedMesh(Avatar):
         movable = like.new_zeros(len(like), 1)
         movable[faces[outer].long().flatten()] = 1
         self.register_buffer("movable", movable, persistent=False)
-        self._kept, self._placed, self._near = Kept[_AtRest](), Kept[Surfels](), Kept[Neighbours]()
+        self.surfels, self.neighbours = self._surfels(), Neighbours(like, faces)
+        # A file may have other numbers of surfels.
+        self.register_load_state_dict_post_hook(lambda avatar, _: setattr(avatar, "surfels", avatar._surfels()))
+        self._kept = Kept[_AtRest]()
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The surfels in the head frame, one batch entry per timestep."""
@@ -99,7 +102,7 @@ class TexturedMesh(Avatar):
         """Penalties of rough offsets, rough albedo, bent normals, and light that is not white from everywhere."""
         config, store = self.config, self.store
         values = torch.cat([posed.aux["offsets"] / _MILLIMETRE, posed.aux["vertex_albedo"]], dim=-1)
-        offsets, albedo = (values - self._neighbours.means(values)).square().split(3, dim=-1)
+        offsets, albedo = (values - self.neighbours.means(values)).square().split(3, dim=-1)
         detail = store["albedo"].square().sum(1).mean()
         return {
             "offsets": config.offset_weight * offsets.sum(1).mean(),
@@ -156,7 +159,7 @@ class TexturedMesh(Avatar):
         return self._kept.of([*self.parameters(), *self.store.buffers()], self._compute_rest)
 
     def _compute_rest(self) -> _AtRest:
-        store, faces, surfels = self.store, self.face_model.faces.long(), self._surfels
+        store, faces, surfels = self.store, self.face_model.faces.long(), self.surfels
         offsets, vertex_albedo = self._averaged()
         vertices = self.face_model.rest_vertices(self._moved_subject(offsets))
         corners = corners_in_frames(vertices, faces)
@@ -175,23 +178,16 @@ class TexturedMesh(Avatar):
         colors = albedo * shade(self._normals(vertices), self.light) if self.config.light == "head" else None
         return _AtRest(offsets, vertex_albedo, albedo, local, colors)
 
-    @property
     def _surfels(self) -> Surfels:
-        """The places of the surfels.
+        """The places of the surfels of the store.
 
         Raises:
             UserError: they are not as this method places them, as in a damaged file.
         """
-        bound, faces = self.store["face_index"], self.face_model.faces
         try:
-            return self._placed.of([bound], lambda: Surfels(bound, len(faces), self.face_model.template))
+            return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
         except ValueError as error:
             raise UserError(f"cannot be posed ({error})") from None
-
-    @property
-    def _neighbours(self) -> Neighbours:
-        model = self.face_model
-        return self._near.of([model.template, model.faces], lambda: neighbours_of(model.template, model.faces))
 
     def _moved_subject(self, offsets: Float[Tensor, "v 3"]) -> FaceParams:
         own = self.subject.vertex_offsets
@@ -201,7 +197,7 @@ class TexturedMesh(Avatar):
         """Offsets in metres and logits of the albedo of the vertices, averaged over neighbours."""
         values = torch.cat([self.vertex_means, self.vertex_albedo], dim=-1)
         for _ in range(self.config.smoothing):
-            values = (values + self._neighbours.means(values)) / 2
+            values = (values + self.neighbours.means(values)) / 2
         offsets, albedo = values.split(3, dim=-1)
         return offsets * self.get_buffer("movable"), albedo
 
@@ -212,7 +208,7 @@ class TexturedMesh(Avatar):
 
     def _normals(self, vertices: Float[Tensor, "*b v 3"]) -> Float[Tensor, "*b n 3"]:
         """Unit normals at the surfels of a posed mesh, bent by the normal map along the axes of triangles."""
-        faces, surfels = self.face_model.faces, self._surfels
+        faces, surfels = self.face_model.faces, self.surfels
         smooth = surfels.at_corners(vertex_normals(vertices, faces)[..., faces.long(), :])
         axes = surfels.at_triangles(triangle_frames(vertices, faces).R[..., ::2].flatten(-2))
         along, across = axes.unflatten(-1, (3, 2)).unbind(-1)

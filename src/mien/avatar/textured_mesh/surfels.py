@@ -4,29 +4,16 @@ A triangle is cut into k times k equal parts, which have its shape at 1 / k of i
 All of them move with the corners: a surfel has fixed barycentric coordinates and a fixed share of the triangle.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
 
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """Triangles that are cut alike."""
-
-    grid: Float[Tensor, "k 3"]
-    """Barycentric coordinates of their surfels."""
-    side: int
-    """Number of parts along an edge."""
-    count: int
-    """Number of triangles."""
-
-
-class Surfels:
+class Surfels(nn.Module):
     """The places of surfels on a mesh: those of one triangle follow each other, and so do triangles that are cut alike.
 
     Args:
@@ -39,35 +26,42 @@ class Surfels:
     """
 
     def __init__(self, face_index: Int[Tensor, " n"], faces: int, like: Tensor):
+        super().__init__()
         counts = torch.bincount(face_index.clamp(0, faces - 1), minlength=faces)
         sides = counts.double().sqrt().round().long()
-        self._order = sides.sort(stable=True).indices
         if not torch.equal(face_index, _face_index(sides)):
             raise ValueError("its surfels are not in the order of their triangles")
+        self.register_buffer("order", sides.sort(stable=True).indices, persistent=False)
         found, numbers = sides.unique(return_counts=True)
-        self._groups = [
-            _Group(_middles(side).to(like), side, count)
-            for side, count in zip(found.tolist(), numbers.tolist(), strict=True)
-        ]
+        self.sides: list[int] = found.tolist()
+        """Numbers of parts along an edge."""
+        self.counts: list[int] = numbers.tolist()
+        """Numbers of triangles that are cut so."""
+        grids = torch.cat([_middles(side) for side in self.sides])
+        self.register_buffer("grids", grids.to(like), persistent=False)
 
     def at_corners(self, corners: Float[Tensor, "*b f 3 c"]) -> Float[Tensor, "*b n c"]:
         """Values that are linear on each triangle, at the surfels."""
-        return self._at_surfels(corners.transpose(-1, -2), lambda own, group: own @ group.grid.T)
+        grids = self.get_buffer("grids").split([side**2 for side in self.sides])
+        parts = zip(self._alike(corners.transpose(-1, -2)), grids, strict=True)
+        return self._joined([own @ grid.T for own, grid in parts])
 
     def at_triangles(self, values: Float[Tensor, "*b f c"]) -> Float[Tensor, "*b n c"]:
         """Values that are constant on each triangle, at the surfels."""
-        return self._at_surfels(values[..., None], lambda own, group: own.expand(*own.shape[:-1], group.side**2))
+        parts = zip(self._alike(values[..., None]), self.sides, strict=True)
+        return self._joined([own.expand(*own.shape[:-1], side**2) for own, side in parts])
 
     def shares(self) -> Float[Tensor, " n"]:
         """Length of the part that each surfel covers, as a share of its triangle's."""
-        return torch.cat(
-            [group.grid.new_full((group.count * group.side**2,), 1 / group.side) for group in self._groups]
-        )
+        like, parts = self.get_buffer("grids"), zip(self.sides, self.counts, strict=True)
+        return torch.cat([like.new_full((count * side**2,), 1 / side) for side, count in parts])
 
-    def _at_surfels(self, values: Tensor, spread: Any) -> Tensor:
-        parts = values.index_select(-3, self._order).split([group.count for group in self._groups], dim=-3)
-        spreads = [spread(own, group) for own, group in zip(parts, self._groups, strict=True)]
-        return torch.cat([one.transpose(-1, -2).flatten(-3, -2) for one in spreads], dim=-2)
+    def _alike(self, values: Float[Tensor, "*b f c k"]) -> tuple[Tensor, ...]:
+        """Values of triangles, apart for those that are cut alike."""
+        return values.index_select(-3, self.get_buffer("order")).split(self.counts, dim=-3)
+
+    def _joined(self, parts: list[Tensor]) -> Float[Tensor, "*b n c"]:
+        return torch.cat([one.transpose(-1, -2).flatten(-3, -2) for one in parts], dim=-2)
 
 
 @torch.no_grad()
@@ -92,27 +86,27 @@ def _middles(side: int) -> Float[Tensor, "k 3"]:
     return torch.stack([side - b - c, b, c], dim=-1) / side
 
 
-@dataclass(frozen=True, eq=False)
-class Neighbours:
-    """The vertices that share an edge with each vertex, one vertex after the other."""
+class Neighbours(nn.Module):
+    """The vertices that share an edge with each vertex.
 
-    of: Int[Tensor, " p"]
-    starts: Int[Tensor, " v"]
-    """Index into `of` of each vertex's first neighbour."""
-    degrees: Float[Tensor, "v 1"]
-    """Number of neighbours, at least 1."""
+    Args:
+        like: The vertices.
+        faces: The triangles.
+    """
+
+    def __init__(self, like: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]):
+        super().__init__()
+        edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long()
+        own, of = torch.cat([edges, edges.flip(1)]).unique(dim=0).unbind(1)
+        degrees = torch.bincount(own, minlength=len(like))
+        self.register_buffer("of", of.contiguous(), persistent=False)
+        self.register_buffer("starts", degrees.cumsum(0) - degrees, persistent=False)
+        self.register_buffer("degrees", degrees.clamp_min(1).to(like)[:, None], persistent=False)
 
     def means(self, values: Float[Tensor, "v c"]) -> Float[Tensor, "v c"]:
         """The mean of each vertex's neighbours, 0 if it has none."""
-        return _NeighbourSums.apply(values, self.of, self.starts) / self.degrees
-
-
-def neighbours_of(like: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Neighbours:
-    """The neighbours of the vertices `like`, whose numbers are on its device."""
-    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long()
-    own, of = torch.cat([edges, edges.flip(1)]).unique(dim=0).unbind(1)
-    degrees = torch.bincount(own, minlength=len(like))
-    return Neighbours(of.contiguous(), degrees.cumsum(0) - degrees, degrees.clamp_min(1).to(like)[:, None])
+        sums = _NeighbourSums.apply(values, self.get_buffer("of"), self.get_buffer("starts"))
+        return sums / self.get_buffer("degrees")
 
 
 class _NeighbourSums(torch.autograd.Function):
