@@ -14,6 +14,7 @@ from mien.avatar import (
     MonoGaussianAvatarConfig,
     PointAvatarConfig,
     Rate,
+    TexturedMeshConfig,
 )
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.training import TrainSettings
@@ -31,6 +32,7 @@ def plain_config(method: str, **changes: Any) -> MethodConfig:
         "gaussian_avatars": plain_gaussian_avatars,
         "mono_gaussian_avatar": plain_mono_gaussian_avatar,
         "point_avatar": plain_point_avatar,
+        "textured_mesh": plain_textured_mesh,
     }
     return replace(plain.get(method, METHODS[method].config)(), **changes)
 
@@ -66,3 +68,8 @@ def plain_point_avatar(**changes: Any) -> PointAvatarConfig:
         start="sphere", pretraining=0, points=200, max_points=1_000, epochs=20, growth_epochs=4, frames_per_step=1
     )
     return replace(plain, **changes)
+
+
+def plain_textured_mesh(**changes: Any) -> TexturedMeshConfig:
+    """Some hundred surfels."""
+    return replace(TexturedMeshConfig(surfels=500, smoothing=2), **changes)

@@ -20,6 +20,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "headgas": {"points": 60, "judged_expressions": 4, "directions": 3},
     "mono_gaussian_avatar": {"points": 60, "max_points": 120, "pretraining": 5},
     "point_avatar": {"points": 60, "max_points": 120, "pretraining": 5},
+    "textured_mesh": {"surfels": 300},
 }
 
 

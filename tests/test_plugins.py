@@ -55,12 +55,13 @@ def test_one_package_adds_one_of_each(tmp_path: Path, cache: str) -> None:  # no
     assert (tmp_path / "again.xyz9").read_text() == me.read_text()
     assert '"kind": "mesh_points9"' in (Path(out) / "runs/mesh_points9/avatar/avatar.json").read_text()
     shown = mien(tmp_path, "train", "--help").stdout
-    assert "point_avatar, mesh_points9 (compared" in " ".join(shown.replace("\u2502", " ").split())
+    assert "textured_mesh, mesh_points9 (compared" in " ".join(shown.replace("\u2502", " ").split())
     assert ".xyz9 files get numbers" in " ".join(
         mien(tmp_path, "export", "--help").stdout.replace("\u2502", " ").split()
     )
     wrong = mien(tmp_path, "train", out, "--method", "nerf").stderr
-    assert "give one of gaussian_avatars, headgas, mono_gaussian_avatar, point_avatar, mesh_points9 instead" in wrong
+    names = "gaussian_avatars, headgas, mono_gaussian_avatar, point_avatar, textured_mesh, mesh_points9"
+    assert f"give one of {names} instead" in wrong
     # Without the package, its avatar is refused with the remedy.
     gone = mien(Path(out), "export", out, "--out", str(tmp_path / "b.ply"))
     assert gone.returncode == 2

@@ -51,6 +51,8 @@ if TYPE_CHECKING:
         RefillSettings,
     )
     from mien.avatar.store import GaussianStore, Moments
+    from mien.avatar.textured_mesh.avatar import TexturedMesh
+    from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 
@@ -85,6 +87,8 @@ __all__ = [
     "PointAvatarConfig",
     "Posed",
     "SurfacePrior",
+    "TexturedMesh",
+    "TexturedMeshConfig",
     "Progress",
     "Rate",
     "RefillDensity",

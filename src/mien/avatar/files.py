@@ -138,6 +138,8 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     avatar.gaussian_store().resize(gaussians)
     try:
         avatar.load_state_dict(state)
+    except UserError as error:
+        raise UserError(f"{source}: {error}; train it again") from None
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{source}: does not fit its settings ({reason}); train it again") from None

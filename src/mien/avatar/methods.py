@@ -82,6 +82,9 @@ METHODS = {
     "point_avatar": Method(
         "mien.avatar.point_avatar.avatar:PointAvatar", "mien.avatar.point_avatar.settings:PointAvatarConfig"
     ),
+    "textured_mesh": Method(
+        "mien.avatar.textured_mesh.avatar:TexturedMesh", "mien.avatar.textured_mesh.settings:TexturedMeshConfig"
+    ),
 }
 """Mien's own methods by name. A method whose settings import torch comes last: looking for the method of a config goes
 through the settings in this order."""

@@ -47,6 +47,13 @@ def triangle_frames(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]
     return TriangleFrames(R, (v0 + v1 + v2) / 3, (edge_length + height) / 2)
 
 
+def corners_in_frames(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "f 3 3"]:
+    """The corners of triangles in the triangles' frames and units, whose second coordinates are 0. Differentiable."""
+    frames = triangle_frames(vertices, faces)
+    corners = vertices[faces.long()] - frames.T[:, None]
+    return torch.einsum("fji,fcj->fci", frames.R, corners) / frames.k[:, None, None]
+
+
 def triangle_ellipses(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
 ) -> tuple[Float[Tensor, "f 4"], Float[Tensor, "f 3"]]:
@@ -54,16 +61,26 @@ def triangle_ellipses(
 
     In the plane, they have the triangle's own second moments, widened so that neighbours overlap without a gap.
     """
-    frames = triangle_frames(vertices, faces)
-    corners = vertices[faces.long()] - frames.T[:, None]
-    local = torch.einsum("fji,fcj->fci", frames.R, corners) / frames.k[:, None, None]
-    x, z = local[..., 0], local[..., 2]
+    return ellipses_of_corners(corners_in_frames(vertices, faces), AVATAR.ellipse_widening)
+
+
+def ellipses_of_corners(
+    corners: Float[Tensor, "f 3 3"], widening: float
+) -> tuple[Float[Tensor, "f 4"], Float[Tensor, "f 3"]]:
+    """`triangle_ellipses` from `corners_in_frames`, with scales of `widening` standard deviations. Differentiable.
+
+    The direction of an ellipse that is a circle has no gradient.
+    """
+    x, z = corners[..., 0], corners[..., 2]
     xx, zz, xz = ((a * b).sum(-1) / 12 for a, b in ((x, x), (z, z), (x, z)))
-    middle, half = (xx + zz) / 2, torch.hypot((xx - zz) / 2, xz)
-    angle = -0.5 * torch.atan2(2 * xz, xx - zz)
+    middle, apart = (xx + zz) / 2, (xx - zz) / 2
+    circle = torch.hypot(apart.detach(), xz.detach()) < 1e-6 * middle.detach()
+    apart, xz = torch.where(circle, 1.0, apart), xz.masked_fill(circle, 0.0)
+    half = torch.hypot(apart, xz).masked_fill(circle, 0.0)
+    angle = -0.5 * torch.atan2(2 * xz, 2 * apart)
     zero, flat = torch.zeros_like(angle), torch.full_like(angle, AVATAR.ellipse_flatness)
     quats = torch.stack([(angle / 2).cos(), zero, (angle / 2).sin(), zero], dim=-1)
-    wide, narrow = ((middle + sign * half).clamp_min(1e-6).sqrt() * AVATAR.ellipse_widening for sign in (1, -1))
+    wide, narrow = ((middle + sign * half).clamp_min(1e-6).sqrt() * widening for sign in (1, -1))
     return quats, torch.stack([wide, flat, narrow], dim=-1).log()
 
 

@@ -16,7 +16,7 @@ from mien.face import FaceParams
 from mien.formats import Format, Options, numbered
 from mien.gaussians import Gaussians
 from mien.progress import say, track_progress
-from mien.runtime import PortableAvatar
+from mien.runtime import MeshBound, PortableAvatar
 from mien.training import read_coverage, read_face_track, run_camera
 from mien.training.whole_head import with_soft_cut
 from mien.workspace import Workspace
@@ -75,9 +75,9 @@ class RunContent:
         return portable if covered is None else replace(portable, confidence=as_array(covered.seen))
 
     def mesh(self) -> MeshModel:
-        """Return the person's mesh with its texture coordinates."""
-        model = self._avatar.face_model
-        rig = bake_rig(model, self._avatar.subject)
+        """Return the mesh that the Gaussians are bound to, or else the person's, with its texture coordinates."""
+        model, baked = self._avatar.face_model, self._avatar.bake()
+        rig = baked.rig if isinstance(baked, MeshBound) else bake_rig(model, self._avatar.subject)
         return MeshModel(rig, *map(as_array, (model.faces, model.uv, model.uv_faces)))
 
     def pose(self) -> Gaussians:

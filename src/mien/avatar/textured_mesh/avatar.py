@@ -1,0 +1,221 @@
+"""A textured mesh: the tracked mesh with trained offsets, albedo, a normal map, and light by spherical harmonics.
+
+It is what a renderer of meshes can do with a tracked head, and the plain baseline of all methods. The mesh is drawn as
+flat, opaque surfels that are fixed in its triangles (`mien.avatar.textured_mesh.surfels`), so that all of mien can show
+it; nothing of them is trained but albedo and normals. A colour is albedo times the light on the normal: the
+interpolated normal of the vertices, bent by the normal map. Light has nine coefficients for each channel, those of the
+spherical harmonics up to degree 2, which hold nearly all that a matt surface shows of distant light (Ramamoorthi and
+Hanrahan, SIGGRAPH 2001).
+
+Offsets and a part of the albedo belong to vertices and are averaged over neighbours, as a smooth change of variables
+whose gradient is smooth as well. Teeth, tongue, eyes and the inside of the mouth have no offsets.
+
+A baked record has no colours that depend on normals, so light is by default that on the face at rest, in the head's
+frame. With light in the world (`light`), a person may turn before a fixed lamp, and such an avatar is not baked.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from mien.avatar.avatar import UNBAKED_REMEDY, Avatar, Extras, ParameterGroup, Posed, store_group
+from mien.avatar.baked_pose import Kept
+from mien.avatar.baking import as_array, bake_rig
+from mien.avatar.density import FixedDensity
+from mien.avatar.ops.activation import sigmoid
+from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
+from mien.avatar.ops.triangle_frames import corners_in_frames, ellipses_of_corners, triangle_frames
+from mien.avatar.schedules import TRAINED, Progress
+from mien.avatar.store import GaussianStore
+from mien.avatar.textured_mesh.settings import TexturedMeshConfig
+from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams, head_poses
+from mien.face.head_parts import head_parts
+from mien.gaussians import sh_from_rgb
+from mien.render.mesh import shade, vertex_normals
+from mien.render.rendering import Rendering
+from mien.runtime.baked import Attributes, MeshBound
+
+_OPACITY = 0.99
+"""Opacity of every surfel in its middle. The kernel lets none be 1."""
+_UNBAKED = "the setting light world of textured_mesh: light on turning normals is no function of the expression"
+_MILLIMETRE = 1e-3
+
+
+class _AtRest(NamedTuple):
+    """What does not depend on the face."""
+
+    offsets: Float[Tensor, "v 3"]
+    vertex_albedo: Float[Tensor, "v 3"]
+    albedo: Float[Tensor, "n 3"]
+    local: dict[str, Tensor]
+    """Raw tensors of the surfels in the frames of their triangles."""
+    colors: Float[Tensor, "n 3"] | None
+    """Colours of the face at rest. None with light in the world."""
+
+
+class TexturedMesh(Avatar):
+    """Opaque surfels on the triangles of a mesh. Offsets of vertices, albedo, normals and light are trained."""
+
+    config: TexturedMeshConfig
+
+    def __init__(self, config: TexturedMeshConfig, face_model: FaceModel, face: FaceParams):
+        unbaked = _UNBAKED if config.light == "world" else None
+        super().__init__(config, face_model, face, Extras(unbaked=unbaked))
+        like, faces = face_model.template, face_model.faces
+        face_index = place_surfels(face_model.rest_vertices(self.subject), faces, config.surfels)
+        n = len(face_index)
+        self.store = GaussianStore(
+            {"albedo": like.new_zeros(n, 3), "slopes": like.new_zeros(n, 2)}, {"face_index": face_index}
+        )
+        self.vertex_means = nn.Parameter(torch.zeros_like(like))
+        self.vertex_albedo = nn.Parameter(torch.zeros_like(like))
+        self.light = nn.Parameter(white_light(like))
+        parts = head_parts(face_model)
+        outer = ~(parts.interior | torch.stack(parts.eyes).any(0)).to(faces.device)
+        movable = like.new_zeros(len(like), 1)
+        movable[faces[outer].long().flatten()] = 1
+        self.register_buffer("movable", movable, persistent=False)
+        self.surfels, self.neighbours = self._surfels(), Neighbours(like, faces)
+        # A file may have other numbers of surfels.
+        self.register_load_state_dict_post_hook(lambda avatar, _: setattr(avatar, "surfels", avatar._surfels()))
+        self._kept = Kept[_AtRest]()
+
+    def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
+        """The surfels in the head frame, one batch entry per timestep."""
+        rest = self._rest()
+        own = face.vertex_offsets
+        face = replace(face, vertex_offsets=rest.offsets if own is None else own + rest.offsets)
+        sh = sh_from_rgb(rest.albedo if rest.colors is None else rest.colors)[:, None]
+        gaussians = pose_bound_gaussians(self.face_model, face, rest.local, sh, in_head=True)
+        if rest.colors is None:
+            gaussians = replace(gaussians, sh=sh_from_rgb(self._world_colors(face, rest.albedo))[..., None, :])
+        return Posed(gaussians, {"offsets": rest.offsets, "vertex_albedo": rest.vertex_albedo})
+
+    def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
+        """Penalties of rough offsets, rough albedo, bent normals, and light that is not white from everywhere."""
+        config, store = self.config, self.store
+        values = torch.cat([posed.aux["offsets"] / _MILLIMETRE, posed.aux["vertex_albedo"]], dim=-1)
+        offsets, albedo = (values - self.neighbours.means(values)).square().split(3, dim=-1)
+        detail = store["albedo"].square().sum(1).mean()
+        return {
+            "offsets": config.offset_weight * offsets.sum(1).mean(),
+            "albedo": config.albedo_weight * (albedo.sum(1).mean() + detail),
+            "normals": config.normal_weight * store["slopes"].square().sum(1).mean(),
+            "light": config.light_weight * (self.light - white_light(self.light)).square().mean(),
+        }
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """Per-surfel tensors, those of the vertices, and the light."""
+        config = self.config
+        return [
+            store_group(self.store, "albedo", config.albedo_rate),
+            store_group(self.store, "slopes", config.normal_rate),
+            ParameterGroup("offsets", {"vertex_means": self.vertex_means}, config.offset_rate),
+            ParameterGroup("vertex_albedo", {"vertex_albedo": self.vertex_albedo}, config.albedo_rate),
+            ParameterGroup("light", {"light": self.light}, config.light_rate),
+        ]
+
+    def gaussian_store(self) -> GaussianStore:
+        """Every per-surfel tensor."""
+        return self.store
+
+    def density(self) -> FixedDensity:
+        """The surfels stay where they are."""
+        return FixedDensity()
+
+    @torch.no_grad()
+    def bake(self) -> MeshBound:
+        """The mesh with its offsets, and surfels in constant colours.
+
+        Raises:
+            UserError: the light is in the world.
+        """
+        if self.extras.unbaked is not None:
+            raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
+        rest = self._compute_rest()
+        assert rest.colors is not None
+        local = {name: as_array(value) for name, value in rest.local.items()}
+        sh = as_array(sh_from_rgb(rest.colors)[:, None])
+        return MeshBound(
+            rig=bake_rig(self.face_model, self._moved_subject(rest.offsets)),
+            faces=as_array(self.face_model.faces),
+            face_index=local["face_index"],
+            means=local["means"],
+            attributes=Attributes(local["quats"], local["log_scales"], local["opacity_logits"], sh),
+            sh_frame="head",
+        )
+
+    def _rest(self) -> _AtRest:
+        """What does not depend on the face. Between steps of a training, it is computed once."""
+        if self.training or torch.is_grad_enabled():
+            return self._compute_rest()
+        return self._kept.of([*self.parameters(), *self.store.buffers()], self._compute_rest)
+
+    def _compute_rest(self) -> _AtRest:
+        store, faces, surfels = self.store, self.face_model.faces.long(), self.surfels
+        offsets, vertex_albedo = self._averaged()
+        vertices = self.face_model.rest_vertices(self._moved_subject(offsets))
+        corners = corners_in_frames(vertices, faces)
+        means, albedo = surfels.at_corners(torch.cat([corners, vertex_albedo[faces]], dim=-1)).split(3, dim=-1)
+        shapes = torch.cat(ellipses_of_corners(corners, self.config.overlap), dim=-1)
+        quats, log_scales = surfels.at_triangles(shapes).split([4, 3], dim=-1)
+        shares = surfels.shares()
+        local = {
+            "face_index": store["face_index"],
+            "means": means,
+            "quats": quats,
+            "log_scales": log_scales + shares.log()[:, None],
+            "opacity_logits": torch.full_like(shares, math.log(_OPACITY / (1 - _OPACITY))),
+        }
+        albedo = sigmoid(store["albedo"] + albedo)
+        colors = albedo * shade(self._normals(vertices), self.light) if self.config.light == "head" else None
+        return _AtRest(offsets, vertex_albedo, albedo, local, colors)
+
+    def _surfels(self) -> Surfels:
+        """The places of the surfels of the store.
+
+        Raises:
+            UserError: they are not as this method places them, as in a damaged file.
+        """
+        try:
+            return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
+        except ValueError as error:
+            raise UserError(f"cannot be posed ({error})") from None
+
+    def _moved_subject(self, offsets: Float[Tensor, "v 3"]) -> FaceParams:
+        own = self.subject.vertex_offsets
+        return replace(self.subject, vertex_offsets=offsets if own is None else own + offsets)
+
+    def _averaged(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v 3"]]:
+        """Offsets in metres and logits of the albedo of the vertices, averaged over neighbours."""
+        values = torch.cat([self.vertex_means, self.vertex_albedo], dim=-1)
+        for _ in range(self.config.smoothing):
+            values = (values + self.neighbours.means(values)) / 2
+        offsets, albedo = values.split(3, dim=-1)
+        return offsets * self.get_buffer("movable"), albedo
+
+    def _world_colors(self, face: FaceParams, albedo: Float[Tensor, "n 3"]) -> Float[Tensor, "b n 3"]:
+        """Colours under light that stands still in the world."""
+        normals = self._normals(self.face_model.head_vertices(face))
+        return albedo * shade(normals @ head_poses(face)[:, :3, :3].transpose(1, 2), self.light)
+
+    def _normals(self, vertices: Float[Tensor, "*b v 3"]) -> Float[Tensor, "*b n 3"]:
+        """Unit normals at the surfels of a posed mesh, bent by the normal map along the axes of triangles."""
+        faces, surfels = self.face_model.faces, self.surfels
+        smooth = surfels.at_corners(vertex_normals(vertices, faces)[..., faces.long(), :])
+        axes = surfels.at_triangles(triangle_frames(vertices, faces).R[..., ::2].flatten(-2))
+        along, across = axes.unflatten(-1, (3, 2)).unbind(-1)
+        slopes = self.store["slopes"]
+        return normalize(smooth + along * slopes[:, :1] + across * slopes[:, 1:], dim=-1)
+
+
+def white_light(like: Tensor) -> Float[Tensor, "9 3"]:
+    """The coefficients of light that is 1 on every normal."""
+    return torch.cat([like.new_full((1, 3), math.sqrt(4 * math.pi)), like.new_zeros(8, 3)])
