@@ -141,6 +141,16 @@ def is_file_inside(root: Path, place: Path) -> bool:
         return False
 
 
+def check_file_inside(root: Path, place: Path) -> None:
+    """Check that a file is there.
+
+    Raises:
+        UserError: it is missing, or outside of the folder `root`, perhaps through a link.
+    """
+    if not is_file_inside(root, place):
+        raise UserError(f"{place}: is missing, or no file; {REMEDY}")
+
+
 def numbered_files(folder: Path, ending: str) -> dict[int, Path]:
     """Return the files of a folder whose names are whole numbers, by their numbers, in increasing order."""
     if not folder.is_dir():

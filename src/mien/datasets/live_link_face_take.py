@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mien.bounded import read_bytes
-from mien.datasets.content import REMEDY, is_file_inside, sniff
+from mien.datasets.content import REMEDY, check_file_inside, sniff
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
 from mien.errors import UserError
 
@@ -54,10 +54,10 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     video, table = _video(path), _table(path)
     if video is None:
         raise UserError(f"{path}: has not exactly one video (.mov); copy the whole take")
-    is_file_inside(path, video)
+    check_file_inside(path, video)
     files = {}
     if table is not None:
-        is_file_inside(path, table)
+        check_file_inside(path, table)
         try:
             files[DRIVER] = read_bytes(table, _MAX_CSV_BYTES)
         except (OSError, ValueError) as error:

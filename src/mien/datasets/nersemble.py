@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mien.datasets.content import REMEDY, is_file_inside, numbers, read_object, rotation_part
+from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, numbers, read_object, rotation_part
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
 from mien.errors import UserError
 from mien.inside import is_plain_name
@@ -110,7 +110,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     for name in _names(path):
         videos = {}
         for video in sorted((path / "sequences" / name / "images").glob("cam_*.mp4")):
-            is_file_inside(path, video)
+            check_file_inside(path, video)
             videos[video.stem.removeprefix("cam_")] = video
         unknown = [serial for serial in videos if serial not in cameras]
         if unknown:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mien.datasets.content import REMEDY, is_file_inside
+from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.datasets.nersemble import FRONTAL, read_cameras
 from mien.errors import UserError
@@ -117,6 +117,8 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
     from mien.datasets.pictures import collect
 
     videos = _videos(folder, root)
+    if not videos:  # a link to itself is no file, and yet a name
+        raise UserError(f"{folder / 'images'}: none of its videos (cam_SERIAL.mp4) can be read; {REMEDY}")
     serials = [serial for serial in (FRONTAL, *videos) if serial in videos]
     serials = list(dict.fromkeys(serials))
     opened = {}
@@ -173,7 +175,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     model = needed_flame(path, face_model, VERSION)
     for folder in folders:
         file = folder / "tracking" / TRACKING
-        is_file_inside(path, file)
+        check_file_inside(path, file)
         flame, turns, shifts, scale = flame_from_benchmark(file)
         serials, images, mattes = _pictures(folder, path)
         if len(images) != len(turns):
