@@ -318,7 +318,7 @@ def _nothing(path: Path, serial: str = "") -> None:
 def write_nersemble(
     folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL), film: Callable[[Path, str], None] = _nothing
 ) -> Path:
-    """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera; without it, videos are empty."""
+    """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera, instead of empty files."""
     poses = {serial: np.eye(4).tolist() for serial in serials}
     (folder / "calibration").mkdir(parents=True)
     K = [[8000.0, 0, 1100], [0, 8000, 1604], [0, 0, 1]]
