@@ -4,7 +4,7 @@ They have no mattes and no tracking, so `mien capture` processes the videos. The
 sequence BACKGROUND, serves as its clean plate. Every third frame of 73 a second is taken, as in other work (24.3).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -91,18 +91,32 @@ def scaled_intrinsics(K: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
     return np.diag([width / SIZE[0], height / SIZE[1], 1.0]) @ K
 
 
+def frames_in(videos: Iterable[Path]) -> int | None:
+    """Return the number of frames of the first video, or None if it is damaged or there is none."""
+    from mien.capture.video import count_frames
+
+    for video in videos:
+        try:
+            return count_frames(video)
+        except UserError:  # whoever reads it says what is wrong with it
+            return None
+    return None
+
+
 def _survey(path: Path) -> Findings:
-    names = _names(path)
-    clips = tuple(
-        Clip(name, None, len(list((path / "sequences" / name / "images").glob("cam_*.mp4")))) for name in names
-    )
+    clips = []
+    for name in _names(path):
+        videos = sorted((path / "sequences" / name / "images").glob("cam_*.mp4"))
+        frames = frames_in(video for video in videos if is_file_inside(path, video))
+        clips.append(Clip(name, None if frames is None else -(-frames // _STRIDE), len(videos)))
     missing = [
+        "two of three frames",
         "mattes and tracking: `mien capture` and `mien track` make them",
         "colour calibration, which is not used",
     ]
     if not any((path / "sequences" / _EMPTY).glob("image_*.jpg")):
         missing.append(f"pictures of the empty scene (sequences/{_EMPTY}): mattes are less exact without them")
-    return Findings(clips, None, None, tuple(missing))
+    return Findings(tuple(clips), None, None, tuple(missing))
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:

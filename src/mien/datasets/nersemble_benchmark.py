@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
-from mien.datasets.nersemble import FRONTAL, read_cameras
+from mien.datasets.nersemble import FRONTAL, frames_in, read_cameras
 from mien.errors import UserError
 from mien.training import HIDDEN_CAMERAS
 
@@ -54,14 +54,17 @@ def _videos(folder: Path, root: Path) -> dict[str, Path]:
 def _survey(path: Path) -> Findings:
     folders = _sequences(path)
     mono = [folder for folder in folders if (folder / "tracking" / TRACKING).is_file()]
-    clips = tuple(Clip(folder.name, None, len(_videos(folder, path))) for folder in folders)
+    videos = {folder: _videos(folder, path) for folder in folders}
+    clips = tuple(Clip(folder.name, frames_in(own.values()), len(own)) for folder, own in videos.items())
     hidden = [folder.parent.parent.name for folder in sorted(path.glob(f"sequences/*/tracking/{TRACKING}"))
               if folder.parent.parent not in folders]  # fmt: skip
     missing = [] if mono else ["a tracking: use `mien track`"]
     if hidden:
         missing.append(f"pictures of {', '.join(hidden)}, which are hidden: they are not imported")
-    if not mono:
-        missing.append(f"the cameras {', '.join(HIDDEN_CAMERAS)}, which are hidden")
+    there = {serial for own in videos.values() for serial in own}
+    hidden_cameras = [serial for serial in HIDDEN_CAMERAS if serial not in there]
+    if not mono and hidden_cameras:
+        missing.append(f"the cameras {', '.join(hidden_cameras)}, which are hidden")
     return Findings(clips, "FLAME 2023" if mono else None, None, tuple(missing))
 
 
