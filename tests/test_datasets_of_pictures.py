@@ -212,6 +212,17 @@ def test_nersemble_is_captured_with_its_cameras_and_clean_plates(
     assert asked == [([f"{name}.mp4" for name in names], [f"{name}.jpg" for name in names])]
     assert (tmp_path / "out/dataset.json").is_file()
 
+    def refuse(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
+        plate = sorted((settings.clean_plate or tmp_path).iterdir())[0]
+        raise UserError(f"--capture.clean-plate {plate}: {videos[1]} and {calibration} differ")
+
+    monkeypatch.setattr(import_footage, "capture_cameras", refuse)
+    with pytest.raises(UserError) as told:  # without the links' names, which vanish
+        import_footage.write_footage(tmp_path / "out2", footage, find_dataset("nersemble"), folder)
+    plate, video = folder / "sequences/BACKGROUND/image_222200036.jpg", footage.videos[1]
+    assert str(told.value) == f"{plate}: {video} and {folder} (its cameras) differ"
+    assert not (tmp_path / "out2").exists()
+
 
 TAKE = "Timecode,BlendshapeCount,"
 

@@ -20,12 +20,12 @@ from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
 from mien.training import read_sequence
 
 PERSON = replace(
-    RECIPES["plain"], width=275, height=401, fps=25.0, clothes=False, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),
+    RECIPES["plain"], width=550, height=802, fps=25.0, clothes=False, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),
     script=(Segment("speech", 0.32),),
 )  # fmt: skip
 SERIALS = ("222200036", FRONTAL, "222200046")
 STRIDE = 3
-FULL = 8
+FULL = 4
 """NeRSemble's pictures have so many times the side of those that are drawn here."""
 SMALL = ("--preset", "draft", "--training.resolution", "128")
 PLAIN = ("--training.unseen", "trained", "--training.inside", "free", "--training.mesh", "tracked")
@@ -115,7 +115,7 @@ def test_a_take_of_live_link_face_becomes_an_avatar(tmp_path: Path, monkeypatch:
     from mien.evaluation import living
 
     monkeypatch.setattr(living, "FPS", 2)
-    scene = SyntheticScene(replace(PERSON, script=(Segment("speech", 0.8),)), 3)
+    scene = SyntheticScene(replace(PERSON, width=256, height=320, script=(Segment("speech", 0.8),)), 3)
     pictures = [frame.image for frame in scene.frames()]
     take, root = tmp_path / "20240131_Me_3", tmp_path / "me"
     write_take(take, lambda path, _: film(path, pictures, fps=25.0))

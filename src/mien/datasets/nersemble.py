@@ -4,6 +4,7 @@ They have no mattes and no tracking, so `mien capture` processes the videos. The
 sequence BACKGROUND, serves as its clean plate. Every third frame of 73 a second is taken, as in other work (24.3).
 """
 
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,9 +40,14 @@ def _recognises(path: Path) -> str | None:
     if not _calibration(path).is_file() or not (path / "sequences").is_dir():
         return None
     names = _names(path)
-    if not names or any((path / "sequences" / name / "alpha_maps").is_dir() for name in names):
+    if not names or any(has_mattes(path / "sequences" / name) for name in names):
         return None
     return f"a person of NeRSemble ({len(names)} sequence{'s' * (len(names) != 1)})"
+
+
+def has_mattes(sequence: Path) -> bool:
+    """Whether a sequence's folder has mattes, as the benchmark's have. Links to nothing count, to be refused later."""
+    return os.path.lexists(sequence / "alpha_maps")
 
 
 def _names(path: Path) -> list[str]:

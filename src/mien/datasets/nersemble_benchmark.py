@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
-from mien.datasets.nersemble import FRONTAL, frames_in, read_cameras
+from mien.datasets.nersemble import FRONTAL, frames_in, has_mattes, read_cameras
 from mien.errors import UserError
 from mien.training import HIDDEN_CAMERAS
 
@@ -32,8 +32,8 @@ _MAX_ANGLE = 1e-4
 
 def _sequences(path: Path) -> list[Path]:
     """The sequences' folders that have pictures and mattes."""
-    return [folder.parent for folder in sorted(path.glob("sequences/*/alpha_maps"))
-            if any((folder.parent / "images").glob("cam_*.mp4"))]  # fmt: skip
+    folders = sorted(folder for folder in path.glob("sequences/*") if has_mattes(folder))
+    return [folder for folder in folders if any((folder / "images").glob("cam_*.mp4"))]
 
 
 def _recognises(path: Path) -> str | None:
