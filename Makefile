@@ -112,7 +112,7 @@ fuzz: setup
 	$(MAKE) fuzz-native
 
 # FAULTS faults in each layout that `mien import` reads, layouts side by side, without the tests' checks of types at run time, as
-# users have it. Counts go to out/fuzz/datasets.jsonl. About half an hour on two cores.
+# users have it. Counts go to out/fuzz/datasets.jsonl. About ten minutes on two free cores.
 FAULTS ?= 2000
 fuzz-datasets: setup
 	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_DATASET_FUZZ_COUNTS=out/fuzz/datasets.jsonl MIEN_THREADS=1 \
@@ -123,7 +123,7 @@ KILLS ?= 200
 kills: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing.kills --kills $(KILLS) --seed $(SEED) --findings out/fuzz/kills.jsonl
 
-# Mistakes put into copies of the code, one at a time: the tests must catch 95 % of them. About half an hour on two cores.
+# Mistakes put into copies of the code, one at a time: the tests must catch 95 % of them. About ten minutes on two free cores.
 mutate: setup web-packages
 	PYTHONPATH=tests $(BIN)/python -m mutations --workers 2 --json out/mutate/verdicts.json
 

@@ -21,7 +21,7 @@ from dataset_cases import LAYOUTS, Campaign, Outcome, make_quick
 from fuzzing.dataset_faults import KINDS, faulty_dataset
 from mien.errors import UserError
 
-CASES, FIRST = (int(os.environ.get(f"MIEN_DATASET_FUZZ{name}", default)) for name, default in (("", 30), ("_FROM", 0)))
+CASES, FIRST = (int(os.environ.get(f"MIEN_DATASET_FUZZ{name}", default)) for name, default in (("", 60), ("_FROM", 0)))
 """Number of cases of each layout, and the number of the first, to run some of them again."""
 _SHOWN = 20
 """Most findings that a failure lists."""
