@@ -115,7 +115,7 @@ fuzz: setup
 # users have it. Counts go to out/fuzz/datasets.jsonl. About ten minutes on two free cores.
 FAULTS ?= 2000
 fuzz-datasets: setup
-	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_DATASET_FUZZ_COUNTS=out/fuzz/datasets.jsonl MIEN_THREADS=1 \
+	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_DATASET_FUZZ_COUNTS=$(abspath out/fuzz/datasets.jsonl) MIEN_THREADS=1 \
 	  $(BIN)/pytest -q -o addopts= -n auto --dist load --timeout 0 tests/test_datasets_fuzz.py
 
 # Commands that are killed at random moments and run again, until there are KILLS kills; findings go to out/fuzz/kills.jsonl.

@@ -16,6 +16,7 @@ from mien.camera import Camera
 from mien.capture import read_capture
 from mien.capture.video import write_video
 from mien.cli import main
+from mien.datasets.pictures import read_picture
 from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
 from mien.training import read_sequence
 
@@ -47,6 +48,7 @@ def film(path: Path, pictures: list[np.ndarray], repeats: int = 1, fps: float = 
 def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
     """Write a person of NeRSemble's raw recordings, with one timestep in three pictures. Return the frontal mattes."""
     pictures: dict[str, list[np.ndarray]] = {serial: [] for serial in SERIALS}
+    assert rig.background is not None
     mattes = []
     for timestep in range(rig.timesteps):
         for camera, frame in enumerate(rig.timestep_frames(timestep)):
@@ -131,6 +133,6 @@ def test_a_take_of_live_link_face_becomes_an_avatar(tmp_path: Path, monkeypatch:
     assert min(better.values()) > 1, better
     line = ["drive", str(root), "--run", "a", "--by", str(folder / "driving.csv")]
     assert main([*line, "--out", str(tmp_path / "d_%06d.png"), "--size", "64"]) == 0
-    drawn = [cv2.imread(str(path)).astype(int) for path in sorted(tmp_path.glob("d_*.png"))]
+    drawn = [read_picture(path)[0].astype(int) for path in sorted(tmp_path.glob("d_*.png"))]
     assert len(drawn) == 6
     assert np.abs(drawn[5] - drawn[0]).max() > 10, "the mouth opens"
