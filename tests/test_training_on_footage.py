@@ -88,8 +88,8 @@ def test_raw_recordings_of_nersemble_become_an_avatar(
     mattes = write_person(person, rig)
     assert main(["import", str(person), "--out", str(root)]) == 0
     assert main(["track", str(root), *LANDMARKS]) == 0
-    sequence = read_sequence(root / "sequences/EMO-1-shout+laugh")
-    capture, tracking = read_capture(sequence.folder / "capture"), sequence.tracking
+    folder = root / "sequences/EMO-1-shout+laugh"
+    capture, tracking = read_capture(folder / "capture"), read_sequence(folder).tracking
     assert (capture.timesteps, capture.camera_ids) == (rig.timesteps, tuple(sorted(SERIALS)))
     check_cameras(rig, capture, tracking.cameras, mattes)
     # The head is where it was drawn, in the dataset's world.
