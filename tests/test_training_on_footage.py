@@ -21,7 +21,7 @@ from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
 from mien.training import read_sequence
 
 PERSON = replace(
-    RECIPES["plain"], width=550, height=802, fps=25.0, clothes=False, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),
+    RECIPES["plain"], width=550, height=802, fps=25.0, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),
     script=(Segment("speech", 0.32),),
 )  # fmt: skip
 SERIALS = (FRONTAL, "222200036", "222200046")
@@ -105,13 +105,15 @@ def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mat
     for serial, drawn in zip(SERIALS, rig.cameras, strict=True):
         assert float((cameras[places[serial]].viewmat - drawn.viewmat).abs().max()) < 1e-5
     crop = capture.source["cameras"][FRONTAL]["crop"]
-    left, top, width, height = (crop[name] for name in ("left", "top", "width", "height"))
-    scale = capture.width / width
+    step = crop["width"] / capture.width
+    to_drawn = np.array([[step, 0, crop["left"] + step / 2 - 0.5], [0, step, crop["top"] + step / 2 - 0.5]])
+    K, front = cameras[places[FRONTAL]].K.double().numpy(), rig.cameras[0].K.double().numpy()
+    moved = np.array([[1, 0, crop["left"]], [0, 1, crop["top"]], [0, 0, 1]]) @ np.diag([step, step, 1.0]) @ K
+    assert np.abs(moved - front).max() < 0.01
     for matte, found in zip(mattes, capture.mattes[:, places[FRONTAL]], strict=True):
-        cut = matte[max(top, 0) : top + height, max(left, 0) : left + width]
-        small = cv2.resize(cut, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        part = found[: small.shape[0], : small.shape[1]]
-        both, either = ((part > 127) & (small > 127)).sum(), ((part > 127) | (small > 127)).sum()
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        expected = cv2.warpAffine(matte, to_drawn, (capture.width, capture.height), flags=flags)
+        both, either = ((found > 127) & (expected > 127)).sum(), ((found > 127) | (expected > 127)).sum()
         assert both > 0.9 * either
 
 
