@@ -4,6 +4,7 @@ import io
 import json
 import pickle
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -310,8 +311,14 @@ def write_benchmark(
     return folder
 
 
-def write_nersemble(folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL)) -> Path:
-    """Write a person of NeRSemble's raw recordings, with empty videos."""
+def _nothing(path: Path, serial: str = "") -> None:
+    path.write_bytes(b"0")
+
+
+def write_nersemble(
+    folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL), film: Callable[[Path, str], None] = _nothing
+) -> Path:
+    """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera, instead of empty files."""
     poses = {serial: np.eye(4).tolist() for serial in serials}
     (folder / "calibration").mkdir(parents=True)
     K = [[8000.0, 0, 1100], [0, 8000, 1604], [0, 0, 1]]
@@ -321,16 +328,16 @@ def write_nersemble(folder: Path, serials: tuple[str, ...] = ("222200036", FRONT
         for name in (f"EMO-1-shout+laugh/images/cam_{serial}.mp4", f"BACKGROUND/image_{serial}.jpg"):
             place = folder / "sequences" / name
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_bytes(b"0")
+            (film if place.suffix == ".mp4" else _nothing)(place, serial)
     return folder
 
 
-def write_take(folder: Path) -> Path:
-    """Write a take of Live Link Face: a table of coefficients and an empty video."""
+def write_take(folder: Path, film: Callable[[Path, str], None] = _nothing) -> Path:
+    """Write a take of Live Link Face: a table of coefficients, and a video that `film` writes."""
     folder.mkdir(parents=True, exist_ok=True)
     table = live_link_face(folder, [{"jawOpen": 0.1 * index, "eyeBlinkLeft": 0.5} for index in range(6)])
     table.rename(folder / "Me_3_iPhone_cal.csv")
-    (folder / "Me_3_iPhone.mov").write_bytes(b"0")
+    film(folder / "Me_3_iPhone.mov", "")
     (folder / "take.json").write_text(json.dumps({"slate": "Me", "takeNumber": 3, "rate": [60, 1.5]}))
     (folder / "frame_log.csv").write_text("V,0,12:00:00:00.451\nV,1,12:00:00:02.451\n")
     return folder

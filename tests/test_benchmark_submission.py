@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from dataset_cases import NoDetector
 from dataset_scene import SIDE, Scene, head_view, make_scene, projected
 from dataset_writers import BENCHMARK_SCALE, UNEQUAL, benchmark_vertices, write_benchmark
 from mien.avatar import DEFAULT_METHOD, FaceTuning
@@ -18,7 +19,6 @@ from mien.datasets.submission import monocular_tasks
 from mien.face import add_face_model, load_face_model
 from mien.training import read_sequence, train
 from plain_settings import plain_config, plain_run
-from test_datasets_fuzz import NoDetector
 
 TESTED = ("222200037", "222200046", "220700191", "222200039")
 """Cameras of the monocular task, frontal one first."""

@@ -22,8 +22,9 @@ from dataset_writers import (
 )
 from mien.capture import CaptureSettings
 from mien.capture.calibration import read_calibration
+from mien.capture.video import write_video
 from mien.commands.stages import import_footage
-from mien.datasets import FilmedSequence, Footage, TrackedSequence, find_dataset, recognised, sequences
+from mien.datasets import Clip, FilmedSequence, Footage, TrackedSequence, datasets, find_dataset, recognised, sequences
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.render import rasterize_mesh
@@ -211,6 +212,58 @@ def test_nersemble_is_captured_with_its_cameras_and_clean_plates(
     names = ["222200036", FRONTAL]
     assert asked == [([f"{name}.mp4" for name in names], [f"{name}.jpg" for name in names])]
     assert (tmp_path / "out/dataset.json").is_file()
+
+    def refuse(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
+        plate = sorted((settings.clean_plate or tmp_path).iterdir())[0]
+        raise UserError(f"--capture.clean-plate {plate}: {videos[1]} and {calibration} differ")
+
+    monkeypatch.setattr(import_footage, "capture_cameras", refuse)
+    with pytest.raises(UserError) as told:  # without the links' names, which vanish
+        import_footage.write_footage(tmp_path / "out2", footage, find_dataset("nersemble"), folder)
+    plate, video = folder / "sequences/BACKGROUND/image_222200036.jpg", footage.videos[1]
+    assert str(told.value) == f"{plate}: {video} and {folder} (its cameras) differ"
+    assert not (tmp_path / "out2").exists()
+
+
+def test_videos_of_nersemble_are_counted_before_they_are_read(scene: Scene, tmp_path: Path) -> None:
+    """Every third frame is taken. A video that leads nowhere is refused when it is read, with its name."""
+
+    def seven(path: Path, serial: str) -> None:
+        write_video(path, iter(np.zeros((7, 32, 32, 3), np.uint8)), 73.0)
+
+    folder = write_nersemble(tmp_path / "017", film=seven)
+    dataset = find_dataset("nersemble")
+    assert dataset.survey is not None
+    assert dataset.survey(folder).clips == (Clip("EMO-1-shout+laugh", 3, 2),)
+    video = folder / "sequences/EMO-1-shout+laugh/images/cam_222200036.mp4"
+    video.unlink()
+    video.symlink_to(video)
+    assert dataset.survey(folder).clips == (Clip("EMO-1-shout+laugh", 3, 2),)
+    with pytest.raises(UserError, match=r"cam_222200036.mp4: is missing, or no file"):
+        read(folder, "nersemble")
+
+
+def test_a_benchmark_person_without_its_mattes_is_no_raw_recording(scene: Scene, tmp_path: Path) -> None:
+    folder = write_benchmark(tmp_path / "393", scene, ("222200036", FRONTAL), False)
+    survey = find_dataset("nersemble-benchmark").survey
+    assert survey is not None
+    assert [(clip.frames, clip.cameras) for clip in survey(folder).clips] == [(len(scene), 2)]
+    (hidden,) = (each for each in survey(folder).missing if "hidden" in each)
+    assert hidden == "the cameras 222200046, 222200039, which are hidden"
+    mattes = folder / "sequences/EXP-2-eyes/alpha_maps"
+    shutil.rmtree(mattes)
+    for target in (folder / "nothing", folder / "calibration/camera_params.json"):
+        mattes.symlink_to(target)
+        assert [each.name for each in datasets() if each.recognises(folder)] == ["nersemble-benchmark"]
+        with pytest.raises(UserError, match="is missing, the mattes of cam_222200037.mp4"):
+            read(folder, "nersemble-benchmark")
+        mattes.unlink()
+    for video in (folder / "sequences/EXP-2-eyes/images").iterdir():
+        video.unlink()
+        video.symlink_to(video)
+    mattes.mkdir()
+    with pytest.raises(UserError, match="images: none of its videos"):
+        read(folder, "nersemble-benchmark")
 
 
 TAKE = "Timecode,BlendshapeCount,"

@@ -110,6 +110,7 @@ def test_names_stay_in_the_dataset(tmp_path: Path) -> None:
         (str(root / "own.png"), "is not the name of a file"),
         ("circle.png", "is missing"),
         ("a" * 300, "is missing"),
+        ("images/a.png" * 100, r"^.{,200}: 'images/a.pngimages/a.png[^']{36}' is not the name of a file"),
         ("a\nb", "is not the name of a file"),
         (7, "is not the name of a file"),
         ("", "is not the name of a file"),

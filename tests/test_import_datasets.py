@@ -47,7 +47,8 @@ def test_a_dry_run_only_tells(subject: Path, tmp_path: Path, capsys: pytest.Capt
     assert main(["import", str(subject), "--out", str(tmp_path / "me"), "--dry-run"]) == 0
     told = capsys.readouterr().err
     for words in ("flame_params.json of 2 clips", "one person, 2 sequences", "MVI_1810: 3 frames, 1 camera",
-                  "face model: FLAME 2020", "split: the clip MVI_1812 is held out"):  # fmt: skip
+                  "face model: FLAME 2020; give yours with --face-model",
+                  "split: the clip MVI_1812 is held out"):  # fmt: skip
         assert words in told
     assert not (tmp_path / "me").exists()
 

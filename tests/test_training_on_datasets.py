@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from dataset_cases import NoDetector, tiny_scene
 from dataset_scene import Scene, make_scene
 from dataset_writers import write_benchmark, write_imavatar, write_insta, write_nerf_blendshape, write_vhap
 from mien.batch import Batch, run_row, write_results
@@ -17,7 +18,7 @@ from mien.cli import main
 from mien.commands.stages.batch_table import read_table
 from mien.face import add_face_model
 from mien.face.cache import cache_folder
-from test_datasets_fuzz import NoDetector, quick, tiny_scene  # noqa: F401
+from test_datasets_fuzz import quick  # noqa: F401
 
 TASK = ("EXP-2-eyes", "SEN-10-port_strong_smokey")
 LAYOUTS: dict[str, tuple[Callable[[Path, Scene], Path], str, str]] = {

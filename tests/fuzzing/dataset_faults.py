@@ -28,16 +28,18 @@ class RunsCode:
         return os.mkdir, (str(self.place),)
 
 
-def faulty_dataset(root: Path, canary: Path, dice: Random) -> str:
+def faulty_dataset(root: Path, canary: Path, dice: Random, only: str | None = None) -> str:
     """Make one fault in a copy of a dataset, and return what it is.
 
     Args:
         root: The copy.
         canary: Folder outside of it, into which links lead and in which hostile pickles make a folder.
         dice: Random numbers.
+        only: One of `KINDS`, or None for any.
     """
-    kinds = list(_FAULTS)
+    kinds = list(KINDS)
     dice.shuffle(kinds)
+    kinds = kinds if only is None else [only]
     for kind in kinds:
         told = _FAULTS[kind](root, canary, dice)
         if told is not None:
@@ -160,6 +162,7 @@ _FAULTS: dict[str, Callable[[Path, Path, Random], str | None]] = {
     "camera": _missing_camera, "lengths": _other_lengths, "numbers": _not_a_number, "pickle": _hostile_pickle,
     "bomb": _bomb, "link": _link,
 }  # fmt: skip
+KINDS = tuple(_FAULTS)
 
 
 def _pick(root: Path, dice: Random, suffixes: tuple[str, ...]) -> Path | None:

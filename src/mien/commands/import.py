@@ -67,7 +67,7 @@ class Command:
             say(f"{self.path}: {told}")  # before they are read, which takes long
         if dataset.survey is not None:
             findings = dataset.survey(self.path)
-            for line in findings_lines(findings):
+            for line in findings_lines(findings, self.face_model is not None or not self.dry_run):
                 say(line)
             if not self.dry_run and self._is_there(findings):
                 say(f"{self.out}: all sequences are there already")

@@ -20,6 +20,8 @@ _MAX_JSON_BYTES = 512 << 20
 _MAX_SNIFFED = 1 << 20
 _MAX_SHOWN = 60
 """Most characters of a name that a message shows."""
+_MAX_NAME = 500
+"""Most characters of the name of a file, with its folders in the dataset."""
 
 
 def sniff(path: Path) -> bytes:
@@ -116,7 +118,7 @@ def inner(path: Path, root: Path, name: object, endings: Sequence[str] = ("",)) 
     Raises:
         UserError: the name is no text, leads out of the folder, also through a link, or the file is missing.
     """
-    if not is_one_line(name) or not name or Path(str(name)).is_absolute():
+    if not is_one_line(name) or not 0 < len(str(name)) <= _MAX_NAME or Path(str(name)).is_absolute():
         raise UserError(f"{path}: {str(name)[:_MAX_SHOWN]!r} is not the name of a file in the dataset; {REMEDY}")
     named = path.parent / str(name)
     for ending in endings:
@@ -139,6 +141,16 @@ def is_file_inside(root: Path, place: Path) -> bool:
         return whole.is_file()
     except (OSError, ValueError, RuntimeError):  # a name that is too long, or a link to itself
         return False
+
+
+def check_file_inside(root: Path, place: Path) -> None:
+    """Check that a file is there.
+
+    Raises:
+        UserError: it is missing, or outside of the folder `root`, perhaps through a link.
+    """
+    if not is_file_inside(root, place):
+        raise UserError(f"{place}: is missing, or no file; {REMEDY}")
 
 
 def numbered_files(folder: Path, ending: str) -> dict[int, Path]:

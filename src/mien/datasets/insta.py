@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mien.datasets.content import (
+    check_file_inside,
     frames_of,
     inner,
-    is_file_inside,
     numbered_files,
     numbers,
     read_object,
@@ -123,7 +123,7 @@ def _paired(
     if not both:
         raise UserError(f"{folder}: no picture has the number of a checkpoint; copy the files of the dataset again")
     for place in (*pictures.values(), *mattes.values(), *saved.values()):
-        is_file_inside(root, place)
+        check_file_inside(root, place)
     frames = tuple(_Frame(pictures[number], mattes.get(number), saved.get(number)) for number in both)
     last = _TEST_FRAMES[kind] if len(frames) > _TEST_FRAMES[kind] else 0
     test, split = tuple(range(len(frames) - last, len(frames))), f"the last {last} frames are held out ({kind})"

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mien.bounded import read_bytes
-from mien.datasets.content import REMEDY, is_file_inside, sniff
+from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, sniff
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
+from mien.datasets.nersemble import frames_in
 from mien.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,8 +38,9 @@ def _table(path: Path) -> Path | None:
 def _recognises(path: Path) -> str | None:
     if not path.is_dir() or _video(path) is None:
         return None
-    is_take = (path / "take.json").exists() or (path / "frame_log.csv").exists() or _table(path) is not None
-    return "a take of Live Link Face" if is_take else None
+    table = _table(path)
+    is_take = (path / "take.json").exists() or (path / "frame_log.csv").exists() or table is not None
+    return f"a take of Live Link Face (a video{', coefficients' if table is not None else ''})" if is_take else None
 
 
 def _survey(path: Path) -> Findings:
@@ -47,17 +49,19 @@ def _survey(path: Path) -> Findings:
         missing.append("a csv of coefficients" + (
             f": takes with {_DEPTH} have none, and only their video is used" if (path / _DEPTH).exists() else ""
         ))  # fmt: skip
-    return Findings((Clip(path.resolve().name, None),), None, None, tuple(missing))
+    video = _video(path)
+    frames = frames_in([video] if video is not None and is_file_inside(path, video) else [])
+    return Findings((Clip(path.resolve().name, frames),), None, None, tuple(missing))
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     video, table = _video(path), _table(path)
     if video is None:
         raise UserError(f"{path}: has not exactly one video (.mov); copy the whole take")
-    is_file_inside(path, video)
+    check_file_inside(path, video)
     files = {}
     if table is not None:
-        is_file_inside(path, table)
+        check_file_inside(path, table)
         try:
             files[DRIVER] = read_bytes(table, _MAX_CSV_BYTES)
         except (OSError, ValueError) as error:

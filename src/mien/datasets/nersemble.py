@@ -4,11 +4,12 @@ They have no mattes and no tracking, so `mien capture` processes the videos. The
 sequence BACKGROUND, serves as its clean plate. Every third frame of 73 a second is taken, as in other work (24.3).
 """
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mien.datasets.content import REMEDY, is_file_inside, numbers, read_object, rotation_part
+from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, numbers, read_object, rotation_part
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
 from mien.errors import UserError
 from mien.inside import is_plain_name
@@ -39,9 +40,14 @@ def _recognises(path: Path) -> str | None:
     if not _calibration(path).is_file() or not (path / "sequences").is_dir():
         return None
     names = _names(path)
-    if not names or any((path / "sequences" / name / "alpha_maps").is_dir() for name in names):
+    if not names or any(has_mattes(path / "sequences" / name) for name in names):
         return None
     return f"a person of NeRSemble ({len(names)} sequence{'s' * (len(names) != 1)})"
+
+
+def has_mattes(sequence: Path) -> bool:
+    """Whether a sequence's folder has mattes, as the benchmark's have. Links to nothing count, to be refused later."""
+    return os.path.lexists(sequence / "alpha_maps")
 
 
 def _names(path: Path) -> list[str]:
@@ -91,18 +97,32 @@ def scaled_intrinsics(K: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
     return np.diag([width / SIZE[0], height / SIZE[1], 1.0]) @ K
 
 
+def frames_in(videos: Iterable[Path]) -> int | None:
+    """Return the number of frames of the first video, or None if it is damaged or there is none."""
+    from mien.capture.video import count_frames
+
+    for video in videos:
+        try:
+            return count_frames(video)
+        except UserError:  # whoever reads it says what is wrong with it
+            return None
+    return None
+
+
 def _survey(path: Path) -> Findings:
-    names = _names(path)
-    clips = tuple(
-        Clip(name, None, len(list((path / "sequences" / name / "images").glob("cam_*.mp4")))) for name in names
-    )
+    clips = []
+    for name in _names(path):
+        videos = sorted((path / "sequences" / name / "images").glob("cam_*.mp4"))
+        frames = frames_in(video for video in videos if is_file_inside(path, video))
+        clips.append(Clip(name, None if frames is None else -(-frames // _STRIDE), len(videos)))
     missing = [
+        "two of three frames",
         "mattes and tracking: `mien capture` and `mien track` make them",
         "colour calibration, which is not used",
     ]
     if not any((path / "sequences" / _EMPTY).glob("image_*.jpg")):
         missing.append(f"pictures of the empty scene (sequences/{_EMPTY}): mattes are less exact without them")
-    return Findings(clips, None, None, tuple(missing))
+    return Findings(tuple(clips), None, None, tuple(missing))
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
@@ -110,7 +130,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     for name in _names(path):
         videos = {}
         for video in sorted((path / "sequences" / name / "images").glob("cam_*.mp4")):
-            is_file_inside(path, video)
+            check_file_inside(path, video)
             videos[video.stem.removeprefix("cam_")] = video
         unknown = [serial for serial in videos if serial not in cameras]
         if unknown:

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mien.datasets.content import REMEDY, is_file_inside
+from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
-from mien.datasets.nersemble import FRONTAL, read_cameras
+from mien.datasets.nersemble import FRONTAL, frames_in, has_mattes, read_cameras
 from mien.errors import UserError
 from mien.training import HIDDEN_CAMERAS
 
@@ -32,8 +32,8 @@ _MAX_ANGLE = 1e-4
 
 def _sequences(path: Path) -> list[Path]:
     """The sequences' folders that have pictures and mattes."""
-    return [folder.parent for folder in sorted(path.glob("sequences/*/alpha_maps"))
-            if any((folder.parent / "images").glob("cam_*.mp4"))]  # fmt: skip
+    folders = sorted(folder for folder in path.glob("sequences/*") if has_mattes(folder))
+    return [folder for folder in folders if any((folder / "images").glob("cam_*.mp4"))]
 
 
 def _recognises(path: Path) -> str | None:
@@ -54,14 +54,17 @@ def _videos(folder: Path, root: Path) -> dict[str, Path]:
 def _survey(path: Path) -> Findings:
     folders = _sequences(path)
     mono = [folder for folder in folders if (folder / "tracking" / TRACKING).is_file()]
-    clips = tuple(Clip(folder.name, None, len(_videos(folder, path))) for folder in folders)
+    videos = {folder: _videos(folder, path) for folder in folders}
+    clips = tuple(Clip(folder.name, frames_in(own.values()), len(own)) for folder, own in videos.items())
     hidden = [folder.parent.parent.name for folder in sorted(path.glob(f"sequences/*/tracking/{TRACKING}"))
               if folder.parent.parent not in folders]  # fmt: skip
     missing = [] if mono else ["a tracking: use `mien track`"]
     if hidden:
         missing.append(f"pictures of {', '.join(hidden)}, which are hidden: they are not imported")
-    if not mono:
-        missing.append(f"the cameras {', '.join(HIDDEN_CAMERAS)}, which are hidden")
+    there = {serial for own in videos.values() for serial in own}
+    hidden_cameras = [serial for serial in HIDDEN_CAMERAS if serial not in there]
+    if not mono and hidden_cameras:
+        missing.append(f"the cameras {', '.join(hidden_cameras)}, which are hidden")
     return Findings(clips, "FLAME 2023" if mono else None, None, tuple(missing))
 
 
@@ -117,6 +120,8 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
     from mien.datasets.pictures import collect
 
     videos = _videos(folder, root)
+    if not videos:  # a link to itself is no file, and yet a name
+        raise UserError(f"{folder / 'images'}: none of its videos (cam_SERIAL.mp4) can be read; {REMEDY}")
     serials = [serial for serial in (FRONTAL, *videos) if serial in videos]
     serials = list(dict.fromkeys(serials))
     opened = {}
@@ -173,7 +178,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     model = needed_flame(path, face_model, VERSION)
     for folder in folders:
         file = folder / "tracking" / TRACKING
-        is_file_inside(path, file)
+        check_file_inside(path, file)
         flame, turns, shifts, scale = flame_from_benchmark(file)
         serials, images, mattes = _pictures(folder, path)
         if len(images) != len(turns):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mien.camera import Camera
-from mien.datasets.content import REMEDY, is_file_inside
+from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.flame_poses import FRONT, carried, face_of_flame, in_front, needed_flame
 from mien.datasets.nersemble import read_cameras
 from mien.datasets.nersemble_benchmark import FPS_MONO, FPS_VIEWS, TRACKING, VERSION, flame_from_benchmark
@@ -53,7 +53,7 @@ def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) ->
         UserError: a file is missing or damaged, or the face model is not FLAME.
     """
     file = path / "calibration" / "camera_params.json"
-    is_file_inside(path, file)
+    check_file_inside(path, file)
     known = read_cameras(file, size)
     for serial in TEST_CAMERAS:
         if serial not in known:
@@ -86,7 +86,7 @@ def view_task(path: Path, sequence: str, face: FaceParams, trained: dict[str, Ca
         UserError: the calibration is missing or damaged, or has not the same cameras.
     """
     file = path / "calibration" / "camera_params.json"
-    is_file_inside(path, file)
+    check_file_inside(path, file)
     first = next(iter(trained.values()))
     known = read_cameras(file, (first.width, first.height))
     shared = next((name for name in trained if name in known), None)

@@ -8,6 +8,7 @@ from pathlib import Path
 from mien.camera import Camera
 from mien.capture import CaptureSettings, capture_cameras, capture_video
 from mien.datasets import Dataset, Footage
+from mien.errors import UserError
 from mien.inside import inside, remove_tree
 from mien.storage import write_atomically
 from mien.training import write_own_split
@@ -30,7 +31,7 @@ def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path
         if footage.cameras is None:
             capture_video(footage.videos[0], folder / "capture", settings, footage.name)
         else:
-            _capture_rig(folder / "capture", footage, footage.cameras)
+            _capture_rig(folder / "capture", footage, footage.cameras, source)
         imported = {"dataset": dataset.name, "from": str(source.absolute())}
         write_own_split(folder, footage.own_split, {"imported": imported})
         for name, content in footage.files.items():
@@ -40,20 +41,26 @@ def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path
         raise
 
 
-def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera]) -> None:
-    """Capture calibrated videos. They get the names of their cameras by links, which the capture expects."""
+def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera], source: Path) -> None:
+    """Capture calibrated videos. They get the names of their cameras by links, which the capture expects.
+
+    Complaints about a link or the calibration name what the user knows instead.
+    """
     with tempfile.TemporaryDirectory(prefix="mien-import-") as name:
         place = Path(name)
-        videos = []
+        videos, known = [], {}
         for camera_id, video in zip(cameras, footage.videos, strict=True):
             videos.append(place / f"{camera_id}{video.suffix}")
             videos[-1].symlink_to(video.resolve())
+            known[str(videos[-1])] = str(video)
         plates = None
         if footage.clean_plates is not None:
             plates = place / "plates"
             plates.mkdir()
             for camera_id, plate in footage.clean_plates.items():
-                (plates / f"{camera_id}{plate.suffix}").symlink_to(plate.resolve())
+                link = plates / f"{camera_id}{plate.suffix}"
+                link.symlink_to(plate.resolve())
+                known[f"--capture.clean-plate {link}"] = known[str(link)] = str(plate)
         calibration = place / "cameras.json"
         entries = [
             {"id": camera_id, "K": camera.K.double().tolist(), "viewmat": camera.viewmat.double().tolist(),
@@ -62,4 +69,12 @@ def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera]) -> 
         ]  # fmt: skip
         calibration.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": entries}))
         settings = CaptureSettings(stride=footage.stride, clean_plate=plates)
-        capture_cameras(videos, calibration, out, footage.name, settings)
+        try:
+            capture_cameras(videos, calibration, out, footage.name, settings)
+        except UserError as error:
+            if str(place) not in str(error):
+                raise
+            told = str(error)
+            for link, file in {**known, str(calibration): f"{source} (its cameras)"}.items():
+                told = told.replace(link, file)
+            raise UserError(told) from None

