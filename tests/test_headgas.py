@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mien.adam import FactoredMoments, Moments
-from mien.avatar import HeadGas, HeadGasConfig, Progress
+from mien.avatar import HeadGas, HeadGasConfig, Progress, method_named
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.avatar import input_directions, neighbor_distances, sample_surface, spread_out
@@ -164,8 +164,8 @@ def test_opacity_has_no_reset_and_counts_by_the_highest_seen() -> None:
     avatar = new_avatar()
     density = avatar.density()
     assert density.opacity_logits is None
-    for preset in PRESETS.values():
-        config: Any = preset.config("headgas")
+    for preset in method_named("headgas").presets:
+        config: Any = PRESETS[preset].config("headgas")
         assert config.density.opacity_resets == ()
     seen = torch.rand(40)
     assert torch.equal(density.judged_opacities(avatar.store, seen), seen)
