@@ -50,7 +50,8 @@ def test_density_control() -> None:
     density = PAPER.density
     assert density.grow_gradient == 2e-4
     assert (density.size_unit, density.split_size, density.prune_size) == ("extent", 0.01, 0.1)
-    assert (density.prune_opacity, density.prune_radius) == (0.005, 20)
+    assert density.prune_opacity == 0.005
+    assert (density.prune_radius, density.rules.prune_wide) == (20, False), "the code never prunes by the radius"
     assert density.max_gaussians >= 200_000
 
 
@@ -166,7 +167,6 @@ def test_docs_have_all_values_of_gaussian_avatars() -> None:
     assert (PAPER.means_rate, PAPER.sh_degree, PAPER.sh_warmup) == (Rate(5e-3, 5e-5), 3, 4 / 600)
     assert (PAPER.means_times_extent, density.size_unit) == (True, "extent")
     assert density.size_start is None, "sizes are judged from the first reset after the first round"
-    assert density.rules.prune_wide
     assert (tuning.keep_mean_pose, tuning.keep_turns) == (False, False)
     expected = {
         "steps": f"{STEPS:,}",
@@ -181,7 +181,8 @@ def test_docs_have_all_values_of_gaussian_avatars() -> None:
         "density.size_unit": "extent",
         "density.split_size": f"{number(density.split_size)} E",
         "density.prune_size": f"{number(density.prune_size)} E, from step {judged_from:,}",
-        "density.prune_radius": f"{density.prune_radius:g} pixels, from step {judged_from:,}",
+        "density.prune_radius, density.rules.prune_wide": f"{density.prune_radius:g} pixels, "
+        + ("yes" if density.rules.prune_wide else "no"),
         "density.prune_opacity": number(density.prune_opacity),
         "density.opacity_resets": f"the same, to step {all_resets[-1]:,}",
         "density.max_gaussians": f"{density.max_gaussians:,}",
