@@ -194,6 +194,20 @@ def test_everybody_can_use_the_page(page: Path, device: list[str]) -> None:
     assert told["results"][1:] == [[], []]
 
 
+OUTSIDE = """(async () => {
+  await mien;
+  return [...document.querySelectorAll("button:not([hidden])")].filter((each) => each.offsetParent !== null).filter((each) => {
+    const { left, right, top, bottom } = each.getBoundingClientRect();
+    return left < 0 || right > innerWidth || top < 0 || bottom > innerHeight;
+  }).map((each) => each.textContent);
+})()"""
+
+
+@pytest.mark.slow
+def test_no_face_is_cut_off_on_a_phone(page: Path) -> None:
+    assert browse(page, [OUTSIDE], size=(390, 844), device=["touch"])["results"] == [[]]
+
+
 def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.PortableAvatar) -> None:
     described = Described('Ada & "Bo"', "https://example.org/heads/a.html")
     write_page(tmp_path / "a.html", portable, described=described)
