@@ -20,7 +20,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-MOST_SDIST_BYTES = 5_000_000
+MOST_SDIST_BYTES = 6_000_000
+"""Largest sdist. 4.5 MB of it are MediaPipe's networks, which the package needs."""
 PARTS = ("sdist", "wheels", "npm", "docs")
 
 
