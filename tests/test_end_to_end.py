@@ -10,6 +10,7 @@ from mien.avatar import DEFAULT_METHOD
 from mien.capture.video import probe_video
 from mien.cli import main
 from mien.export import read_ply
+from web_case import chromium, violations
 
 DEMO = ("--seconds", "1.2", "--steps", "150")
 FRAMES = 30
@@ -41,6 +42,16 @@ def test_demo_leaves_what_people_look_at(workspace: Path) -> None:
     assert "<h1>" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert probe_video(workspace / "sequences/synthetic/tracking/overlay.mp4").frames == FRAMES
+
+
+@pytest.mark.slow
+def test_everybody_can_read_the_reports(workspace: Path, tmp_path: Path) -> None:
+    chromium()
+    assert main(["evaluate", str(workspace), "--compare", "--out", str(tmp_path / "compare.html")]) == 0
+    tracked = workspace / "sequences/synthetic/tracking/report.html"
+    for page in (workspace / RUN / "report.html", tracked, tmp_path / "compare.html"):
+        for size, device in (((1280, 800), []), ((390, 844), ["dark", "touch"])):
+            assert violations(page, size, device) == [], (page, device)
 
 
 @pytest.mark.slow

@@ -54,6 +54,14 @@ def test_the_changelog_has_the_version_of_the_package(tmp_path: Path) -> None:
         make.section(tmp_path / "CHANGELOG.md", "2.0.0")
 
 
+def test_the_source_has_what_git_knows_alone(tmp_path: Path) -> None:
+    """Wheels take MediaPipe's code for pages from the checkout. With it, the sdist would be too large."""
+    make.copy_commit(tmp_path / "source")
+    copied = {path.relative_to(tmp_path / "source").as_posix() for path in (tmp_path / "source").rglob("*")}
+    assert {"pyproject.toml", "src/mien/export/landmarker/face_landmarker.task"} <= copied
+    assert not [name for name in copied if "/vision_" in name or name.startswith("build/")]
+
+
 def test_a_folder_with_files_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "old.whl").write_bytes(b"")
     assert make.main(["--out", str(tmp_path), "--parts", "sdist"]) == 2

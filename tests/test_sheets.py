@@ -134,6 +134,16 @@ def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: lis
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
 
 
+def test_a_sheet_without_a_name_lies_in_the_runs_folder(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Other pictures need a name, because it says what they are."""
+    assert main(["render", str(workspace), "--size", "32", "--sheet", "turntable"]) == 0
+    (sheet,) = (workspace / "runs").glob("*/sheet_turntable.png")
+    assert f"{sheet}: 9 pictures" in capsys.readouterr().err
+    sheet.unlink()
+    assert main(["render", str(workspace), "--size", "32"]) == 2
+    assert "--out: is missing" in capsys.readouterr().err
+
+
 def test_what_is_beyond_the_film_is_told_and_softened(
     workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -79,11 +79,24 @@ def test_shares_grow_with_the_distance_from_the_cut(model: FaceModel) -> None:
     origin, up = (torch.from_numpy(each).float() for each in (cut.origin, cut.axes[2]))
     points = origin + torch.linspace(-0.02, 0.05, 15)[:, None] * up
     far = torch.full((1, 3), 10.0)
-    shares = opacity_shares(points, cut, far)
+    shares = opacity_shares(points, cut, far, points)
     assert (shares.diff() >= 0).all()
     assert (float(shares[0]), float(shares[-1])) == (0.0, 1.0)
     assert ((shares > 0.1) & (shares < 0.9)).any()
-    assert (opacity_shares(points, cut, points) == 1).all(), "what lies on the head is not cut off"
+    assert (opacity_shares(points, cut, points, points) == 1).all(), "what lies on the head is not cut off"
+
+
+def test_what_stands_off_the_skin_goes_just_above_the_cut_alone(model: FaceModel) -> None:
+    """Shards of a collar go, and hair beside the upper neck stays."""
+    cut = fit_neck_cut(NeckParts.of(model), model.template, torch.tensor([0.0, 1.0, 0.0]))
+    origin, side, up = (torch.from_numpy(each).float() for each in (cut.origin, cut.axes[0], cut.axes[2]))
+    far, gap = torch.full((1, 3), 10.0), WHOLE_HEAD.soft_cut_off_skin[1] + 1e-3
+    low, high = WHOLE_HEAD.soft_cut_collar
+    skin = origin + torch.tensor([0.95 * low, 1.1 * high])[:, None] * up
+    on_skin, off_skin = (opacity_shares(skin + away * side, cut, far, skin) for away in (0.0, gap))
+    assert (on_skin > 0.7).all()
+    assert off_skin[0] == 0
+    assert off_skin[1] == on_skin[1] == 1
 
 
 def test_pages_have_the_soft_cut_unless_it_is_declined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -95,6 +95,22 @@ def browse(
     return json.loads(done.stdout)
 
 
+def violations(page: Path, size: tuple[int, int], device: Sequence[str] = (), first: str = "") -> list[list[str]]:
+    """What axe-core finds in a page with all its parts unfolded: each rule, and the first element that breaks it.
+
+    `first` is JavaScript that runs before.
+    """
+    node()
+    axe = (WEB / "node_modules" / "axe-core" / "axe.min.js").read_text()
+    script = f"""(async () => {{
+      {first}
+      document.querySelectorAll("details").forEach((each) => (each.open = true));
+      const {{ violations }} = await axe.run();
+      return violations.map(({{ id, nodes }}) => [id, nodes[0].html.slice(0, 200)]);
+    }})()"""
+    return browse(page, [f"{axe};0", script], size, device=device)["results"][1]
+
+
 def drawn_head(
     count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head", columns: int | None = None, features: int = 0
 ) -> runtime.PortableAvatar:

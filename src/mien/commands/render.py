@@ -33,8 +33,9 @@ class Command:
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder, or a .mien file, which is drawn without torch."""
-    out: Path
-    """Output: .png for a still, a folder or NAME_%06d.png for numbered pictures, .mp4 or .webm for a video."""
+    out: Path | None = None
+    """Output: .png for a still, a folder or NAME_%06d.png for numbered pictures, .mp4 or .webm for a video (only for
+    sheets, default: sheet_NAME.png in the run's folder)."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
@@ -95,7 +96,7 @@ class Command:
         if sum((self.sequence is not None, self.own_motion, self.timestep is not None)) > 1:
             raise UserError("--sequence, --own-motion and --timestep: give only one of them")
         if self.sequence is None and not self.own_motion and self.cameras is None and self.path != "captured":
-            self.picture.plan(self.out, self._frames(None))
+            self.picture.plan(self._output, self._frames(None))
 
     def run(self) -> None:
         """Pose and render frame by frame, after a check of everything that depends on files."""
@@ -122,7 +123,7 @@ class Command:
             motion = read_face_track(run_dir, avatar.face_model)
         timesteps = None if motion is None else len(motion)
         cameras = self._given_cameras(workspace, timesteps)
-        output = self.picture.plan(self.out, self._frames(timesteps) if cameras is None else len(cameras))
+        output = self.picture.plan(self._output, self._frames(timesteps) if cameras is None else len(cameras))
         warn_of_white(self.picture, run_dir, avatar)
         subject = avatar.subject
         face = replace(
@@ -153,9 +154,19 @@ class Command:
         shown = pictures if output.kind == "still" else track_progress(pictures, "Rendering", len(cameras))
         write_pictures(output, shown, self.fps)
         count, first = len(avatar.gaussian_store()), cameras[0]
-        say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
+        say(f"{self._output}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
         if covered is not None:
             say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
+
+    @property
+    def _output(self) -> Path:
+        """What is written: --out, or a sheet in the run's folder."""
+        if self.out is not None:
+            return self.out
+        if self.sheet == "none" or self._is_file():
+            raise UserError("--out: is missing; give a name, such as turntable.mp4 or still.png")
+        workspace = open_workspace(self.workspace)
+        return workspace.run_dir(workspace.pick_run(self.run_name)) / f"sheet_{self.sheet}.png"
 
     @property
     def _magnification(self) -> float:
@@ -183,7 +194,7 @@ class Command:
                     f"{option}: is for runs, and {self.workspace} is a file; leave it out, or give a workspace"
                 )
         self._check_numbers()
-        self.picture.plan(self.out, self._frames(None))
+        self.picture.plan(self._output, self._frames(None))
 
     def _draw_file(self) -> None:
         """Draw the avatar of a file, without torch."""
@@ -193,7 +204,7 @@ class Command:
         view = View(
             self.yaw, self.pitch, self._magnification, lambda camera, center: self._file_path(camera, center, frames)
         )
-        render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
+        render_file(self.workspace, self.picture.plan(self._output, frames), self.picture, self.set, view, self.fps)
 
     def _file_path(
         self, camera: "mien.runtime.Camera", center: "numpy.ndarray", frames: int
@@ -258,7 +269,7 @@ class Command:
         if self.zoom is None:
             tiles = nearer_tiles(tiles, picture, (red, green, blue))
         write_pictures(output, [draw_sheet(tiles, picture, (red, green, blue))], self.fps)
-        say(f"{self.out}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
+        say(f"{self._output}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
 
     def _chosen_timestep(self, run_dir: Path, face_model: "mien.face.FaceModel") -> "mien.face.FaceParams | None":
         """The face at --timestep, or None without that option."""
@@ -291,8 +302,8 @@ class Command:
 
     def _check_sheet(self) -> None:
         """Refuse what does not go with a sheet."""
-        if self.out.suffix.lower() != ".png" or not self._is_still():
-            raise UserError(f"{self.out}: a sheet is one picture; give --out NAME.png")
+        if self._output.suffix.lower() != ".png" or not self._is_still():
+            raise UserError(f"{self._output}: a sheet is one picture; give --out NAME.png")
         if not 0 <= self.strength <= _MAX_STRENGTH:
             raise UserError(f"--strength {self.strength:g}: give a number from 0 to {_MAX_STRENGTH:g}")
         if self.picture.background == "transparent":
@@ -304,7 +315,7 @@ class Command:
                 raise UserError(f"--sheet {self.sheet}: shows one face from a camera of mien's own; leave out {name}")
 
     def _is_still(self) -> bool:
-        return self.out.suffix.lower() == ".png" and "%" not in self.out.name
+        return self._output.suffix.lower() == ".png" and "%" not in self._output.name
 
     def _frames(self, timesteps: int | None) -> int:
         return timesteps or (1 if self._is_still() else self.frames)

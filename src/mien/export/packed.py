@@ -5,9 +5,9 @@ column, which is an index of all other axes together. `unpacked` gives the avata
 lost can be measured.
 """
 
-import gzip
 import json
 import struct
+import zlib
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal
 
@@ -58,14 +58,14 @@ class _Code:
 
 
 _CODES = {
-    "avatar.baked.means": _Code(16, "columns"),
-    "avatar.baked.attributes.quats": _Code(8, "columns", signed=True),
+    "avatar.baked.means": _Code(16, "columns", levels=2047),
+    "avatar.baked.attributes.quats": _Code(8, "columns", signed=True, levels=63),
     "avatar.baked.attributes.log_scales": _Code(8, "columns"),
     "avatar.baked.attributes.opacity_logits": _Code(8, "columns"),
     "avatar.baked.attributes.sh": _Code(8, "columns"),
     "avatar.baked.changes.color": _Code(8, "columns", signed=True),
     "avatar.baked.changes.opacity_logits": _Code(8, "columns", signed=True),
-    "avatar.baked.changes.means": _Code(8, "columns", signed=True),
+    "avatar.baked.changes.means": _Code(8, "columns", signed=True, levels=63),
     "avatar.baked.changes.features.neutral": _Code(8, "columns"),
     "avatar.baked.changes.features.basis": _Code(8, "columns", signed=True, levels=31),
     "avatar.baked.changes.features.own": _Code(8, "columns"),
@@ -77,15 +77,19 @@ _CODES = {
     "avatar.baked.network.along.basis": _Code(8, "columns", signed=True),
     "avatar.baked.still_weights": _Code(16, "columns", signed=True),
     "avatar.baked.rig.template": _Code(16, "columns"),
-    "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True),
+    "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True, levels=1023),
     "avatar.baked.rig.pose_basis": _Code(8, "first", signed=True),
     "avatar.baked.rig.skinning_weights": _Code(16, "columns", signed=True),
+    "avatar.filmed.directions": _Code(16, "columns", signed=True),
     "motion.expression": _Code(16, "columns"),
     "motion.joints": _Code(16, "columns"),
     "motion.head_rotation": _Code(16, "columns"),
     "motion.head_translation": _Code(16, "columns"),
 }
 """Arrays that are not named here are stored as they are; all of them are small."""
+_BLOCKS = 6
+"""zlib's memLevel, which decides how much of an array shares one Huffman code. 8, the default, makes packed avatars 2 %
+larger, and 4 does, too."""
 _LEAST_LOG_SCALE = -12.0
 """Smallest logarithm of a scale that is kept. Beside the dilation of 0.3 pixels^2, smaller ones are not visible."""
 _OPACITY_LOGITS = (-6.5, 7.5)
@@ -104,7 +108,25 @@ def pack(avatar: PortableAvatar, motion: Motion | None = None) -> bytes:
     header = {"format": FORMAT, "version": VERSION, "content": content, "tensors": tensors}
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-(4 + len(text)) % 4)
-    return gzip.compress(b"".join([struct.pack("<I", len(text)), text, *pieces]), 9, mtime=0)
+    return _gzipped([struct.pack("<I", len(text)) + text, *pieces])
+
+
+def _gzipped(parts: list[bytes]) -> bytes:
+    """A gzip file of all parts, each compressed with repetitions or by its bytes' frequencies alone, as is smaller.
+
+    What is nearly noise, as rotations and offsets are, becomes larger by the repetitions that are found in it.
+    """
+    blocks = [min((_deflated(part, by) for by in (zlib.Z_FILTERED, zlib.Z_HUFFMAN_ONLY)), key=len) for part in parts]
+    last = zlib.compressobj(wbits=-zlib.MAX_WBITS).flush()
+    whole = b"".join(parts)
+    checks = struct.pack("<II", zlib.crc32(whole), len(whole) % 2**32)
+    return b"\x1f\x8b\x08" + bytes(5) + b"\x02\xff" + b"".join(blocks) + last + checks
+
+
+def _deflated(part: bytes, strategy: int) -> bytes:
+    """Whole blocks of a deflate stream, which refer to nothing before them."""
+    compressor = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS, _BLOCKS, strategy)
+    return compressor.compress(part) + compressor.flush(zlib.Z_SYNC_FLUSH)
 
 
 def unpacked(avatar: PortableAvatar) -> PortableAvatar:

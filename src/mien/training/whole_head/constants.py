@@ -199,6 +199,15 @@ class WholeHeadConstants:
     soft_cut_width: float = 0.03
     """Distance from the neck cut over which opacity fades where a head is shown, in metres. 2 to 4 cm were looked at on
     four clips; with 2 cm, the end of a bare neck is tufted."""
+    soft_cut_power: float = 1.5
+    """Power of the fading share. Gaussians lie over each other, and together hide more than each alone: with 1, the end
+    of the neck is jagged over dark backgrounds; with 3, half of the neck goes. Looked at on seven clips."""
+    soft_cut_off_skin: tuple[float, float] = (0.005, 0.012)
+    """Distances from the mesh up to which nothing stands off the skin, and from which on what does so is not shown just
+    above the cut, in metres. With 3 to 8 mm, necks themselves thin out. Looked at on seven clips."""
+    soft_cut_collar: tuple[float, float] = (0.025, 0.05)
+    """Heights above the cut below which what stands off the skin goes, and from which on it stays, in metres. With 5 to
+    8 cm, long hair (d3, s18) is bitten off beside the neck."""
     soft_cut_head: tuple[float, float] = (0.008, 0.02)
     """Distances from the vertices of the head without its neck up to which nothing is cut off, and from which on the
     cut counts alone, in metres. A chin may reach below the cut. Set by eye."""

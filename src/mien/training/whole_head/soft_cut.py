@@ -53,21 +53,38 @@ def shares_left(avatar: Avatar) -> Float[Tensor, " n"]:
     vertices = model(rest)[0]
     cut = fit_neck_cut(NeckParts.of(model), vertices, rest.T_world_head[0, :3, 1])
     head = vertices[model.faces[~model.region_mask("neck")].unique()]
-    return opacity_shares(world_means(gaussians).to(on_cpu), cut, head).to(gaussians.means)
+    skin = torch.cat([vertices, vertices[model.faces].mean(1)])
+    return opacity_shares(world_means(gaussians).to(on_cpu), cut, head, skin).to(gaussians.means)
 
 
-def opacity_shares(centers: Float[Tensor, "n 3"], cut: NeckCut, head: Float[Tensor, "m 3"]) -> Float[Tensor, " n"]:
+def opacity_shares(
+    centers: Float[Tensor, "n 3"], cut: NeckCut, head: Float[Tensor, "m 3"], skin: Float[Tensor, "k 3"]
+) -> Float[Tensor, " n"]:
     """The share of each opacity that is left: 0 at the cut, 1 far from it and on the head.
+
+    Just above the cut, what stands off the skin fades as well: shards of collars, and corners where a neck widens.
 
     Args:
         centers: Centres of the Gaussians at rest, in the world, in metres.
         cut: The neck cut at rest.
         head: Vertices of the head without its neck, in the world. What is close to them is not cut off.
+        skin: Points of the mesh, in the world.
     """
-    nearest = torch.cat([torch.cdist(part, head).amin(1) for part in centers.split(_PART)])
+    shares = _smoothstep(cut.margins(centers) / WHOLE_HEAD.soft_cut_width) ** WHOLE_HEAD.soft_cut_power
+    low, high = WHOLE_HEAD.soft_cut_collar
+    above = _smoothstep((cut.heights(centers) - low) / (high - low))
+    near = (shares < 1) | (above < 1)  # distances take time, and most Gaussians are far above
+    close, off = WHOLE_HEAD.soft_cut_off_skin
+    on_skin = _smoothstep((off - _distances(centers[near], skin)) / (off - close))
     first, last = WHOLE_HEAD.soft_cut_head
-    on_head = _smoothstep((last - nearest) / (last - first))
-    return torch.maximum(_smoothstep(cut.margins(centers) / WHOLE_HEAD.soft_cut_width), on_head)
+    on_head = _smoothstep((last - _distances(centers[near], head)) / (last - first))
+    shares[near] = torch.maximum(shares[near] * torch.maximum(on_skin, above[near]), on_head)
+    return shares
+
+
+def _distances(centers: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) -> Float[Tensor, " n"]:
+    """The distance of each centre to the nearest point."""
+    return torch.cat([torch.cdist(part, points).amin(1) for part in centers.split(_PART)])
 
 
 def _smoothstep(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
