@@ -3,6 +3,7 @@
 import base64
 import gzip
 import json
+import math
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -140,7 +141,8 @@ def test_a_hundred_thousand_are_posed_and_sorted_in_time(built: Path, tmp_path: 
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
-    return float(-10 * np.log10(np.square(first.clip(0, 1) - second.clip(0, 1), dtype=np.float64).mean()))
+    error = np.square(first.clip(0, 1) - second.clip(0, 1), dtype=np.float64).mean()
+    return float(-10 * np.log10(error)) if error > 0 else math.inf  # the two back ends may draw the same bytes
 
 
 POSE = """(async () => {
