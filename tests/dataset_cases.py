@@ -162,13 +162,13 @@ def another_flame(scene: Scene, folder: Path) -> FaceModel:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case."""
+    """The outcome of a case."""
 
     fault: str
     complaint: str
     """The line that refused the dataset; nothing if it was imported."""
     wrong: str
-    """What must not be, in words; nothing if all is right."""
+    """The fault of the importer in words, or an empty text if there is none."""
     seconds: float
 
 

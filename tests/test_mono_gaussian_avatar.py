@@ -404,7 +404,7 @@ def test_nearest_vertices_on_a_cpu_take_no_distances_of_all_pairs(monkeypatch: p
 
 
 def test_nearest_vertices_of_many_points_take_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there is no tree, as on a GPU, points are looked at in parts."""
+    """Points are looked at in parts where there is no tree, as on a GPU."""
     random = torch.Generator().manual_seed(0)
     points, vertices = (torch.randn(n, 3, generator=random, dtype=torch.float64) for n in (1000, 50))
     monkeypatch.setattr(motion, "_POINTS_AT_ONCE", 64)

@@ -96,7 +96,7 @@ def browse(
 
 
 def violations(page: Path, size: tuple[int, int], device: Sequence[str] = (), first: str = "") -> list[list[str]]:
-    """What axe-core finds in a page with all its parts unfolded: each rule, and the first element that breaks it.
+    """Return what axe-core finds in a page with all parts unfolded: each rule, and the first element that breaks it.
 
     `first` is JavaScript that runs before.
     """

@@ -160,7 +160,7 @@ class Command:
 
     @property
     def _output(self) -> Path:
-        """What is written: --out, or a sheet in the run's folder."""
+        """Return the path to write: --out, or that of a sheet in the run's folder."""
         if self.out is not None:
             return self.out
         if self.sheet == "none" or self._is_file():

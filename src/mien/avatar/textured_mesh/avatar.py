@@ -49,7 +49,7 @@ _MILLIMETRE = 1e-3
 
 
 class _AtRest(NamedTuple):
-    """What does not depend on the face."""
+    """The part of a posed mesh that is the same for all faces."""
 
     offsets: Float[Tensor, "v 3"]
     vertex_albedo: Float[Tensor, "v 3"]
@@ -153,7 +153,7 @@ class TexturedMesh(Avatar):
         )
 
     def _rest(self) -> _AtRest:
-        """What does not depend on the face. Between steps of a training, it is computed once."""
+        """Return the part that is the same for all faces. Outside of training, it is computed once."""
         if self.training or torch.is_grad_enabled():
             return self._compute_rest()
         return self._kept.of([*self.parameters(), *self.store.buffers()], self._compute_rest)
