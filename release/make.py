@@ -8,7 +8,6 @@ wheels are those of this machine's Pythons, and the page says so.
 
 import argparse
 import hashlib
-import io
 import os
 import re
 import shutil
@@ -81,7 +80,7 @@ def make_sdist(out: Path) -> None:
     """
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "source"
-        copy_commit(source)
+        copy_tracked(source)
         run("uv", "build", "--sdist", "--out-dir", str(out), str(source))
     for path in out.glob("*.tar.gz"):
         if path.stat().st_size > MOST_SDIST_BYTES:
@@ -89,15 +88,18 @@ def make_sdist(out: Path) -> None:
     (out / ".gitignore").unlink(missing_ok=True)
 
 
-def copy_commit(folder: Path) -> None:
-    """Copy the files that git knows into a new folder, as the last commit has them, with changes since then."""
-    folder.mkdir(parents=True)
-    commit = told("git", "stash", "create") or "HEAD"
-    archive = subprocess.run(
-        ["git", "archive", "--format=tar", commit], cwd=ROOT, check=True, capture_output=True
-    ).stdout
-    with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
-        tar.extractall(folder, filter="data")
+def copy_tracked(folder: Path) -> None:
+    """Copy the files that git tracks into a new folder, as the checkout has them.
+
+    It only reads, because the index may be locked by another git. Modes are 644 or 755, whatever the umask was.
+    """
+    for name in filter(None, told("git", "ls-files", "-z").split("\0")):
+        source, target = ROOT / name, folder / name
+        if not source.is_file():
+            continue  # Deleted since the last commit, which `--dirty` allows.
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, target)
+        target.chmod(0o755 if source.stat().st_mode & 0o100 else 0o644)
 
 
 def make_wheels(out: Path, pythons: Sequence[str]) -> None:

@@ -56,10 +56,11 @@ def test_the_changelog_has_the_version_of_the_package(tmp_path: Path) -> None:
 
 def test_the_source_has_what_git_knows_alone(tmp_path: Path) -> None:
     """Wheels take MediaPipe's code for pages from the checkout. With it, the sdist would be too large."""
-    make.copy_commit(tmp_path / "source")
+    make.copy_tracked(tmp_path / "source")
     copied = {path.relative_to(tmp_path / "source").as_posix() for path in (tmp_path / "source").rglob("*")}
     assert {"pyproject.toml", "src/mien/export/landmarker/face_landmarker.task"} <= copied
     assert not [name for name in copied if "/vision_" in name or name.startswith("build/")]
+    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "source").rglob("*.py")} == {0o644}
 
 
 def test_a_folder_with_files_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
