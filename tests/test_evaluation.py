@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from evaluation_case import make_experiment
+from evaluation_case import drawn_sequence, make_experiment
 from mien.avatar import DEFAULT_METHOD
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
@@ -18,6 +18,7 @@ from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_f
 from mien.evaluation.report import RunRecord, report_html
 from mien.evaluation.report_sections import spans
 from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
+from mien.gaussians import sh_from_rgb
 from mien.perceptual import load_perceptual
 from mien.plots import Axes, Series, line_chart
 from mien.tracking.tracking import PARTS
@@ -56,6 +57,32 @@ def test_the_truth_at_soft_edges_is_the_person_without_the_wall(experiment: Expe
     )
     assert held > 0.1
     assert left < 0.35 * held
+
+
+def test_an_avatar_that_white_shines_through_is_told_over_dark_blue() -> None:
+    """The person is white. The avatar of half the opacity looks the same over white, and worse over dark blue."""
+    experiment = replace(make_experiment(), edges="cleaned")
+    sequence, store = experiment.sequences[0], experiment.avatar.gaussian_store()
+    with torch.no_grad():
+        store["sh_constant"].copy_(sh_from_rgb(torch.ones(len(store["sh_constant"]), 3))[:, None])
+    white = drawn_sequence(experiment.avatar, sequence.tracking.face, experiment.camera(experiment.held_out_frames[0]))
+    scoring = replace(experiment.scorings[0], masks=white.capture.mattes)
+    experiment = replace(experiment, sequences=(white,), scorings=(scoring,))
+    quick = EvaluationSettings(perceptual=False, baselines=False)
+    solid = protocol_content(experiment, evaluate_frames(experiment, quick), quick)
+    with torch.no_grad():
+        store["opacity_logits"].fill_(-1.0)
+    thin = protocol_content(experiment, evaluate_frames(experiment, quick), quick)
+    assert min(solid["psnr"], solid["over_dark"]["psnr"], thin["psnr"]) > 40
+    assert thin["over_dark"]["psnr"] < 30
+    assert thin["over_dark"]["head"]["psnr"] < 30
+
+
+def test_only_the_colors_of_the_person_alone_are_shown_over_dark_blue(experiment: Experiment) -> None:
+    quick = EvaluationSettings(perceptual=False, baselines=False)
+    assert not quick.over_dark(replace(experiment, edges="filmed"))
+    assert not replace(quick, protocol="insta").over_dark(replace(experiment, edges="cleaned"))
+    assert "over_dark" not in evaluate_frames(replace(experiment, edges="filmed"), quick).scores
 
 
 def test_the_box_of_some_frames_holds_their_crops_with_a_margin(experiment: Experiment) -> None:

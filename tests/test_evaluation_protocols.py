@@ -196,7 +196,9 @@ def test_comparison_ranks_runs_of_the_same_frames(scored: dict[str, dict], root:
     assert re.sub(r"\x1b\[\d*m", "", text) == plain
     lines = [line for line in plain.splitlines() if "." in line and "held-out" not in line]
     assert len({line.index(".") for line in lines}) == 1, "columns must line up"
-    assert [line.split("  ")[0] for line in lines] == ["short", "longer", "mean training picture", "coloured mesh"]
+    names = [line.split("  ")[0] for line in lines]
+    assert names == ["short", "longer", "short", "longer", "mean training picture", "coloured mesh"]
+    assert ["over dark blue" in line for line in lines] == [False, False, True, True, False, False]
 
 
 @pytest.mark.parametrize("other_in", ["mask", "edges"])

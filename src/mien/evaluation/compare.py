@@ -6,7 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from mien.errors import UserError
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, FITTED_NAME, figure, read_figures
+from mien.evaluation.metrics_file import (
+    BASELINE_NAMES,
+    COLUMNS,
+    FACE_SOURCE_NAMES,
+    FITTED_NAME,
+    OVER_DARK_NAME,
+    figure,
+    read_figures,
+)
 from mien.training import read_run_config
 
 
@@ -183,6 +191,11 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
         entry = run.metrics["protocols"][protocol]
         if entry["face_params"] != "as_tracked":
             rows.append(Row(run.label, entry["as_tracked"], None, FACE_SOURCE_NAMES["as_tracked"]))
+    for run in runs:
+        entry = run.metrics["protocols"][protocol]
+        if "over_dark" in entry:
+            faces = f"{FACE_SOURCE_NAMES[entry['face_params']]}, {OVER_DARK_NAME}"
+            rows.append(Row(run.label, entry["over_dark"], None, faces))
     for run in runs:
         entry = run.metrics["protocols"][protocol]
         if "fitted" in entry:

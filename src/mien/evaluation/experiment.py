@@ -27,6 +27,9 @@ Edges = Literal["cleaned", "filmed"]
 """Colours of the truth where the matte is soft: those of the person alone (`foreground_colors`), or as filmed, with
 a share of the background behind the person."""
 
+WHITE, DARK = (255, 255, 255), (26, 32, 80)
+"""Backgrounds of scored pictures, 0 to 255. An avatar that lets a white background through where the person is light
+or thin, as hair is, looks right over white alone. Dark blue shows it."""
 _HEAD_MARGIN = 0.05
 
 
@@ -92,15 +95,17 @@ def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:
     return int(left) - margin, int(top) - margin, int(right - left) + 2 * margin, int(bottom - top) + 2 * margin
 
 
-def target_image(experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
-    """The target of a rendering, at 8 bits: the person inside the frozen scoring mask or the matte, over white."""
+def target_image(
+    experiment: Experiment, frame: Frame, background: tuple[int, int, int] = WHITE
+) -> Float[Tensor, "h w 3"]:
+    """The target of a rendering, at 8 bits: the person inside the frozen scoring mask or the matte, over a colour."""
     capture = experiment.sequences[frame.sequence].capture
     picture = np.asarray(capture.images[frame[1:]])
     if experiment.edges == "cleaned":
         picture = foreground_colors(picture, np.asarray(capture.mattes[frame[1:]]))
     masks = capture.mattes if experiment.whole_mattes else experiment.scorings[frame.sequence].masks
     mask = np.asarray(masks[frame[1:]])
-    return torch.from_numpy(composite(picture, mask, np.full(3, 255, np.uint8))).float() / 255
+    return torch.from_numpy(composite(picture, mask, np.array(background, np.uint8))).float() / 255
 
 
 def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[str, str]]:
@@ -111,19 +116,25 @@ def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[st
 
 
 @torch.no_grad()
-def avatar_image(experiment: Experiment, frame: Frame, face: FaceParams | None = None) -> Float[Tensor, "h w 3"]:
-    """The avatar posed and seen as in a frame, over white, clamped to 0..1.
+def avatar_image(
+    experiment: Experiment,
+    frame: Frame,
+    face: FaceParams | None = None,
+    background: tuple[int, int, int] = WHITE,
+) -> Float[Tensor, "h w 3"]:
+    """The avatar posed and seen as in a frame, over a colour, clamped to 0..1.
 
     Args:
         experiment: The experiment.
         frame: The frame.
         face: Face parameters that pose the avatar instead of the experiment's.
+        background: The colour, 0 to 255.
 
     Raises:
         UserError: the avatar or the face parameters give Gaussians that are not finite.
     """
     gaussians = experiment.avatar.pose(experiment.face(frame) if face is None else face).gaussians.timestep(0)
-    white = torch.ones(3).to(gaussians.means)
+    color = (torch.tensor(background) / 255).to(gaussians.means)
     with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
-        image = rasterize(gaussians, experiment.camera(frame), white).image.clamp(0, 1)
+        image = rasterize(gaussians, experiment.camera(frame), color).image.clamp(0, 1)
     return close_holes(image, experiment.avatar.extras.closing).cpu()

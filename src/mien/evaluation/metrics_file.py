@@ -26,6 +26,8 @@ FACE_SOURCE_NAMES = {"corrected": "corrected", "as_tracked": "as tracked"}
 """Names for the source of held-out face parameters: tracking with corrections from training, or tracking alone."""
 FITTED_NAME = "fitted to the scored pictures"
 """Name for face parameters that were fitted to the held-out frames themselves. They are never the headline."""
+OVER_DARK_NAME = "over dark blue"
+"""Name for figures over a dark background. The others are over white."""
 _DRIVEN = ("expression_error", "expression_error_still", "head_rotation_error_degrees",
            "head_rotation_error_still_degrees", "faces_found")  # fmt: skip
 _MAX_FIGURE = 1e12
@@ -86,7 +88,7 @@ def _check_protocol(entry: Mapping[str, Any]) -> None:
         _number(entry, "covered_frames", whole=True)
     if entry["face_params"] != "as_tracked":
         _check_row(entry["as_tracked"])
-    for name in ("fitted", "opened", "without_clothes"):
+    for name in ("over_dark", "fitted", "opened", "without_clothes"):
         if name in entry:
             _check_row(entry[name])
     for name, row in entry["baselines"].items():

@@ -23,6 +23,10 @@ GLOSSARY = {
         "those of the person, estimated from what is solid nearby. With `mien evaluate --edges filmed`, which tables "
         "then name, they are the filmed ones, which hold some of the background."
     ),
+    "Over dark blue": (
+        "The same frames and faces over a dark background. An avatar can look right over white because it lets white "
+        "through, at light skin and thin hair. Over other backgrounds it then has holes, and these figures fall."
+    ),
     "Whole frame, head crop": (
         "A white background raises the PSNR of the whole frame by several dB, so compare clips by their head crops. "
         "The head crop is the box of the mask."

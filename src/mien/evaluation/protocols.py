@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
-from mien.evaluation.experiment import Edges, Experiment, avatar_image, scored_on, target_image
+from mien.evaluation.experiment import DARK, Edges, Experiment, avatar_image, scored_on, target_image
 from mien.evaluation.fitting import LOSS, FittedFaces
 from mien.evaluation.metrics import Border, psnr
 from mien.evaluation.partial import PartialScores
@@ -38,7 +38,7 @@ from mien.ranges import Range
 from mien.training.footage import Frame, spread_frames
 
 AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"
-OPENED, UNCLOTHED = "opened", "without_clothes"
+OPENED, UNCLOTHED, OVER_DARK = "opened", "without_clothes", "over_dark"
 _MAX_TRAINING_FRAMES = 200
 _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "ssim", "l1")}
 """Figures that every frame has."""
@@ -75,6 +75,13 @@ class EvaluationSettings(ScoreSettings):
         """Whether drawings are scored eroded and dilated as well, and without clothes."""
         return self.protocol is not None and dataset_protocol(self.protocol).opened
 
+    def over_dark(self, experiment: Experiment) -> bool:
+        """Whether the avatar is scored over a dark background as well. Datasets have none, and holes close over white.
+
+        Only the colours of the person alone can be shown over another background than the filmed one.
+        """
+        return self.protocol is None and experiment.edges == "cleaned" and not experiment.avatar.extras.closing
+
     @property
     def border(self) -> Border:
         """Windows of SSIM at the border of a picture."""
@@ -88,8 +95,8 @@ class Evaluation:
     frames: tuple[Frame, ...]
     scores: dict[str, tuple[Scores, ...]]
     """Figures by subject, with one entry per frame: `avatar`; `as_tracked`, if the avatar's faces are corrected;
-    `fitted`, if asked for; `opened` and `without_clothes`, if the protocol has them; and, with baselines, `mean_frame`
-    and `mesh`."""
+    `fitted`, if asked for; `over_dark`, the avatar over dark blue; `opened` and `without_clothes`, if the protocol has
+    them; and, with baselines, `mean_frame` and `mesh`."""
     seconds_per_frame: float
     """Median time to pose and render the avatar."""
     baselines: Baselines | None
@@ -119,6 +126,7 @@ def evaluate_frames(
     subjects |= {FITTED} if settings.fit_faces else set()
     subjects |= {MEAN_FRAME, MESH} if settings.baselines else set()
     subjects |= {OPENED} if settings.opened else set()
+    subjects |= {OVER_DARK} if settings.over_dark(experiment) else set()
     kept = partial.read() if partial is not None else {}
     done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
     metric, lpips = perceptual_metric(settings), lpips_metric(settings)
@@ -130,18 +138,21 @@ def evaluate_frames(
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
         frame, drawn, seconds = job
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
+        dark = {name: pictures.pop(name) for name in (OVER_DARK,) if name in pictures}
         truth, crop = target_image(experiment, frame), experiment.crop(frame)
         judges = (metric, lpips) if frame in judged else (None, None)
         parts, border = experiment.parts(frame), settings.border
         clothes = experiment.clothes_of(frame) if OPENED in pictures else None
         scores = score_pictures(pictures, truth, crop, judges[0], parts, judges[1], border)
+        if dark:
+            scores |= score_pictures(dark, target_image(experiment, frame, DARK), crop, None)
         if clothes is not None:
             bare = {UNCLOTHED: without(pictures[OPENED], clothes)}
             scores |= score_pictures(bare, without(truth, clothes), crop, judges[0], parts, judges[1], border)
         return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
-        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], baselines, fitted, settings.opened)
+        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], subjects, baselines, fitted)
         for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:
@@ -160,7 +171,11 @@ def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
 
 
 def _drawn(
-    experiment: Experiment, frames: list[Frame], baselines: Baselines | None, fitted: FittedFaces | None, opens: bool
+    experiment: Experiment,
+    frames: list[Frame],
+    subjects: set[str],
+    baselines: Baselines | None,
+    fitted: FittedFaces | None,
 ) -> Iterator[tuple[Frame, dict[str, Tensor], float]]:
     """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar."""
     as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
@@ -172,7 +187,9 @@ def _drawn(
             drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
         if fitted is not None:
             drawn[FITTED] = avatar_image(experiment, frame, fitted.face(frame))
-        if opens:
+        if OVER_DARK in subjects:
+            drawn[OVER_DARK] = avatar_image(experiment, frame, background=DARK)
+        if OPENED in subjects:
             drawn[OPENED] = opened(drawn[AVATAR] if fitted is None else drawn[FITTED])
         if baselines is not None:
             drawn[MEAN_FRAME] = baselines.mean_frame_image(experiment, frame)
@@ -246,6 +263,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "training_frames": _training_means(evaluation),
         "baselines": {name: mean_scores(scores[name]) for name in (MEAN_FRAME, MESH) if name in scores},
         "as_tracked": mean_scores(scores.get(AS_TRACKED, own_rows)),
+        **({OVER_DARK: {**mean_scores(scores[OVER_DARK]), "color": list(DARK)}} if OVER_DARK in scores else {}),
         **_fitted_content(scores, settings),
         **{
             name: {**mean_scores(scores[name]), "frames": len(scores[name])}

@@ -14,7 +14,7 @@ from mien import runtime
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FITTED_NAME, PART_NAMES, figure
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FITTED_NAME, OVER_DARK_NAME, PART_NAMES, figure
 from mien.evaluation.page import (
     FITTED_GLOSSARY,
     GLOSSARY,
@@ -40,6 +40,7 @@ _TITLES = {
 _ROWS = {
     "avatar": "Avatar",
     "as_tracked": "Avatar, faces as tracked",
+    "over_dark": f"Avatar, {OVER_DARK_NAME}",
     "fitted": f"Avatar, faces {FITTED_NAME}",
     **{key: BASELINE_NAMES[key].capitalize() for key in ("mesh", "mean_frame")},
 }
@@ -153,8 +154,8 @@ def _tables(protocols: Mapping[str, Any]) -> list[DataTable]:
     tables = []
     for name, entry in protocols.items():
         corrected = {} if entry["face_params"] == "as_tracked" else {"as_tracked": entry["as_tracked"]}
-        fitted = {"fitted": entry["fitted"]} if "fitted" in entry else {}
-        subjects = {"avatar": entry, **corrected, **fitted, **entry["baselines"]}
+        further = {name: entry[name] for name in ("over_dark", "fitted") if name in entry}
+        subjects = {"avatar": entry, **corrected, **further, **entry["baselines"]}
         caption = (
             f"{_TITLES.get(name, name)} · {entry['frames']} held-out frames ({entry['split']}) · face parameters "
             f"{entry['face_params'].replace('_', ' ')} · PSNR on training frames: "
@@ -179,7 +180,8 @@ def _parts_table(subjects: Mapping[str, Any], parts: Sequence[str]) -> DataTable
     """Every metric on the crops of eyes and mouth."""
     groups = [Cell(PART_NAMES[part], "group head", len(COLUMNS)) for part in parts]
     head = [[Cell("", "blank"), *groups], [Cell(""), *metric_headings(len(parts))]]
-    rows = [[Cell(label), *_part_cells(subjects[key], parts)] for key, label in _ROWS.items() if key in subjects]
+    shown = [key for key in _ROWS if key in subjects and any(part in subjects[key] for part in parts)]
+    rows = [[Cell(_ROWS[key]), *_part_cells(subjects[key], parts)] for key in shown]
     return DataTable(head, rows, "Crops of eyes and mouth, in the frames that show them", own=True)
 
 

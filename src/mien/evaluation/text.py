@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mien.evaluation.compare import Comparison, Row, Table
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, FITTED_NAME, figure
+from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, FITTED_NAME, OVER_DARK_NAME, figure
 from mien.terminal import printable
 
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
@@ -19,6 +19,8 @@ def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
     text = f"{name} ({entry['split']}, {entry['frames']} frames): PSNR {_both(entry)}, faces {faces}"
     if entry["face_params"] != "as_tracked":
         text += f" ({_both(entry['as_tracked'])}, faces {FACE_SOURCE_NAMES['as_tracked']})"
+    if "over_dark" in entry:
+        text += f" ({_both(entry['over_dark'])}, {OVER_DARK_NAME})"
     if "fitted" in entry:
         text += f" ({_both(entry['fitted'])}, faces {FITTED_NAME})"
     for key, baseline in entry["baselines"].items():
