@@ -234,7 +234,7 @@ def test_compare_command(scored: dict[str, dict], root: Path, capsys: pytest.Cap
     printed = json.loads(capsys.readouterr().out)
     assert (printed["format"], printed["version"]) == ("mien.comparison", 1)
     tables = {(table["protocol"], len(table["rows"])) for table in printed["tables"]}
-    assert ("novel_view", 3) in tables
+    assert ("novel_view", 4) in tables
     page = (root / "compare.html").read_text()
     assert "http" not in page
     shown = sum(len({row["run"] for row in t["rows"] if "run" in row}) for t in printed["tables"])
@@ -250,10 +250,11 @@ def test_closing_line_says_what_each_figure_is_of(
     assert main(arguments) == 0
     err = capsys.readouterr().err
     entry = scored["held"]["protocols"]["novel_view"]
-    mesh = entry["baselines"]["mesh"]
+    mesh, dark = entry["baselines"]["mesh"], entry["over_dark"]
     assert (
         f"novel_view (cameras, 40 frames): PSNR {entry['psnr']:.2f} dB whole frame / {entry['head']['psnr']:.2f} dB "
-        "head crop, faces as tracked; mean training picture"
+        f"head crop, faces as tracked ({dark['psnr']:.2f} dB whole frame / {dark['head']['psnr']:.2f} dB head crop, "
+        "over dark blue); mean training picture"
     ) in err
     assert f"coloured mesh {mesh['psnr']:.2f} dB whole frame / {mesh['head']['psnr']:.2f} dB head crop" in err
 
