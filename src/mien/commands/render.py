@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -209,14 +209,18 @@ class Command:
     def _file_path(
         self, camera: "mien.runtime.Camera", center: "numpy.ndarray", frames: int
     ) -> "list[mien.runtime.Camera]":
-        from mien.runtime.camera_paths import sway, turntable
+        from mien.runtime import camera_paths
 
+        return self._moved(camera_paths, camera, center, frames)
+
+    def _moved(self, paths: Any, camera: Any, center: Any, frames: int) -> list[Any]:
+        """The cameras of --path, by the module that moves cameras of this type."""
         span, tilt = math.radians(self.span), math.radians(self.tilt)
         if self.path == "still" or self._is_still():
             return [camera] * frames
         if self.path == "turntable":
-            return turntable(camera, center, frames, span)
-        return sway(camera, center, frames, span, tilt, crossing=self.path == "sway")
+            return paths.turntable(camera, center, frames, span)
+        return paths.sway(camera, center, frames, span, tilt, crossing=self.path == "sway")
 
     def _camera(self, run_dir: Path, subject: "mien.face.FaceParams") -> "mien.camera.Camera":
         """The run's first camera, moved by --yaw, --pitch and --zoom."""
@@ -345,11 +349,6 @@ class Command:
         return cameras if timesteps is None else [cameras[i * len(cameras) // timesteps] for i in range(timesteps)]
 
     def _path(self, camera: "mien.camera.Camera", center: "torch.Tensor", frames: int) -> "list[mien.camera.Camera]":
-        from mien.render.camera_paths import sway, turntable
+        from mien.render import camera_paths
 
-        span, tilt = math.radians(self.span), math.radians(self.tilt)
-        if self.path == "still" or self._is_still():
-            return [camera] * frames
-        if self.path == "turntable":
-            return turntable(camera, center, frames, span)
-        return sway(camera, center, frames, span, tilt, crossing=self.path == "sway")
+        return self._moved(camera_paths, camera, center, frames)
