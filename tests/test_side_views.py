@@ -163,10 +163,8 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
     assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
 
 
-@pytest.mark.parametrize(("filled", "expected"), [(True, "mixed"), (False, "white")])
-def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> None:
-    assert resolved(TrainSettings(background="auto"), filled=filled).background == expected
-    assert resolved(TrainSettings(background="white"), filled=filled).background == "white"
+@pytest.mark.parametrize("filled", [True, False])
+def test_edges_follow_the_sides(filled: bool) -> None:
     assert resolved(TrainSettings(edges="auto"), filled=filled).edges == ("cleaned" if filled else "filmed")
     assert resolved(TrainSettings(edges="cleaned"), filled=filled).edges == "cleaned"
 
@@ -174,11 +172,11 @@ def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> N
 @pytest.mark.parametrize(
     ("method", "background", "unseen", "white"),
     [
-        ("gaussian_avatars", "auto", "auto", False),
-        ("gaussian_avatars", "auto", "trained", True),
-        ("gaussian_avatars", "white", "auto", True),
+        ("gaussian_avatars", "white", "auto", False),
+        ("gaussian_avatars", "white", "trained", True),
         ("gaussian_avatars", "random", "trained", False),
-        ("headgas", "auto", "auto", True),
+        ("headgas", "white", "auto", True),
+        ("headgas", "random", "auto", False),
     ],
 )
 def test_transparent_pictures_warn_of_white_only_where_it_was(method, background, unseen, white, tmp_path, monkeypatch):
