@@ -65,6 +65,7 @@ function addMotion(viewer: Viewer, moveSliders: () => void, stop: () => void): v
       say(`${given.name} ${error instanceof AvatarError ? error.message : "cannot be read"}. Give a csv of Live Link Face, or blend shapes as json.`);
     }
   };
+  on(find("open"), "click", () => file.click());
   on(file, "change", () => open(file.files?.[0]));
   on(window, "dragover", (event) => event.preventDefault());
   on(window, "drop", (event) => {
@@ -80,10 +81,11 @@ function addRest(viewer: Viewer, alive: Alive): void {
     viewer.reset();
     viewer.onMotion();
   });
-  const background = find<HTMLSelectElement>("background"), { classList } = document.documentElement, more = find("more"), full = find("full");
-  on(background, "change", () => {
-    const grey = { white: 1, black: 0 }[background.value];
-    viewer.background = grey === undefined ? [0, 0, 0, 0] : [grey, grey, grey, 1];
+  const { classList } = document.documentElement, more = find("more"), full = find("full");
+  // Around: the page's own light, white, black.
+  on(find("background"), "click", () => {
+    const [grey, , , opaque] = viewer.background, next = opaque ? 0 : 1;
+    viewer.background = [next, next, next, opaque && !grey ? 0 : 1];
     viewer.look();
   });
   // NAME.html#transparent shows the head alone, for a frame in another page.
@@ -121,6 +123,7 @@ async function open(): Promise<Viewer> {
   addRest(viewer, alive);
   new ResizeObserver(() => fit(viewer)).observe(viewer.canvas);
   fit(viewer);
+  find("hint").hidden = false;
   return viewer;
 }
 
