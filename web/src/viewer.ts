@@ -9,8 +9,8 @@ import { DepthSorter } from "./sort";
 
 /** Turns beyond this would show the head upside down, in radians. */
 const MOST_PITCH = 1.4;
-/** Half of a head's width and depth, with hair beyond the points. */
-const HAIR = 0.55;
+/** Half of a head's width and depth, with room for hair and for a head that moves. */
+const HAIR = 0.65;
 
 /** A camera of another 3D program: column-major matrices as OpenGL has them. */
 export interface Matrices {
