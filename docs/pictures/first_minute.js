@@ -14,6 +14,7 @@ function covered(viewer) {
 const strayed = ({ avatar, face }) => Math.max(...face.expression.map((value, k) => Math.abs(value - avatar.neutral.expression[k])));
 
 window.walk = {
+  wait,
   /** Waits for the first picture, and says after how many seconds it came. */
   async first() {
     const viewer = await mien;
@@ -51,6 +52,12 @@ window.walk = {
     let moved = 0;
     for (const end = performance.now() + milliseconds; performance.now() < end; await wait(50)) moved = Math.max(moved, strayed(viewer));
     return { state: camera.state, seconds, moved };
+  },
+  /** Presses "Be me" where the camera is not allowed. */
+  async denied() {
+    const camera = await webcam, told = document.getElementById("camera-state");
+    document.getElementById("camera").click();
+    while (!told.textContent || camera.state !== "off") await wait(50);
   },
   /** Waits for the avatar of an element. */
   async element() {

@@ -29,6 +29,7 @@ from mien.cli import main
 from mien.commands.stages.sheets import named_picture
 from mien.commands.stages.showing import PAGE, show_avatar
 from mien.pictures import picture_grid
+from mien.tracking import read_tracking
 from mien.workspace import open_workspace
 
 HERE = Path(__file__).parent
@@ -38,6 +39,8 @@ SCREENS = {"desktop": (1280, 800, 1), "phone": (390, 844, 2), "landscape": (844,
 THEMES = ("light", "dark")
 CAMERA_FPS, CAMERA_SIDE = 5, 480
 """Pictures per second of the camera, of which software WebGL leaves the detector four to eight, and their side."""
+STILL = 5 * CAMERA_FPS
+"""Pictures at its beginning in which nothing moves. Some pass before the page looks at them."""
 LEAST_HEAD, LEAST_MOVE = 0.04, 0.1
 """Least share of a picture that a head covers, and least change of a coefficient that counts as a face."""
 TILE, COLUMNS = 400, 4
@@ -104,34 +107,45 @@ def living_page(made: Walk, workspace: Path) -> None:
     opened = open_workspace(workspace)
     with made.step(f"the end of mien create: {PAGE}"):
         show_avatar(opened, opened.run_names()[0])
+    for screen in SCREENS:
+        for theme in THEMES:
+            look_at_page(made, workspace / PAGE, screen, theme)
+
+
+def look_at_page(made: Walk, page: Path, screen: str, theme: str) -> None:
+    """Open a page, press its faces, and open what is behind "More".
+
+    Raises:
+        WalkError: there is no head, or a face does not come.
+    """
     scripts = {"first": "walk.first()", "after_3_s": "walk.later(3000)"}
     scripts |= {name.lower(): f"walk.face('{name}')" for name in FACES}
     scripts |= {"more": "walk.more()", "more_mouth": "walk.more('Mouth')"}
-    for screen in SCREENS:
-        for theme in THEMES:
-            name = f"page_{screen}_{theme}"
-            told = shoot(made, workspace / PAGE, name, scripts, screen, theme)
-            made.seconds[f"{name}: first picture"] = round(told["first"]["seconds"], 1)
-            for state in ("first", "after_3_s"):
-                expect(told[state]["covered"] >= LEAST_HEAD, f"{name}: there is no head in the picture {state}")
-            for face in FACES:
-                expect(told[face.lower()]["moved"] >= LEAST_MOVE, f"{name}: the button {face} moves nothing")
+    name = f"page_{screen}_{theme}"
+    told = shoot(made, page, name, scripts, screen, theme)
+    made.seconds[f"{name}: first picture"] = round(told["first"]["seconds"], 1)
+    for state in ("first", "after_3_s"):
+        expect(told[state]["covered"] >= LEAST_HEAD, f"{name}: there is no head in the picture {state}")
+    for face in FACES:
+        expect(told[face.lower()]["moved"] >= LEAST_MOVE, f"{name}: the button {face} moves nothing")
 
 
 def be_me(made: Walk, workspace: Path) -> None:
     """The page that a face drives. The camera shows the drawn person's video."""
     page, camera = made.out / "be_me.html", made.out / "camera.y4m"
     made.command("export", workspace, "--webcam", "--out", page)
-    write_camera(next(iter(workspace.glob("synthetic-*.mp4"))), camera)
+    (sequence,) = open_workspace(workspace).tracked_names()
+    turns = read_tracking(open_workspace(workspace).sequence_dir(sequence) / "tracking").face.head_rotation
+    write_camera(next(iter(workspace.glob("synthetic-*.mp4"))), int(turns.norm(dim=-1).argmin()), camera)
     flags = ["--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={camera}"]
-    scripts = {"before": "walk.first()", "driven": "walk.beMe(4000)", "later": "walk.later(1700)", "more": "walk.more()"}
-    for screen, theme in (("desktop", "light"), ("phone", "light"), ("phone", "dark"), ("landscape", "light")):
+    scripts = {"before": "walk.first()", "driven": "walk.beMe(6000)", "later": "walk.later(2000)", "more": "walk.more()"}
+    for screen, theme in (("desktop", "dark"), ("phone", "light"), ("landscape", "light")):
         name = f"be_me_{screen}_{theme}"
         told = shoot(made, page, name, scripts, screen, theme, [*flags, "--use-fake-ui-for-media-stream"])
         made.seconds[f"{name}: driven"] = round(told["driven"]["seconds"], 1)
         expect(told["driven"]["state"] == "running", f"{name}: the camera is {told['driven']['state']}")
         expect(told["driven"]["moved"] >= LEAST_MOVE, f"{name}: the camera moves nothing")
-    shoot(made, page, "be_me_denied", {"": "walk.beMe(0)"} , "phone", "light", ["--deny-permission-prompts"])
+    shoot(made, page, "be_me_denied", {"": "walk.denied()"}, "phone", "light", ["--deny-permission-prompts"])
 
 
 def report(made: Walk, workspace: Path) -> None:
@@ -139,7 +153,7 @@ def report(made: Walk, workspace: Path) -> None:
     opened = open_workspace(workspace)
     page = opened.run_dir(opened.run_names()[0]) / "report.html"
     for screen, theme in (("desktop", "light"), ("phone", "light"), ("phone", "dark")):
-        shoot(made, page, f"report_{screen}_{theme}", {"": "new Promise((done) => setTimeout(done, 1500))"}, screen, theme, whole=True)
+        shoot(made, page, f"report_{screen}_{theme}", {"": "walk.wait(1500)"}, screen, theme, whole=True)
 
 
 def viewer(made: Walk, workspace: Path) -> None:
@@ -212,7 +226,7 @@ def shoot(
         WalkError: the page asks for anything outside of its folder, or writes a message.
     """
     width, height, scale = SCREENS[screen]
-    given = {"width": width, "height": height, "scale": scale, "whole": whole, "flags": list(flags), "lively": True}
+    given = {"width": width, "height": height, "scale": 1 if whole else scale, "whole": whole, "flags": list(flags), "lively": True}
     given |= {"dark": theme == "dark", "touch": screen != "desktop", "scripts": list(scripts.values())}
     given |= {"screenshots": [made.picture("_".join(filter(None, (name, state)))) for state in scripts]}
     told = node("browser.mjs", str(page), given | {"opening": (HERE / "first_minute.js").read_text(encoding="utf-8")})
@@ -243,18 +257,23 @@ def served(folder: Path) -> Iterator[str]:
         server.shutdown()
 
 
-def write_camera(video: Path, path: Path) -> None:
-    """Write a video as Chromium's fake camera takes it: .y4m, square, with few pictures a second."""
-    reader = cv2.VideoCapture(str(video))
+def write_camera(video: Path, straight: int, path: Path) -> None:
+    """Write a video as Chromium's fake camera takes it: .y4m, square, with few pictures a second.
+
+    It begins with some still seconds of the frame `straight`, since a page takes its first second as the face at rest.
+    """
+    reader, frames = cv2.VideoCapture(str(video)), []
+    while True:
+        read, picture = reader.read()
+        if not read:
+            break
+        small = cv2.resize(picture, (CAMERA_SIDE, CAMERA_SIDE), interpolation=cv2.INTER_AREA)
+        frames.append(cv2.cvtColor(small, cv2.COLOR_BGR2YUV_I420))
     every = max(1, round(reader.get(cv2.CAP_PROP_FPS) / CAMERA_FPS))
     with path.open("wb") as file:
         file.write(f"YUV4MPEG2 W{CAMERA_SIDE} H{CAMERA_SIDE} F{CAMERA_FPS}:1 Ip A1:1 C420jpeg\n".encode())
-        index, (read, picture) = 0, reader.read()
-        while read:
-            if index % every == 0:
-                small = cv2.resize(picture, (CAMERA_SIDE, CAMERA_SIDE), interpolation=cv2.INTER_AREA)
-                file.write(b"FRAME\n" + cv2.cvtColor(small, cv2.COLOR_BGR2YUV_I420).tobytes())
-            index, (read, picture) = index + 1, reader.read()
+        for frame in [frames[straight]] * STILL + (frames[straight:] + frames[:straight])[::every]:
+            file.write(b"FRAME\n" + frame.tobytes())
 
 
 def write_sheet(made: Walk) -> None:

@@ -27,7 +27,10 @@ try {
   await tab.goto(hash ? `${address}#${hash}` : address);
   for (let i = 0; i < scripts.length; ++i) {
     results.push(await tab.evaluate(scripts[i]));
-    if (screenshots[i]) await tab.screenshot({ path: screenshots[i], fullPage: whole, timeout: 120000 });
+    if (!screenshots[i]) continue;
+    // Software WebGL has no larger pictures; below, Chromium would begin at the top again.
+    const clip = whole && { x: 0, y: 0, width, height: Math.min(8192, await tab.evaluate("document.documentElement.scrollHeight")) };
+    await tab.screenshot({ path: screenshots[i], fullPage: whole, timeout: 120000, ...(clip && { clip }) });
   }
   await Promise.all(files);
   console.log(JSON.stringify({ requests: requests.filter((url) => url !== address), messages, results }));
