@@ -138,7 +138,8 @@ def be_me(made: Walk, workspace: Path) -> None:
     turns = read_tracking(open_workspace(workspace).sequence_dir(sequence) / "tracking").face.head_rotation
     write_camera(next(iter(workspace.glob("synthetic-*.mp4"))), int(turns.norm(dim=-1).argmin()), camera)
     flags = ["--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={camera}"]
-    scripts = {"before": "walk.first()", "driven": "walk.beMe(6000)", "later": "walk.later(2000)", "more": "walk.more()"}
+    scripts = {"before": "walk.first()", "driven": "walk.beMe(6000)", "later": "walk.later(2000)"}
+    scripts["more"] = "walk.more()"
     for screen, theme in (("desktop", "dark"), ("phone", "light"), ("landscape", "light")):
         name = f"be_me_{screen}_{theme}"
         told = shoot(made, page, name, scripts, screen, theme, [*flags, "--use-fake-ui-for-media-stream"])
@@ -169,10 +170,13 @@ def viewer(made: Walk, workspace: Path) -> None:
             threading.Thread(target=process.stderr.read, daemon=True).start()
             for screen in ("desktop", "phone"):
                 shots = [made.picture(f"viewer_{screen}_{state}") for state in ("first", "later", "face")]
-                steps = [{"see": "mien"}, {"wait": 2000}, {"screenshot": shots[0]}, {"wait": 4000}, {"screenshot": shots[1]}]
-                face = [{"click": "Random face"}, {"wait": 3000}] if screen == "desktop" else [{"wait": 100}]
-                given = {"width": SCREENS[screen][0], "height": SCREENS[screen][1]}
-                told = node("view.mjs", address, given | {"steps": [*steps, *face, {"screenshot": shots[2]}]})
+                steps: list[dict[str, Any]] = [{"see": "mien"}, {"wait": 2000}, {"screenshot": shots[0]}]
+                steps += [{"wait": 4000}, {"screenshot": shots[1]}]
+                if screen == "desktop":  # on phones, the panel begins folded
+                    steps += [{"click": "Random face"}, {"wait": 3000}]
+                steps += [{"screenshot": shots[2]}]
+                width, height, _ = SCREENS[screen]
+                told = node("view.mjs", address, {"width": width, "height": height, "steps": steps})
                 expect(not told["errors"], f"viewer: {told['errors']}")
         finally:
             process.terminate()
@@ -202,9 +206,8 @@ def mesh(made: Walk, workspace: Path) -> None:
     options = ["--bundle", "--format=iife", "--global-name=mesh", f"--outfile={modules}"]
     environment = {"NODE_PATH": str(WEB / "node_modules"), "PATH": "/usr/bin:/bin"}
     subprocess.run([*esbuild, *options], check=True, capture_output=True, env=environment)
-    (site / "mesh.html").write_text(
-        '<!doctype html><link rel="icon" href="data:,"><body style="margin: 0"><script src="first_minute_mesh.js"></script>'
-    )
+    script = '<script src="first_minute_mesh.js"></script>'
+    (site / "mesh.html").write_text(f'<!doctype html><link rel="icon" href="data:,"><body style="margin: 0">{script}')
     with served(site) as address:
         told = shoot(made, f"{address}/mesh.html", "glb", {"": "mesh.start()"}, "desktop")
     expect(told[""]["morphs"] > 40, f"me.glb: has {told['']['morphs']} morph targets")
@@ -226,7 +229,8 @@ def shoot(
         WalkError: the page asks for anything outside of its folder, or writes a message.
     """
     width, height, scale = SCREENS[screen]
-    given = {"width": width, "height": height, "scale": 1 if whole else scale, "whole": whole, "flags": list(flags), "lively": True}
+    given: dict[str, Any] = {"width": width, "height": height, "scale": 1 if whole else scale, "whole": whole}
+    given |= {"flags": list(flags), "lively": True}
     given |= {"dark": theme == "dark", "touch": screen != "desktop", "scripts": list(scripts.values())}
     given |= {"screenshots": [made.picture("_".join(filter(None, (name, state)))) for state in scripts]}
     told = node("browser.mjs", str(page), given | {"opening": (HERE / "first_minute.js").read_text(encoding="utf-8")})
@@ -297,7 +301,9 @@ STEPS = {function.__name__: function for function in (living_page, be_me, report
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("workspace", type=Path, nargs="?", default=Path("out/demo"), help="made by `mien demo` if missing")
+    parser.add_argument(
+        "workspace", type=Path, nargs="?", default=Path("out/demo"), help="made by `mien demo` if missing"
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="*", choices=STEPS, default=[])
     chosen = parser.parse_args()
