@@ -91,6 +91,11 @@ def test_random_faces_differ_and_are_alike_on_both_sides() -> None:
         }
         assert 0 < len(moved) <= RANDOM_EXPRESSIONS
         assert face[NAMES.index("mouthSmileLeft")] == face[NAMES.index("mouthSmileRight")]
+        assert face[NAMES.index("eyeBlinkLeft")] == 0
+        for part in ("jaw", "mouth"):
+            assert min(face[NAMES.index(f"{part}{side}")] for side in ("Left", "Right")) == 0
+    aside = [NAMES.index(name) for name in ("jawLeft", "jawRight", "mouthLeft", "mouthRight")]
+    assert max(face[aside].max() for face in faces) > 0
 
 
 # The session.

@@ -173,8 +173,8 @@ REST = """(async () => {
 
 CLEAR = """(async () => {
   const viewer = await mien, background = document.getElementById("background");
-  background.value = "none";
-  background.dispatchEvent(new Event("change"));
+  background.click();  // from white to black
+  background.click();
   viewer.draw();
   return viewer.canvas.toDataURL("image/png");
 })()"""

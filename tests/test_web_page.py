@@ -199,6 +199,51 @@ def test_no_face_is_cut_off_on_a_phone(page: Path) -> None:
     assert browse(page, [OUTSIDE], size=(390, 844), device=["touch"])["results"] == [[]]
 
 
+COLUMNS = """(async () => {
+  const viewer = await mien, { canvas } = viewer;
+  return [-1.2, 0, 1.2].map((yaw) => {
+    viewer.yaw = yaw;
+    viewer.draw();
+    const { width, height } = canvas, copy = new OffscreenCanvas(width, height).getContext("2d");
+    copy.drawImage(canvas, 0, 0);
+    const { data } = copy.getImageData(0, 0, width, height), seen = [];
+    for (let k = 3; k < data.length; k += 4) if (data[k] > 128) seen.push(((k >> 2) % width) / width);
+    return [seen.reduce((a, b) => Math.min(a, b)), seen.reduce((a, b) => Math.max(a, b))];
+  });
+})()"""
+
+
+@pytest.mark.slow
+def test_a_head_fills_a_phone_and_is_whole(portable: runtime.PortableAvatar, tmp_path: Path) -> None:
+    """On a phone that is held upright, the filmed picture would leave half of the width empty."""
+    small = replace(portable.camera, K=np.array([[780, 0, 256], [0, 780, 256], [0, 0, 1]], np.float32))
+    write_page(tmp_path / "a.html", replace(portable, camera=small))
+    phone, square = (
+        np.array(browse(tmp_path / "a.html", [COLUMNS], size=size)["results"][0]) for size in ((390, 844), (600, 600))
+    )
+    assert (phone > 0.02).all()
+    assert (phone < 0.98).all()
+    assert np.ptp(phone[1]) > 1.4 * np.ptp(square[1])
+
+
+RESIZED = """(async () => {
+  const viewer = await mien, log = [], draw = viewer.draw.bind(viewer);
+  const frame = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done, 50)));
+  new ResizeObserver(() => log.push("shown")).observe(viewer.canvas);
+  await frame();
+  log.length = 0;
+  viewer.draw = () => (log.push("drawn"), draw());
+  document.getElementById("more").click();
+  await frame();
+  return log;
+})()"""
+
+
+@pytest.mark.slow
+def test_the_head_is_drawn_before_a_resized_window_is_shown(page: Path) -> None:
+    assert browse(page, [RESIZED], size=(900, 500))["results"][0][:2] == ["drawn", "shown"]
+
+
 def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.PortableAvatar) -> None:
     described = Described('Ada & "Bo"', "https://example.org/heads/a.html")
     write_page(tmp_path / "a.html", portable, described=described)

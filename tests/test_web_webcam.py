@@ -251,8 +251,8 @@ def test_every_control_has_a_name_and_is_reached_by_keys(page: Path) -> None:
     told = browse(page, [CONTROLS], (900, 900))
     assert told["results"][0] == [
         ["neutral", 0, True, "This is my neutral face"],
-        ["mirrored", 0, True, "As in a mirror"],
-        ["preview", 0, True, "Show my picture"],
+        ["mirrored", 0, True, "Mirrored"],
+        ["preview", 0, True, "My picture"],
     ]
 
 

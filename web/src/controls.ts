@@ -59,7 +59,8 @@ export function fit(viewer: Viewer): void {
   if (canvas.width !== w || canvas.height !== h) {
     canvas.width = w;
     canvas.height = h;
-    viewer.look();
+    // At once, since another size clears the canvas: drawn a moment later, the head would flicker.
+    viewer.draw();
   }
 }
 

@@ -5,6 +5,7 @@ import { addTurning, fit, isTyping, on } from "./controls";
 import { AvatarError, readPacked } from "./format";
 import { addLife, type Alive } from "./page_life";
 import { addSliders, find } from "./page_sliders";
+import { contextOf } from "./renderer";
 import { readSeries } from "./series";
 import { Viewer } from "./viewer";
 import type { BackendName } from "./webgpu";
@@ -65,6 +66,7 @@ function addMotion(viewer: Viewer, moveSliders: () => void, stop: () => void): v
       say(`${given.name} ${error instanceof AvatarError ? error.message : "cannot be read"}. Give a csv of Live Link Face, or blend shapes as json.`);
     }
   };
+  on(find("open"), "click", () => file.click());
   on(file, "change", () => open(file.files?.[0]));
   on(window, "dragover", (event) => event.preventDefault());
   on(window, "drop", (event) => {
@@ -80,10 +82,11 @@ function addRest(viewer: Viewer, alive: Alive): void {
     viewer.reset();
     viewer.onMotion();
   });
-  const background = find<HTMLSelectElement>("background"), { classList } = document.documentElement, more = find("more"), full = find("full");
-  on(background, "change", () => {
-    const grey = { white: 1, black: 0 }[background.value];
-    viewer.background = grey === undefined ? [0, 0, 0, 0] : [grey, grey, grey, 1];
+  const { classList } = document.documentElement, more = find("more"), full = find("full");
+  // Around: the page's own light, white, black.
+  on(find("background"), "click", () => {
+    const [grey, , , opaque] = viewer.background, next = opaque ? 0 : 1;
+    viewer.background = [next, next, next, opaque && !grey ? 0 : 1];
     viewer.look();
   });
   // NAME.html#transparent shows the head alone, for a frame in another page.
@@ -98,16 +101,19 @@ function addRest(viewer: Viewer, alive: Alive): void {
   // The head alone fills the screen. Telephones of Apple cannot do that.
   full.hidden = !document.fullscreenEnabled;
   on(full, "click", () => find("stage").requestFullscreen());
-  on(window, "pointerdown", (event) => event.target === viewer.canvas && find("hint").remove(), { once: true });
+  on(window, "pointerdown", () => find("hint").remove(), { once: true });
 }
 
 async function open(): Promise<Viewer> {
   const text = find("avatar").textContent!.trim();
-  const { avatar, motion } = await readPacked(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)));
+  const reading = readPacked(Uint8Array.from(atob(text), (c) => c.charCodeAt(0))), canvas = find<HTMLCanvasElement>("view");
   // `mien export --webgpu` puts webgpu.ts into the page. NAME.html#webgl2 and NAME.html#webgpu choose by hand.
   const { mienWebGpu } = window as unknown as { mienWebGpu?: typeof import("./webgpu") };
   const named = /^#(webgl2|webgpu)$/.exec(location.hash)?.[1] as BackendName | undefined;
-  const viewer = new Viewer(find<HTMLCanvasElement>("view"), avatar, motion, await mienWebGpu?.findBackend(named));
+  // The GPU starts while the avatar is unpacked.
+  if (!mienWebGpu) contextOf(canvas);
+  const { avatar, motion } = await reading;
+  const viewer = new Viewer(canvas, avatar, motion, await mienWebGpu?.findBackend(named));
   let alive: Alive | undefined;
   const stop = () => alive?.stop();
   const moveSliders = addSliders(viewer, find("sliders"), () => {
@@ -121,6 +127,7 @@ async function open(): Promise<Viewer> {
   addRest(viewer, alive);
   new ResizeObserver(() => fit(viewer)).observe(viewer.canvas);
   fit(viewer);
+  find("hint").hidden = false;
   return viewer;
 }
 

@@ -59,7 +59,7 @@ export function addSliders(viewer: Viewer, place: HTMLElement, touched: () => vo
       if (!range) return;
       taken.add(name);
       const looks = /^eyeLook/.test(name);
-      rows.push(slider(readable(name), name, range, looks ? -1 : index, looks ? null : () => face.expression[index], (value) => viewer.setExpression(name, value)));
+      rows.push(slider(readable(name).replace(new RegExp(`^${title.replace(/s$/, "")} `, "i"), ""), name, range, looks ? -1 : index, looks ? null : () => face.expression[index], (value) => viewer.setExpression(name, value)));
     });
     if (rows.length) place.append(element("details", {}, element("summary", {}, title), ...rows));
   }

@@ -66,6 +66,10 @@ class ArrayTexture {
 
 const ARRAYS = ["frames", "means", "quats", "scales", "colors", "sh"] as const;
 
+/** The context of a canvas. The first call starts the GPU, which takes a while. */
+export const contextOf = (canvas: HTMLCanvasElement | OffscreenCanvas): WebGL2RenderingContext | null =>
+  (canvas as HTMLCanvasElement).getContext("webgl2", { antialias: false, depth: false, premultipliedAlpha: true, powerPreference: "high-performance" });
+
 export class Renderer implements Drawer {
   private readonly gl: WebGL2RenderingContext;
   private readonly splats: Program;
@@ -79,7 +83,7 @@ export class Renderer implements Drawer {
   private readonly features: FeaturePass | null;
 
   constructor(canvas: HTMLCanvasElement | OffscreenCanvas, avatar: Avatar, private readonly poser: Poser) {
-    const gl = canvas.getContext("webgl2", { antialias: false, depth: false, premultipliedAlpha: true, powerPreference: "high-performance" });
+    const gl = contextOf(canvas);
     if (!gl) throw new AvatarError("needs WebGL2, which this browser lacks or has switched off");
     this.gl = gl;
     const { attributes } = avatar.baked, { faceIndex } = poser;

@@ -9,6 +9,8 @@ import { DepthSorter } from "./sort";
 
 /** Turns beyond this would show the head upside down, in radians. */
 const MOST_PITCH = 1.4;
+/** Half of a head's width and depth, with room for hair and for a head that moves. */
+const HAIR = 0.65;
 
 /** A camera of another 3D program: column-major matrices as OpenGL has them. */
 export interface Matrices {
@@ -47,6 +49,7 @@ export class Viewer {
   private readonly sorter: DepthSorter;
   private readonly depths: Float32Array;
   private readonly middle: number[];
+  private readonly radius: number;
   private renderer: Drawer;
   /** Coefficients of the gaze that `setExpression` set. */
   private readonly gaze = new Map<string, number>();
@@ -63,7 +66,7 @@ export class Viewer {
     const count = this.poser.faceIndex.length;
     this.sorter = new DepthSorter(count);
     this.depths = new Float32Array(count);
-    this.middle = middleOf(this.poser.rest);
+    [this.middle, this.radius] = middleOf(this.poser.rest);
     this.renderer = backend?.(canvas, avatar, this.poser, () => this.change(), Renderer) ?? new Renderer(canvas, avatar, this.poser);
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
@@ -132,14 +135,16 @@ export class Viewer {
     this.wait();
   }
 
-  /** The view for a picture of that size: the whole first camera's picture fits into it. */
+  /** The view for a picture of that size: the whole first camera's picture fits into it, and into a narrow one the head. */
   view(width: number, height: number): View {
-    const { K, viewmat, width: w, height: h } = this.avatar.camera, scale = Math.min(width / w, height / h);
+    const { K, viewmat, width: w, height: h } = this.avatar.camera;
     const pose = rigid(rotationMatrix(this.shown.head_rotation, 0), this.shown.head_translation);
     const { head_rotation, head_translation } = this.avatar.neutral;
     const rest = rigid(rotationMatrix(head_rotation, 0), head_translation);
     // The camera turns about the middle of the head at rest, seen from where the first camera stands.
     const pivot = moved(viewmat, moved(rest, this.middle));
+    const reach = Math.abs((K[0] * pivot[0]) / pivot[2] + K[2] - w / 2) + (K[0] * this.radius) / pivot[2];
+    const scale = Math.min(width / Math.min(w, 2 * reach), height / h);
     const turn = chained(rigid(rotationMatrix([this.pitch, 0, 0], 0), [0, 0, 0]), rigid(rotationMatrix([0, this.yaw, 0], 0), [0, 0, 0]));
     const to = moved(turn, pivot);
     turn[3] = pivot[0] - to[0];
@@ -218,14 +223,17 @@ function fromOpenGL({ projection: p, headToCamera: m }: Matrices, width: number,
   };
 }
 
-/** The middle of the box around points. */
-function middleOf(points: Float32Array): number[] {
-  return [0, 1, 2].map((axis) => {
+/** The middle of the box around points, and how far to the sides it reaches when it turns, with hair. */
+function middleOf(points: Float32Array): [number[], number] {
+  let radius = 0;
+  const middle = [0, 1, 2].map((axis) => {
     let least = Infinity, most = -Infinity;
     for (let i = axis; i < points.length; i += 3) {
       least = Math.min(least, points[i]);
       most = Math.max(most, points[i]);
     }
+    if (axis !== 1) radius = Math.max(radius, HAIR * (most - least));
     return (least + most) / 2;
   });
+  return [middle, radius];
 }

@@ -225,7 +225,7 @@ async function camera(): Promise<MediaStream> {
   } catch (error) {
     const { name, message } = error as DOMException;
     const words: Record<string, string> = {
-      NotAllowedError: "The camera is not allowed. Allow it for this page (the camera sign beside the address), and press the button again. A page in a frame needs allow=\"camera\" there.",
+      NotAllowedError: `The camera is not allowed. Allow it for this page (the camera sign beside the address), and press the button again.${window === top ? "" : ' The frame around this page needs allow="camera".'}`,
       NotFoundError: "There is no camera. Connect one, and press the button again.",
       NotReadableError: "The camera does not answer. Close other programs that use it, and press the button again.",
     };

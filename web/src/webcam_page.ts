@@ -54,7 +54,7 @@ function addCamera(viewer: Viewer): Webcam {
   };
   webcam.onState = (state, why) => {
     const on = state !== "off";
-    button.textContent = on ? "Stop the camera" : "Be me";
+    button.textContent = on ? "Stop" : "Be me";
     more.hidden = !on;
     tell(why ?? WORDS[state]);
     for (const box of others) {

@@ -20,6 +20,10 @@ RANDOM_EXPRESSIONS = 6
 _MOST = 0.7
 """Largest coefficient of a random face, as a share of the expression's range."""
 _SIDE = re.compile(r"(Left|Right)$")
+_AWAY = re.compile(r"(jaw|mouth)(Left|Right)$")
+"""Moves to one side or to the other, of which both together are none."""
+_CLOSED = re.compile(r"eyeBlink")
+"""Moves that random faces leave out: with closed eyes, a face looks asleep."""
 
 
 def readable(name: str) -> str:
@@ -54,17 +58,21 @@ def random_expression(
     bounds: Float32[np.ndarray, "e 2"],
     random: np.random.Generator,
 ) -> Float32[np.ndarray, " e"]:
-    """The coefficients of a random face: a few expressions beyond the person at rest, the same on both sides."""
+    """The coefficients of a random face: a few expressions beyond the person at rest, the same on both sides.
+
+    Jaw and mouth go to one side only, and eyes stay open.
+    """
     kinds: dict[str, list[int]] = {}
     for index, name in enumerate(names):
-        if bounds[index, 0] < bounds[index, 1]:
+        if bounds[index, 0] < bounds[index, 1] and not _CLOSED.match(name):
             kinds.setdefault(_SIDE.sub("", name), []).append(index)
     expression = rest.copy()
     chosen = random.permutation(len(kinds))[:RANDOM_EXPRESSIONS]
     members = list(kinds.values())
     for kind in chosen:
         share = random.uniform(0, _MOST)
-        for index in members[kind]:
+        both: list[int] = members[int(kind)]
+        for index in both if len(both) < 2 or not _AWAY.fullmatch(names[both[0]]) else random.permutation(both)[:1]:
             # Expressions of FLAME go in both directions, those of ARKit from 0 to 1.
             low, high = bounds[index]
             towards = low if low < 0 and random.random() < 0.5 else high
