@@ -13,8 +13,9 @@ import train_toy
 from mien.avatar import Avatar, load_avatar
 from mien.cli import main
 from mien.lab.analysis import ANALYSES
+from mien.lab.analysis.mono_gaussian_avatar import compared, times
 from mien.lab.analysis.mono_gaussian_avatar import convergence as parts_of_convergence
-from mien.lab.analysis.mono_gaussian_avatar import times
+from mien.lab.analysis.mono_gaussian_avatar.compared import scale_gain
 from mien.lab.analysis.mono_gaussian_avatar.subsets import Measured, frontal_quarter, masks, measure, mixed_half, ranges
 from mien.training import TrainSettings
 from mien.training.footage.frames import training_frames
@@ -71,6 +72,7 @@ def test_short_trainings_write_their_pictures(workspace: Path, capsys: pytest.Ca
     sides = parts["resolutions"]["values"]["rows"]
     assert [row["side"] for row in sides] == [32, 16]
     assert sides[0]["head_psnr"] != sides[1]["head_psnr"]
+    assert [row["scale_gain"] for row in sides] == [0.00625, 0.00625]
     subsets = parts["diversity"]["values"]["rows"]
     assert [(row["name"], row["timesteps"]) for row in subsets] == [
         ("all frames", 4), ("frontal quarter", 1), ("mixed half", 2)
@@ -98,6 +100,20 @@ def test_convergence_trains_as_the_run_did(tmp_path: Path, monkeypatch: pytest.M
     assert trained.keys() == seen[-1].keys()
     for name, tensor in trained.items():
         assert torch.equal(tensor, seen[-1][name]), name
+
+
+def test_resolutions_have_the_papers_bounds_of_scales() -> None:
+    """0.0025 m from the middle between 512 and 1024 pixels on, which is at 724."""
+    assert [scale_gain(side) for side in (128, 512, 720, 730, 1024, 2048)] == 3 * [0.00625] + 3 * [0.0025]
+
+
+@pytest.mark.slow
+def test_each_resolution_trains_with_its_own_bound(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compared, "GAINS", {16: 0.004, 32: 0.002})
+    analyze(workspace, "--parts", "resolutions", "--steps", "10")
+    runs = (workspace / "analysis/toy/runs").glob("resolution-*")
+    gains = {one.name.split("-")[1]: load_avatar(one).config.scale_gain for one in runs}  # type: ignore[attr-defined]
+    assert gains == {"16": 0.004, "32": 0.002}
 
 
 def measured(angles: np.ndarray, expressions: np.ndarray) -> Measured:
