@@ -163,8 +163,10 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
     assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
 
 
-@pytest.mark.parametrize("filled", [True, False])
-def test_edges_follow_the_sides(filled: bool) -> None:
+@pytest.mark.parametrize(("filled", "expected"), [(True, "mixed"), (False, "white")])
+def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> None:
+    assert resolved(TrainSettings(background="auto"), filled=filled).background == expected
+    assert resolved(TrainSettings(background="white"), filled=filled).background == "white"
     assert resolved(TrainSettings(edges="auto"), filled=filled).edges == ("cleaned" if filled else "filmed")
     assert resolved(TrainSettings(edges="cleaned"), filled=filled).edges == "cleaned"
 
@@ -172,11 +174,11 @@ def test_edges_follow_the_sides(filled: bool) -> None:
 @pytest.mark.parametrize(
     ("method", "background", "unseen", "white"),
     [
-        ("gaussian_avatars", "white", "auto", False),
-        ("gaussian_avatars", "white", "trained", True),
+        ("gaussian_avatars", "auto", "auto", False),
+        ("gaussian_avatars", "auto", "trained", True),
+        ("gaussian_avatars", "white", "auto", True),
         ("gaussian_avatars", "random", "trained", False),
-        ("headgas", "white", "auto", True),
-        ("headgas", "random", "auto", False),
+        ("headgas", "auto", "auto", True),
     ],
 )
 def test_transparent_pictures_warn_of_white_only_where_it_was(method, background, unseen, white, tmp_path, monkeypatch):

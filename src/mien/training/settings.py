@@ -34,11 +34,11 @@ class TrainSettings:
     gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08.
     nersemble-benchmark is that of the benchmark: four sequences, and all cameras but the frontal one. dataset is the
     split of an imported dataset's authors (docs/datasets.md)."""
-    background: Literal["white", "mixed", "random"] = "white"
-    """Background of the training pictures. Over white, Gaussians can imitate it, or let it through, which shows as
-    white dots from the side and as holes over other backgrounds, unless alpha is compared with the matte
-    (`--method.photometric.alpha-weight`), as it is where sides are filled. A random colour in each step prevents it as
-    well and costs 0.2 to 0.6 dB over white. Mixed is random in three of ten steps, and costs half of that."""
+    background: Literal["white", "mixed", "random", "auto"] = "auto"
+    """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
+    which can show as white dots from the side and white needles in new poses. It costs 0.2 to 0.6 dB compared with
+    white. Mixed is random in three of ten steps and white in the others: it costs half of that, and ears and hair stay
+    clean. Auto: mixed where sides are filled (`--training.unseen`), else white."""
     edges: Literal["filmed", "cleaned", "auto"] = "auto"
     """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
     avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
@@ -57,7 +57,7 @@ class TrainSettings:
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
     broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
     no picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes;
-    and alpha is compared with the matte (weight 1 or more). Auto: filled if one camera filmed, trained if there are
+    and alpha is compared with the matte (weight 0.2 or more). Auto: filled if one camera filmed, trained if there are
     several. Methods that bind no Gaussians to triangles train all sides in either case."""
     mesh: Literal["tracked", "fitted", "auto"] = "auto"
     """The mesh that Gaussians are bound to. Tracked: as tracking left it. Fitted: before training, what stands out
@@ -181,7 +181,7 @@ class Preset:
         return presets[self.name]
 
 
-_OPEN = {"edges": "filmed", "inside": "free", "mesh": "tracked", "unseen": "trained"}
+_OPEN = {"background": "white", "edges": "filmed", "inside": "free", "mesh": "tracked", "unseen": "trained"}
 """Heads stay as they were filmed, as in the papers."""
 PRESETS = {
     preset.name: preset

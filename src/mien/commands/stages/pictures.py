@@ -71,6 +71,7 @@ def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> Non
 
 
 def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:
-    """Whether white may shine through. Where sides are filled, alpha is compared with the matte, which prevents it."""
+    """Whether a run had a white background. `auto` is random where avatar and settings can fill sides."""
+    background = settings.get("background")
     may_fill = avatar.surface() is not None and settings.get("unseen") != "trained"
-    return settings.get("background") == "white" and not may_fill
+    return background == "white" or (background == "auto" and not may_fill)

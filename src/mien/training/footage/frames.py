@@ -190,7 +190,9 @@ class FrameOrder:
 
 
 def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
-    """The settings without `auto`: filled sides have cleaned edges, others filmed ones."""
+    """The settings without `auto`: filled sides have mixed backgrounds and cleaned edges, others white and filmed."""
+    if settings.background == "auto":
+        settings = replace(settings, background="mixed" if filled else "white")
     return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
 
 
