@@ -132,7 +132,7 @@ def test_options_reach_every_depth(choices: Any) -> None:
         sh_frame="head",
         means_rate=Rate(4e-3, 4e-5),
         photometric=replace(STANDARD.photometric, alpha_weight=0.1),
-        density=GradientSettings(max_gaussians=20_000, opacity_resets=(0.2, 0.5)),
+        density=GradientSettings(grow_gradient=1e-4, max_gaussians=20_000, opacity_resets=(0.2, 0.5)),
         face_tuning=FaceTuning(head_translation=Rate(3e-4, begin=0.5), keep_mean_pose=True, keep_turns=True),
     )
     assert settings == replace(RUN, steps=70, resolution=256, checkpoint_every=50, record_every=5, threads=1)

@@ -126,7 +126,7 @@ class GaussianAvatarsConfig(MethodConfig):
     """Weight of the scale penalty, which is the scale beyond the scale threshold."""
     surface: SurfaceLimits = field(default_factory=SurfaceLimits)
     """Limits that keep Gaussians on the surface of the mesh."""
-    density: GradientSettings = field(default_factory=GradientSettings)
+    density: GradientSettings = field(default_factory=lambda: GradientSettings(grow_gradient=1e-4))
     """Density control: when and where Gaussians are added and removed."""
 
 
@@ -171,6 +171,7 @@ _PAPER: dict[str, Any] = _PUBLISHED | {
         "start": (_FIRST + _ROUND) / _STEPS,
         "stop": (_STEPS - _ROUND) / _STEPS,
         "rounds": (_STEPS - _FIRST) // _ROUND - 1,
+        "grow_gradient": 2e-4,
         "size_unit": "extent",
         "split_size": 0.01,
         "prune_radius": 20.0,
