@@ -34,9 +34,9 @@ from mien.training.trainer import ProgressBar, train
 
 _WHITE = np.full(3, 255, np.uint8)
 _EPSILON = 1e-12
+"""Least size of gradients, so that those of zero move nothing."""
 _TEMPLATE_GROW_GRADIENT = 2e-4
 """`grow_gradient` of the quick avatar. The alignment was measured with it (log, 11-27)."""
-"""Least size of gradients, so that those of zero move nothing."""
 _KEPT = "aligned.safetensors"
 """File with the parameters of timesteps that are aligned."""
 _Timestep = tuple[int, int, tuple[int, ...]]
