@@ -55,7 +55,7 @@ class TrainOptions:
     subject: str | None = None
     """Subject of --split gaussian-avatars, for example 306 (default: the number in the workspace's name)."""
     background: Literal["white", "mixed", "random", "auto"] = "auto"
-    """Background of the training pictures; mixed is random in three of ten steps. auto: mixed where sides are filled,
+    """Background of the training pictures; mixed is random in one of ten steps. auto: mixed where sides are filled,
     else white."""
     steps: int = 0
     """Number of optimiser steps, over which all schedules stretch. 0 means the preset's number."""

@@ -37,8 +37,8 @@ class TrainSettings:
     background: Literal["white", "mixed", "random", "auto"] = "auto"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white dots from the side and white needles in new poses. It costs 0.2 to 0.6 dB compared with
-    white. Mixed is random in three of ten steps and white in the others: it costs half of that, and ears and hair stay
-    clean. Auto: mixed where sides are filled (`--training.unseen`), else white."""
+    white. Mixed is random in one of ten steps and white in the others: it costs next to nothing, and ears, hair and
+    cheeks stay clean. Auto: mixed where sides are filled (`--training.unseen`), else white."""
     edges: Literal["filmed", "cleaned", "auto"] = "auto"
     """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
     avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
@@ -57,7 +57,7 @@ class TrainSettings:
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
     broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
     no picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes;
-    and alpha is compared with the matte (weight 0.2 or more). Auto: filled if one camera filmed, trained if there are
+    and alpha is compared with the matte (weight 1 or more). Auto: filled if one camera filmed, trained if there are
     several. Methods that bind no Gaussians to triangles train all sides in either case."""
     mesh: Literal["tracked", "fitted", "auto"] = "auto"
     """The mesh that Gaussians are bound to. Tracked: as tracking left it. Fitted: before training, what stands out
