@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mien.errors import UserError
-from mien.files import check_writable, read_arrays, write_arrays, write_atomically
+from mien.files import check_writable, read_arrays, remove_leftovers, write_arrays, write_atomically
 from needs import IS_ROOT
 
 
@@ -60,6 +60,15 @@ def test_names_as_long_as_a_file_system_allows(tmp_path: Path) -> None:
     check_writable(path)
     write_atomically(path, lambda temporary: temporary.write_bytes(b"1"))
     assert path.read_bytes() == b"1"
+
+
+def test_what_killed_writers_left_is_removed(tmp_path: Path) -> None:
+    path, kept = tmp_path / "overlay.mp4", tmp_path / ".overlay.json"
+    for name in (path, kept, tmp_path / ".overlay.mp4.a1b2c3.mp4", tmp_path / ".overlay.mp4.d4.mp4"):
+        name.write_bytes(b"1")
+    remove_leftovers(path)
+    assert sorted(tmp_path.iterdir()) == sorted([path, kept])
+    remove_leftovers(tmp_path / "missing" / "overlay.mp4")
 
 
 def test_arrays_and_their_metadata_need_no_torch(tmp_path: Path) -> None:

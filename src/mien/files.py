@@ -103,6 +103,17 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         raise cannot_write(path, error) from None
 
 
+def remove_leftovers(path: Path) -> None:
+    """Remove temporary files of `write_atomically` that killed writers of `path` left.
+
+    Only for what a single process writes at a time, such as one that holds the workspace's lock.
+    """
+    start, end = f".{path.name[:_KEPT_OF_NAME]}.", path.suffix[-20:]
+    for other in path.parent.iterdir() if path.parent.is_dir() else ():
+        if other.name.startswith(start) and other.name.endswith(end):
+            other.unlink(missing_ok=True)
+
+
 def replace_folder(path: Path, finished: Path) -> None:
     """Move the folder `finished`, which is on the same disk, to `path`, and remove the folder that was there.
 

@@ -127,8 +127,12 @@ class Command:
     def _aligns(self, several_cameras: bool) -> bool:
         """Whether new trackings are aligned."""
         auto = not several_cameras and not PRESETS[self.options.preset].published
-        auto = auto and self.options.settings().steps >= self.alignment.template_steps
+        auto = auto and not self._too_short_to_align(self.options.settings().steps)
         return self.alignment.when == "always" or (self.alignment.when == "auto" and auto)
+
+    def _too_short_to_align(self, steps: int) -> bool:
+        """Whether a run is shorter than the training of the quick avatar that frames are aligned to."""
+        return steps < self.alignment.template_steps
 
     def _run_stages(self, workspace: Workspace, run: str, method: MethodConfig, settings: TrainSettings) -> None:
         from mien.commands.stages.aligning import is_trained_on, one_camera, run_alignment_stage
@@ -137,6 +141,7 @@ class Command:
         from mien.commands.stages.names import sequence_names
         from mien.commands.stages.tracking import run_tracking_stage, show_trackings
         from mien.commands.stages.training import run_training_stage
+        from mien.progress import say
         from mien.training import check_held_out
 
         if self.calibration is None:
@@ -158,8 +163,14 @@ class Command:
             show=False,
         )
         together = [name for name in captured if name in trackings]
+        one = one_camera(workspace, together)
+        if one and self.alignment.when == "auto" and self._too_short_to_align(settings.steps):
+            say(
+                f"frames are not aligned to a quick avatar, as --steps {settings.steps} is below its own "
+                f"{self.alignment.template_steps:,}; `--alignment.when always` aligns them"
+            )
         # A run that goes on keeps its tracking.
-        if self._aligns(not one_camera(workspace, together)) and not is_trained_on(workspace, run, together):
+        if self._aligns(not one) and not is_trained_on(workspace, run, together):
             run_alignment_stage(workspace, together, self.alignment, settings, keep=True)
         show_trackings(workspace, list(trackings), self.overlay)
         run_training_stage(workspace, together, run, method, settings, self.view)

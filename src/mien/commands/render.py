@@ -138,6 +138,8 @@ class Command:
             tell_of_unfilmed(self.set, face, avatar.face_model, filmed_range(run_dir, avatar))
         if self.sheet != "none":
             self._draw_sheet(run_dir, avatar, face, output)
+            if self.sheet == "turntable" and covered is not None:
+                say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
             return
         if cameras is None:
             cameras = self._path(self._camera(run_dir, subject), subject.head_translation[0], self._frames(timesteps))

@@ -193,16 +193,17 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
             rows.append(Row(run.label, entry["as_tracked"], None, FACE_SOURCE_NAMES["as_tracked"]))
     for run in runs:
         entry = run.metrics["protocols"][protocol]
-        if "over_dark" in entry:
-            faces = f"{FACE_SOURCE_NAMES[entry['face_params']]}, {OVER_DARK_NAME}"
-            rows.append(Row(run.label, entry["over_dark"], None, faces))
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
         if "fitted" in entry:
             rows.append(Row(run.label, entry["fitted"], None, FITTED_NAME))
     first = runs[0].metrics["protocols"][protocol]
     for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
+    # Last, as they are not on the scale of the rows above.
+    for run in runs:
+        entry = run.metrics["protocols"][protocol]
+        if "over_dark" in entry:
+            label = f"{run.label}, {OVER_DARK_NAME}"
+            rows.append(Row(label, entry["over_dark"], None, FACE_SOURCE_NAMES[entry["face_params"]]))
     return Table(protocol, first["split"], first["frames"], first["scored_on"], first["edges"], tuple(rows))
 
 

@@ -14,7 +14,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, head_box, targe
 from mien.evaluation.living import FILM
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import COLUMNS, figure
+from mien.evaluation.metrics_file import COLUMNS, PROTOCOL_NAMES, figure
 from mien.evaluation.page import (
     GLOSSARY,
     Card,
@@ -116,7 +116,7 @@ def _chart(table: Table) -> Card:
 
 def _heading(table: Table) -> str:
     names = ", ".join(dict.fromkeys(table.rows[0].entry["per_frame"]["sequence"]))
-    protocol = table.protocol.replace("_", " ").capitalize()
+    protocol = PROTOCOL_NAMES.get(table.protocol, table.protocol)
     return f"{protocol}: {table.frames} held-out frames of {names} ({table.ground})"
 
 

@@ -18,6 +18,13 @@ COLUMNS = (
     ("perceptual", "ST-LPIPS", 3, False),
 )  # fmt: skip
 """Metric, heading, number of digits, whether higher is better."""
+PROTOCOL_NAMES = {
+    "self_reenactment": "Self-reenactment",
+    "self_reenactment_tail": "Self-reenactment, last part of the sequence",
+    "self_reenactment_sequence": "Self-reenactment, held-out sequences",
+    "novel_view": "Novel views, held-out cameras",
+}
+"""Headings of protocols, by their keys in metrics.json."""
 PART_NAMES = {"eyes": "Eyes", "mouth": "Mouth"}
 """Headings of the parts of the face that have figures of their own, by their keys in metrics.json."""
 BASELINE_NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"}

@@ -24,8 +24,10 @@ GLOSSARY = {
         "then name, they are the filmed ones, which hold some of the background."
     ),
     "Over dark blue": (
-        "The same frames and faces over a dark background. An avatar can look right over white because it lets white "
-        "through, at light skin and thin hair. Over other backgrounds it then has holes, and these figures fall."
+        "The same frames and faces over a dark background, red 26, green 32, blue 80 of 255. An avatar can look right "
+        "over white because it lets white through, at light skin and thin hair, and has holes over other backgrounds. "
+        "Compare these figures only with those of other runs over dark blue: dark hair differs less from dark blue "
+        "than from white, so that they can be above or below the figures over white."
     ),
     "Whole frame, head crop": (
         "A white background raises the PSNR of the whole frame by several dB, so compare clips by their head crops. "

@@ -14,7 +14,15 @@ from mien import runtime
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FITTED_NAME, OVER_DARK_NAME, PART_NAMES, figure
+from mien.evaluation.metrics_file import (
+    BASELINE_NAMES,
+    COLUMNS,
+    FITTED_NAME,
+    OVER_DARK_NAME,
+    PART_NAMES,
+    PROTOCOL_NAMES,
+    figure,
+)
 from mien.evaluation.page import (
     FITTED_GLOSSARY,
     GLOSSARY,
@@ -31,18 +39,12 @@ from mien.pages import render
 from mien.storage import write_atomically
 from mien.training.footage import Coverage
 
-_TITLES = {
-    "self_reenactment": "Self-reenactment",
-    "self_reenactment_tail": "Self-reenactment, last part of the sequence",
-    "self_reenactment_sequence": "Self-reenactment, held-out sequences",
-    "novel_view": "Novel views, held-out cameras",
-}
 _ROWS = {
     "avatar": "Avatar",
     "as_tracked": "Avatar, faces as tracked",
-    "over_dark": f"Avatar, {OVER_DARK_NAME}",
     "fitted": f"Avatar, faces {FITTED_NAME}",
     **{key: BASELINE_NAMES[key].capitalize() for key in ("mesh", "mean_frame")},
+    "over_dark": f"Avatar, {OVER_DARK_NAME}",
 }
 
 
@@ -100,7 +102,7 @@ def report_html(
     first = next(iter(results.values()), None)
     shown = [
         {
-            "title": _TITLES.get(name, name),
+            "title": PROTOCOL_NAMES.get(name, name),
             "comparison": sections.comparison(experiment, evaluation),
             "video": videos.get(name),
             "over_time": sections.over_time(experiment, evaluation),
@@ -137,7 +139,7 @@ def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> list[tuple[str, str]
     """The few figures to read first, each with its name."""
     tiles: list[tuple[str, str]] = []
     for name, entry in protocols.items():
-        where = "" if len(protocols) == 1 else f", {_TITLES.get(name, name).lower()}"
+        where = "" if len(protocols) == 1 else f", {PROTOCOL_NAMES.get(name, name).lower()}"
         tiles.append((f"{entry['psnr']:.2f} dB", f"PSNR, whole frame{where}"))
         tiles.append((f"{entry['head']['psnr']:.2f} dB", f"PSNR, head crop{where}"))
         if entry["head"]["perceptual"] is not None and len(protocols) == 1:
@@ -157,8 +159,8 @@ def _tables(protocols: Mapping[str, Any]) -> list[DataTable]:
         further = {name: entry[name] for name in ("over_dark", "fitted") if name in entry}
         subjects = {"avatar": entry, **corrected, **further, **entry["baselines"]}
         caption = (
-            f"{_TITLES.get(name, name)} · {entry['frames']} held-out frames ({entry['split']}) · face parameters "
-            f"{entry['face_params'].replace('_', ' ')} · PSNR on training frames: "
+            f"{PROTOCOL_NAMES.get(name, name)} · {entry['frames']} held-out frames ({entry['split']}) · "
+            f"face parameters {entry['face_params'].replace('_', ' ')} · PSNR on training frames: "
             f"{entry['training_frames']['psnr']:.2f} dB, head crop {entry['training_frames']['head']['psnr']:.2f} dB"
         )
         if entry["perceptual_frames"]:

@@ -14,6 +14,7 @@ from mien.commands.stages.face_models import face_model_of
 from mien.errors import UserError
 from mien.face import FaceModel, load_face_model
 from mien.face.checks import check_face_params
+from mien.files import remove_leftovers
 from mien.inside import remove_tree
 from mien.locks import hold
 from mien.progress import say
@@ -296,7 +297,9 @@ def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, over
         if every > 1:
             say(f"{capture.name}: the overlay shows one frame in {every} of {len(tracking.valid)}; `--overlay all` "
                 "shows them all")  # fmt: skip
-        write_overlay(folder / "tracking" / "overlay.mp4", capture, tracking, face_model, every)
+        video = folder / "tracking" / "overlay.mp4"
+        remove_leftovers(video)
+        write_overlay(video, capture, tracking, face_model, every)
 
 
 def _is_shown(folder: Path, tracking: Tracking, overlay: Overlay) -> tuple[bool, bool]:
