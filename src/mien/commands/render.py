@@ -109,18 +109,14 @@ class Command:
         from mien.export.pictures import write_pictures
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
-        from mien.training import filmed_range, filmed_words, read_coverage, read_face_track, read_sequence
+        from mien.training import filmed_range, filmed_words, read_coverage
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         avatar = load_avatar(run_dir)
         covered = read_coverage(run_dir, avatar.face_model)
         neutral = avatar.face_model.head_vertices(avatar.subject)[0].detach()
-        motion = None
-        if self.sequence is not None:
-            motion = read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
-        elif self.own_motion:
-            motion = read_face_track(run_dir, avatar.face_model)
+        motion = self._motion(workspace, run_dir, avatar.face_model)
         timesteps = None if motion is None else len(motion)
         cameras = self._given_cameras(workspace, timesteps)
         output = self.picture.plan(self._output, self._frames(timesteps) if cameras is None else len(cameras))
@@ -159,6 +155,16 @@ class Command:
         say(f"{self._output}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
         if covered is not None:
             say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
+
+    def _motion(
+        self, workspace: Workspace, run_dir: Path, model: "mien.face.FaceModel"
+    ) -> "mien.face.FaceParams | None":
+        """The motion of --sequence or --own-motion."""
+        from mien.training import read_face_track, read_sequence
+
+        if self.sequence is not None:
+            return read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
+        return read_face_track(run_dir, model) if self.own_motion else None
 
     @property
     def _output(self) -> Path:
