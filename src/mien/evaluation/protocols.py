@@ -138,14 +138,14 @@ def evaluate_frames(
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
         frame, drawn, seconds = job
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
-        dark = {name: pictures.pop(name) for name in (OVER_DARK,) if name in pictures}
+        dark = pictures.pop(OVER_DARK, None)
         truth, crop = target_image(experiment, frame), experiment.crop(frame)
         judges = (metric, lpips) if frame in judged else (None, None)
         parts, border = experiment.parts(frame), settings.border
         clothes = experiment.clothes_of(frame) if OPENED in pictures else None
         scores = score_pictures(pictures, truth, crop, judges[0], parts, judges[1], border)
-        if dark:
-            scores |= score_pictures(dark, target_image(experiment, frame, DARK), crop, None)
+        if dark is not None:
+            scores |= score_pictures({OVER_DARK: dark}, target_image(experiment, frame, DARK), crop, None)
         if clothes is not None:
             bare = {UNCLOTHED: without(pictures[OPENED], clothes)}
             scores |= score_pictures(bare, without(truth, clothes), crop, judges[0], parts, judges[1], border)

@@ -37,8 +37,8 @@ class TrainSettings:
     background: Literal["white", "mixed", "random", "auto"] = "auto"
     """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
     which can show as white dots from the side and white needles in new poses. It costs 0.2 to 0.6 dB compared with
-    white. Mixed is random in one of ten steps and white in the others: it costs next to nothing, and ears, hair and
-    cheeks stay clean. Auto: mixed where sides are filled (`--training.unseen`), else white."""
+    white. Mixed is random in one of ten steps and white in the others: it costs next to nothing, ears and hair
+    stay clean, and cheeks nearly so. Auto: mixed where sides are filled (`--training.unseen`), else white."""
     edges: Literal["filmed", "cleaned", "auto"] = "auto"
     """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
     avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
