@@ -130,6 +130,14 @@ double mean_squared_difference(const Array<const float>& image, const Array<cons
   return mien::mean_squared_difference(image.data(), target.data(), static_cast<int64_t>(image.size()));
 }
 
+void absolute_difference(const Array<const float, nb::ndim<2>>& values, const Array<const uint8_t, nb::ndim<2>>& target,
+                         float weight, const Array<float, nb::ndim<2>>& gradient, const Array<float, nb::shape<>>& loss) {
+  require(same_shape(values, target) && same_shape(values, gradient), "the pictures must be equally large");
+  const nb::gil_scoped_release release;
+  *loss.data() = static_cast<float>(mien::absolute_difference(
+      values.data(), target.data(), static_cast<int64_t>(values.size()), weight, gradient.data()));
+}
+
 }  // namespace
 
 void bind_training(nb::module_& module) {
@@ -146,6 +154,9 @@ void bind_training(nb::module_& module) {
   module.def("clear_rows", &clear_rows, "chosen"_a, "arrays"_a, "Sets the chosen rows of all arrays to 0, in place.");
   module.def("mean_squared_difference", &mean_squared_difference, "image"_a.noconvert(), "target"_a.noconvert(),
              "The mean squared difference of a picture and one of bytes, where 255 is 1.");
+  module.def("absolute_difference", &absolute_difference, "values"_a, "target"_a, "weight"_a, "gradient"_a, "loss"_a,
+             "Fills the weighted mean absolute difference of a picture and one of bytes, where 255 is 1, and its "
+             "gradient.");
   module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(),
              "Left, top, width and height of the box that holds all numbers other than 0.");
 }

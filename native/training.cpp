@@ -110,4 +110,21 @@ double mean_squared_difference(const float* image, const uint8_t* bytes, int64_t
   return total / static_cast<double>(std::max<int64_t>(count, 1));
 }
 
+double absolute_difference(const float* values, const uint8_t* bytes, int64_t count, float weight, float* gradient) {
+  const float share = weight / static_cast<float>(std::max<int64_t>(count, 1));
+  const int64_t pieces = (count + kElements - 1) / kElements;
+  thread_local std::vector<double> sums;
+  sums.resize(pieces);
+  double* const parts = sums.data();
+  const TrainingKernels& kernels = training_kernels();
+  parallel_for(pieces, [&](int64_t piece) {
+    const int64_t first = piece * kElements;
+    parts[piece] = kernels.absolute_difference(values + first, bytes + first, share, gradient + first,
+                                               std::min(kElements, count - first));
+  });
+  double total = 0;
+  for (int64_t piece = 0; piece < pieces; ++piece) total += parts[piece];
+  return static_cast<double>(share) * total;
+}
+
 }  // namespace mien

@@ -60,4 +60,7 @@ PixelBox box_of_nonzero(const float* values, int width, int height);
 // The mean of (image - bytes / 255)^2 over all values of a picture.
 double mean_squared_difference(const float* image, const uint8_t* bytes, int64_t count);
 
+// `weight` times the mean of |values - bytes / 255|, and its gradient, which is written. Runs on the pool.
+double absolute_difference(const float* values, const uint8_t* bytes, int64_t count, float weight, float* gradient);
+
 }  // namespace mien

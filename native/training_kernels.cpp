@@ -118,9 +118,25 @@ double squared_difference(const float* image, const uint8_t* bytes, int64_t coun
   return total;
 }
 
+double absolute_difference(const float* values, const uint8_t* bytes, float share, float* gradient, int64_t count) {
+  F sums{};
+  const F up = set1(share);
+  for (int64_t i = 0; i < count; i += W) {
+    const int64_t valid = count - i;
+    F target{};
+    for (int lane = 0; lane < W && lane < valid; ++lane) target[lane] = (float)bytes[i + lane];
+    // Rounded, or else equal values would differ by what the product is rounded by.
+    const F difference = load_some(values + i, valid) - rounded(target * (1.0f / 255));
+    sums = sums + maximum(difference, -difference);
+    store_some(gradient + i, valid, keep(less(F{}, difference), up) - keep(less(difference, F{}), up));
+  }
+  return sum(sums);
+}
+
 }  // namespace
 
 extern const TrainingKernels training_kernels;
-const TrainingKernels training_kernels = {adam, penalties, observe, any_nonzero, squared_difference};
+const TrainingKernels training_kernels = {adam, penalties, observe, any_nonzero, squared_difference,
+                                          absolute_difference};
 
 }  // namespace mien::MIEN_ISA

@@ -15,6 +15,8 @@ struct TrainingKernels {
   bool (*any_nonzero)(const float* values, int64_t count);
   // The sum of (image - bytes / 255)^2 over `count` values.
   double (*squared_difference)(const float* image, const uint8_t* bytes, int64_t count);
+  // The sum of |values - bytes / 255| over `count` values. Fills `gradient` with its sign times `share`.
+  double (*absolute_difference)(const float* values, const uint8_t* bytes, float share, float* gradient, int64_t count);
 };
 
 }  // namespace mien

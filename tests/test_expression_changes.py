@@ -14,6 +14,7 @@ import train_toy
 from mien import _native, runtime
 from mien.avatar import GaussianAvatars, Progress, Rate, load_avatar, make_portable, write_avatar
 from mien.avatar.gaussian_avatars.avatar import resting_opacities
+from mien.avatar.gaussian_avatars.changes import mean_squares
 from mien.avatar.ops.expression_changes import (
     MARGIN,
     activations_reference,
@@ -250,3 +251,12 @@ def test_impossible_changes_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(UserError, match=part):
             runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=replace(baked, changes=wrong)))
+
+
+def test_mean_squares_are_what_autograd_computes() -> None:
+    """Value and gradients of the penalty agree with autograd's."""
+    tensors = [torch.randn(7, 3, dtype=torch.float64, requires_grad=True), torch.randn(7, dtype=torch.float64)]
+    tensors[1].requires_grad_()
+    assert torch.autograd.gradcheck(lambda *own: mean_squares(0.3, *own), tensors)
+    expected = 0.3 * sum(own.square().mean() for own in tensors)
+    torch.testing.assert_close(mean_squares(0.3, *tensors), expected)

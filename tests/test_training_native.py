@@ -8,6 +8,7 @@ from mien import _native
 from mien.avatar import Moments
 from mien.training.adam import Update, update_all, update_reference
 from mien.training.density_control.gradient import observe_reference
+from mien.training.losses import alpha_loss, alpha_loss_reference
 
 COUNTS = (0, 1, 15, 16, 4097)
 
@@ -73,6 +74,20 @@ def test_mean_squared_difference(isa: str, size: tuple[int, int]) -> None:
     image, picture = random(*size, 3), (255 * random(*size, 3, seed=1).sigmoid()).to(torch.uint8)
     expected = (image.double() - picture.double() / 255).square().sum() / max(image.numel(), 1)
     assert _native.mean_squared_difference(image, picture) == pytest.approx(float(expected), rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130), (200, 301)])
+def test_the_loss_of_alpha(isa: str, size: tuple[int, int]) -> None:
+    """Value and gradient agree with PyTorch's in float64. Where alpha is the matte, the gradient is 0."""
+    alpha, matte = random(*size).sigmoid(), (255 * random(*size, seed=1).sigmoid()).to(torch.uint8)
+    alpha[0] = matte[0].float() * (1 / 255)
+    own, exact = alpha.clone().requires_grad_(), alpha.double().requires_grad_()
+    loss, expected = 2 * alpha_loss(own, matte, 0.7), 2 * alpha_loss_reference(exact, matte, 0.7)
+    torch.autograd.backward([loss, expected])
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5, abs=1e-7)
+    assert own.grad is not None and exact.grad is not None
+    assert not own.grad[0].any()
+    torch.testing.assert_close(own.grad[1:].double(), exact.grad[1:], rtol=1e-5, atol=0)
 
 
 def test_the_same_bits_for_any_number_of_threads() -> None:

@@ -291,6 +291,9 @@ def clear_rows(chosen: Tensor, arrays: list[Tensor]) -> None:
     """Updates all arrays [n, ...]. `chosen` [n] is uint8."""
 
 def mean_squared_difference(image: Tensor, target: Tensor) -> float: ...
+def absolute_difference(values: Tensor, target: Tensor, weight: float, gradient: Tensor, loss: Tensor) -> None:
+    """Fills `gradient` and `loss`. `target` is uint8."""
+
 def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...
 
 # native/bind_composite.cpp; arrays are uint8

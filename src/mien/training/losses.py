@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import is_native
+from mien.arrays import is_native, native, recycled, unpacked
 from mien.avatar import PerceptualLoss, Photometric
 from mien.perceptual import TrainingFeatures, load_training_features
 from mien.pictures import Box
@@ -32,25 +32,37 @@ def picture_losses(rendering: Rendering, target: Target, weights: Photometric) -
     )  # fmt: skip
     losses = {"photometric": photometric}
     if weights.alpha_weight > 0:
-        losses["alpha"] = _AlphaLoss.apply(rendering.alpha, target.matte, weights.alpha_weight)
+        losses["alpha"] = alpha_loss(rendering.alpha, target.matte, weights.alpha_weight)
     return losses
 
 
+def alpha_loss_reference(alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Float[Tensor, ""]:
+    """`alpha_loss` in plain PyTorch, for any dtype and device."""
+    return weight * (alpha - matte.to(alpha) / 255).abs().mean()
+
+
+@native(alpha_loss_reference)
+def alpha_loss(alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Float[Tensor, ""]:
+    """`weight` times the mean absolute difference between alpha and a matte (0..255). Native for float32 on a CPU."""
+    return _AlphaLoss.apply(alpha, matte, weight)  # pyright: ignore[reportReturnType]
+
+
 class _AlphaLoss(torch.autograd.Function):
-    """Weighted mean absolute difference between alpha and a matte (0..255), in fewer passes than autograd's."""
+    """One native pass computes value and gradient; `backward` only scales the gradient."""
 
     @staticmethod
     def forward(ctx: Any, alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Tensor:
-        share, difference = weight / alpha.numel(), torch.sub(alpha.detach(), matte, alpha=1 / 255)
-        loss = share * torch.linalg.vector_norm(difference, 1)
-        ctx.save_for_backward(difference.sign_().mul_(share))
+        gradient, loss = recycled(*alpha.shape), torch.empty(())
+        values, target, *filled = unpacked(alpha.detach().contiguous(), matte.contiguous(), gradient, loss)
+        _native.absolute_difference(values, target, weight, *filled)
+        ctx.save_for_backward(gradient)
         return loss
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient * grad_loss, None, None
+        return gradient if float(grad_loss) == 1 else gradient * grad_loss, None, None
 
 
 @dataclass(frozen=True, eq=False)
