@@ -17,7 +17,7 @@ from mien.evaluation.fitting import FittedFaces, fit_face
 from mien.evaluation.metrics import l1
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, evaluate_frames, protocol_content
-from mien.evaluation.text import protocol_line
+from mien.evaluation.text import protocol_lines
 from mien.tracking import Scoring
 from plain_settings import plain_config
 from toy_workspace import write_toy_workspace
@@ -95,9 +95,11 @@ def test_the_third_figure_stands_beside_the_others_and_is_never_the_headline(tmp
     assert entry["fitted"]["psnr"] > entry["psnr"] + 1
     assert entry["fitted"]["head"]["psnr"] > entry["head"]["psnr"]
     assert entry["fitted"]["fit"]["steps"] == 20
-    line = protocol_line("self_reenactment", entry)
-    assert line.index(f"{entry['psnr']:.2f} dB") < line.index("faces fitted to the scored pictures")
-    assert "fitted" not in protocol_line("self_reenactment", without)
+    _, first, *others = protocol_lines("self_reenactment", entry)
+    assert f"{entry['psnr']:.2f} /" in first
+    assert "fitted" not in first
+    assert any(line.startswith("  avatar, faces fitted to the scored pictures  ") for line in others)
+    assert not any("fitted" in line for line in protocol_lines("self_reenactment", without))
     resumed = evaluate_frames(experiment, FIT, partial)
     assert resumed.scores == scored.scores
 

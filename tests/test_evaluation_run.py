@@ -72,6 +72,15 @@ def test_what_is_scored_is_known_to_be(workspace: tuple[Path, Path]) -> None:
     assert not is_evaluated(run_dir, [folder], replace(quick, edges="filmed"))
     (run_dir / "report.html").unlink()
     assert not is_evaluated(run_dir, [folder], quick)
+    whole = evaluate(run_dir, [folder])["protocols"]["self_reenactment"]
+    short = EvaluationSettings(perceptual_of="avatar")
+    assert is_evaluated(run_dir, [folder], short)  # It has all figures of the short scoring, and more.
+    entry = evaluate(run_dir, [folder], short)["protocols"]["self_reenactment"]
+    assert entry["perceptual"] == whole["perceptual"]
+    assert entry["baselines"]["mesh"]["psnr"] == whole["baselines"]["mesh"]["psnr"]
+    assert entry["baselines"]["mesh"]["perceptual"] is None
+    assert whole["baselines"]["mesh"]["perceptual"] is not None
+    assert not is_evaluated(run_dir, [folder])
     evaluate(run_dir, [folder])
 
 

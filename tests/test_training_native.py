@@ -85,7 +85,8 @@ def test_the_loss_of_alpha(isa: str, size: tuple[int, int]) -> None:
     loss, expected = 2 * alpha_loss(own, matte, 0.7), 2 * alpha_loss_reference(exact, matte, 0.7)
     torch.autograd.backward([loss, expected])
     assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5, abs=1e-7)
-    assert own.grad is not None and exact.grad is not None
+    assert own.grad is not None
+    assert exact.grad is not None
     assert not own.grad[0].any()
     torch.testing.assert_close(own.grad[1:].double(), exact.grad[1:], rtol=1e-5, atol=0)
 

@@ -141,6 +141,7 @@ class Command:
         from mien.commands.stages.names import sequence_names
         from mien.commands.stages.tracking import run_tracking_stage, show_trackings
         from mien.commands.stages.training import run_training_stage
+        from mien.evaluation import EvaluationSettings
         from mien.progress import say
         from mien.training import check_held_out
 
@@ -175,4 +176,5 @@ class Command:
         show_trackings(workspace, list(trackings), self.overlay)
         run_training_stage(workspace, together, run, method, settings, self.view)
         if settings.holds_out:
-            run_evaluation_stage(workspace, run, again=False)
+            # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all the rest of scoring.
+            run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)

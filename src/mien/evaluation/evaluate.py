@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence as Items
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def _evaluate(
 
 
 def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings | None = None) -> bool:
-    """Whether metrics.json holds the figures that `evaluate` would write: same avatar, data and settings.
+    """Whether metrics.json holds the figures that `evaluate` would write, or more: same avatar, data and settings.
 
     Raises:
         UserError: the run is not finished, or the sequences are not those of the run.
@@ -118,8 +119,9 @@ def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: Evaluation
     except UserError:
         return False
     experiments = load_experiments(run_dir, sequence_dirs, settings.edges, settings.protocol)
-    expected = {name: _fingerprint(run_dir, name, each, settings) for name, each in experiments.items()}
-    return bool(expected) and known == expected and (run_dir / "report.html").is_file()
+    enough = (settings, replace(settings, perceptual_of="all"))
+    expected = [{name: _fingerprint(run_dir, name, each, own) for name, each in experiments.items()} for own in enough]
+    return bool(experiments) and known in expected and (run_dir / "report.html").is_file()
 
 
 def _video(
@@ -137,6 +139,8 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
         file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,
         settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone, settings.edges,
     ]  # fmt: skip
+    if settings.perceptual_of != "all":
+        content.append(settings.perceptual_of)
     if settings.protocol is not None:
         content += [settings.protocol, settings.opened]
     if settings.lpips_weights is not None:

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -57,6 +57,9 @@ class EvaluationSettings(ScoreSettings):
 
     baselines: bool = True
     """Whether to score the mean training picture and the coloured mesh as well."""
+    perceptual_of: Literal["all", "avatar"] = "all"
+    """Whether ST-LPIPS and LPIPS judge baselines and faces as tracked as well, or the avatar alone, in less than half
+    of the time."""
     video_frames: int = 600
     """Largest number of frames in each side-by-side video. 0 makes no videos."""
     pictures: bool = False
@@ -130,7 +133,7 @@ def evaluate_frames(
     kept = partial.read() if partial is not None else {}
     done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
     metric, lpips = perceptual_metric(settings), lpips_metric(settings)
-    judged = set(spread_frames(frames, settings.perceptual_frames))
+    perceptual_frames = set(spread_frames(frames, settings.perceptual_frames))
     threads = worker_threads(settings.threads)
     baselines = make_baselines(experiment, threads) if settings.baselines else None
     fitted = FittedFaces(experiment, settings.fit_steps) if settings.fit_faces else None
@@ -140,10 +143,11 @@ def evaluate_frames(
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
         dark = pictures.pop(OVER_DARK, None)
         truth, crop = target_image(experiment, frame), experiment.crop(frame)
-        judges = (metric, lpips) if frame in judged else (None, None)
+        judges = (metric, lpips) if frame in perceptual_frames else (None, None)
         parts, border = experiment.parts(frame), settings.border
         clothes = experiment.clothes_of(frame) if OPENED in pictures else None
-        scores = score_pictures(pictures, truth, crop, judges[0], parts, judges[1], border)
+        compared = None if settings.perceptual_of == "all" else (AVATAR,)
+        scores = score_pictures(pictures, truth, crop, judges[0], parts, judges[1], border, compared)
         if dark is not None:
             scores |= score_pictures({OVER_DARK: dark}, target_image(experiment, frame, DARK), crop, None)
         if clothes is not None:

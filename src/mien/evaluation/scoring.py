@@ -1,7 +1,7 @@
 """Figures of pictures against a target, computed alike for protocols and for pictures of other programs."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -88,6 +88,7 @@ def score_pictures(
     parts: Mapping[str, Box] = MappingProxyType({}),
     lpips: Lpips | None = None,
     border: Border = "zeros",
+    compared: Container[str] | None = None,
 ) -> dict[str, Scores]:
     """The figures of several pictures against one target, on the whole frame and on the crops that are given.
 
@@ -99,6 +100,7 @@ def score_pictures(
         parts: The boxes of eyes and mouth, by name. ST-LPIPS enlarges those with a side below `PART_SIDE` to it.
         lpips: Exact LPIPS, or None. It skips and enlarges the same crops.
         border: Windows of SSIM at the border of a picture or crop.
+        compared: Names of the pictures that get ST-LPIPS and LPIPS. None means all.
     """
     metrics = [(name, each) for name, each in (("perceptual", metric), (LPIPS, lpips)) if each is not None]
     rows: dict[str, dict[str, float]] = {name: {} for name in pictures}
@@ -113,7 +115,7 @@ def score_pictures(
             image, row = crop_to(picture, box), rows[name]
             row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut, border)
             row[f"{prefix}l1"] = l1(image, cut)
-            for key, each, reference in references:
+            for key, each, reference in references if compared is None or name in compared else ():
                 row[f"{prefix}{key}"] = each.between(each.features(enlarged(image, least)), reference)
     return dict(rows)
 

@@ -1,4 +1,4 @@
-"""Figures as text for a terminal: a protocol in one line, a comparison of runs as an aligned table."""
+"""Figures as text for a terminal: a protocol in a few lines, a comparison of runs as an aligned table."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,19 +13,19 @@ _FURTHER = {"opened": "eroded and dilated", "without_clothes": "the same without
 _PARTS = ((None, "whole frame"), ("head", "head crop"))
 
 
-def protocol_line(name: str, entry: Mapping[str, Any]) -> str:
-    """A protocol of metrics.json in one line: the PSNR figures of the avatar, then those of the baselines."""
-    faces = FACE_SOURCE_NAMES[entry["face_params"]]
-    text = f"{name} ({entry['split']}, {entry['frames']} frames): PSNR {_both(entry)}, faces {faces}"
+def protocol_lines(name: str, entry: Mapping[str, Any]) -> list[str]:
+    """The PSNR of a protocol of metrics.json: a heading, then a line for the avatar and for each baseline."""
+    rows = {f"avatar, faces {FACE_SOURCE_NAMES[entry['face_params']]}": entry}
     if entry["face_params"] != "as_tracked":
-        text += f" ({_both(entry['as_tracked'])}, faces {FACE_SOURCE_NAMES['as_tracked']})"
+        rows[f"avatar, faces {FACE_SOURCE_NAMES['as_tracked']}"] = entry["as_tracked"]
     if "over_dark" in entry:
-        text += f" ({_both(entry['over_dark'])}, {OVER_DARK_NAME})"
+        rows[f"avatar, {OVER_DARK_NAME}"] = entry["over_dark"]
     if "fitted" in entry:
-        text += f" ({_both(entry['fitted'])}, faces {FITTED_NAME})"
-    for key, baseline in entry["baselines"].items():
-        text += f"; {BASELINE_NAMES[key]} {_both(baseline)}"
-    return text
+        rows[f"avatar, faces {FITTED_NAME}"] = entry["fitted"]
+    rows |= {BASELINE_NAMES[key]: baseline for key, baseline in entry["baselines"].items()}
+    width = max(map(len, rows))
+    heading = f"{name} ({entry['split']}, {entry['frames']} frames): PSNR of the whole frame / of the head crop"
+    return [heading, *(f"  {words:<{width}}  {_both(row)}" for words, row in rows.items())]
 
 
 def dataset_line(entry: Mapping[str, Any]) -> str:
@@ -120,7 +120,7 @@ def _line(cells: Sequence[tuple[str, bool]], widths: Sequence[int], bold: bool) 
 
 
 def _both(entry: Mapping[str, Any]) -> str:
-    return f"{entry['psnr']:.2f} dB whole frame / {entry['head']['psnr']:.2f} dB head crop"
+    return f"{entry['psnr']:.2f} / {entry['head']['psnr']:.2f} dB"
 
 
 def _figures(entry: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from mien.evaluation.compare_report import write_comparison
 from mien.evaluation.evaluate import evaluate, is_evaluated
 from mien.evaluation.metrics_file import read_figures
 from mien.evaluation.protocols import EvaluationSettings
-from mien.evaluation.text import dataset_line, driven_line, protocol_line
+from mien.evaluation.text import dataset_line, driven_line, protocol_lines
 from mien.inside import check_tree
 from mien.progress import say
 from mien.training import NAMED_SPLIT, read_run_config
@@ -44,7 +44,8 @@ def run_evaluation_stage(
         named = read_run_config(run_dir)["settings"]["split"] == NAMED_SPLIT
         metrics = evaluate(run_dir, folders, settings, _driver_folders(drivers, driving_sequences if named else list))
     for name, entry in metrics["protocols"].items():
-        say(driven_line(entry) if name == "cross_reenactment" else protocol_line(name, entry))
+        for line in [driven_line(entry)] if name == "cross_reenactment" else protocol_lines(name, entry):
+            say(line)
         if "dataset_protocol" in entry:
             say(dataset_line(entry))
     say(f"Look at {run_dir / 'report.html'}")

@@ -14,7 +14,7 @@ _FIND, _CAPTURE, _LANDMARKS, _PIXELS, _SCORING, _OVERLAY = 0.005, 0.036, 0.062, 
 _SHARED_PIXELS = 10.0
 _STEP = 0.042
 _TEMPLATE_STEP, _ALIGN = 0.03, 0.012
-_SCORE, _PERCEPTUAL, _VIDEO = 0.35, 2.0, 0.05
+_SCORE, _PERCEPTUAL, _VIDEO = 0.35, 0.9, 0.05
 """Seconds per frame, per step and per scored frame: medians over clips of 216 to 587 frames of 512x512, two cores."""
 _PERCEPTUAL_FRAMES = 24
 _HELD_OUT = 0.2
