@@ -14,6 +14,8 @@ import pytest
 from mien.capture.video import write_video
 from mien.cli import COMMANDS, main
 from mien.commands.help_text import readable
+from mien.commands.options import check_driver
+from mien.errors import UserError
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -158,6 +160,18 @@ def test_file_that_is_no_video(
         (tmp_path / name).write_bytes(picture)
         message = complaint(capsys, command, str(tmp_path / name), "--out", str(tmp_path / "out"))
         assert f"{name}: is a picture; give a video" in message
+
+
+def test_bad_driver_and_bad_colour_are_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They are refused although the workspace is empty, because they are looked at before it is."""
+    letter = tmp_path / "letter.mp4"
+    letter.write_text("Dear reader")
+    with pytest.raises(UserError, match=r"letter\.mp4: cannot be read as a video"):
+        check_driver(letter, None)
+    message = complaint(capsys, "render", str(tmp_path), "--sheet", "turntable", "--background", "darkblue")
+    assert "--background darkblue" in message
 
 
 def test_video_without_a_face(faceless_video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

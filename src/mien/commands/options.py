@@ -299,7 +299,8 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
     """Check before any work that the driver exists: a workspace with that sequence, or a file.
 
     Raises:
-        UserError: the driver is missing, does not have that sequence, has no sequences, or takes no frame rate.
+        UserError: the driver is missing, does not have that sequence, has no sequences, takes no frame rate, or is
+            neither a recording nor a video.
     """
     suffix = by.suffix.lower() if by.is_file() else ""
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
@@ -312,3 +313,7 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
         raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
     if not by.is_file():
         open_workspace(by).pick_sequence(sequence)
+    elif suffix not in (".csv", ".json", *SOUND_ENDINGS):
+        from mien.commands.stages.names import check_videos
+
+        check_videos([by])

@@ -83,6 +83,7 @@ class Command:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         check_device(self.device)
+        self.picture.color()
         if self._is_file():
             self._check_file()
             return

@@ -96,8 +96,8 @@ def resume(folder: Path, state: TrainingState, first_record: int) -> None:
             continue
         with expect_whole(path, "delete it and run the same command again"):
             _restore(path, state, tensors, first_record)
-        if damaged:
-            say(f"training continues from the older checkpoint {path.name}, step {state.step}")
+        older = f" from the older checkpoint {path.name}" if damaged else ""
+        say(f"training continues{older} at step {state.step:,}")
         return
     if damaged:
         say(f"{folder}: no checkpoint can be read; training starts again from the first step")
