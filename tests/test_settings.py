@@ -92,8 +92,9 @@ def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 def test_without_options_a_run_has_the_defaults(method: str, choices: Any) -> None:
     assert choices(f"--method {method}") == (METHODS[method].config(), TrainSettings())
     assert choices(f"--method {method} --preset standard") == (METHODS[method].config(), TrainSettings())
-    draft = (PRESETS["draft"].config(method), replace(RUN, steps=8000))
+    draft = (PRESETS["draft"].config(method), replace(RUN, steps=4000))
     assert choices(f"--method {method} --preset draft") == draft
+    assert choices(f"--method {method} --preset fine") == (METHODS[method].config(), replace(RUN, steps=12_000))
 
 
 def test_a_preset_gives_the_settings_of_run_and_method(choices: Any) -> None:
@@ -216,7 +217,7 @@ def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) ->
     )
     config, settings = choices("--hold-out --method.features 8 --steps 50 --preset draft --seed 0", file)
     assert (config, settings) == (HeadGasConfig(features=8, density=density), replace(RUN, steps=50, record_every=7))
-    assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == replace(RUN, steps=8000, split="tail")
+    assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == replace(RUN, steps=4000, split="tail")
     assert choices("--method headgas", {"settings": {"seed": 1}}) == (HeadGasConfig(), replace(RUN, seed=1))
     assert choices("", {}) == choices("")
 

@@ -69,7 +69,7 @@ def test_help_all_shows_where_presets_differ(method: str, capsys: pytest.Capture
 
 def test_help_all_with_a_preset_shows_its_values(capsys: pytest.CaptureFixture[str]) -> None:
     about = about_options(help_of(capsys, "create", "--preset", "paper", "--help-all"))
-    assert about["--method.sh-degree"].endswith("(from 0 to 3; default: 3; draft, standard: 0)")
+    assert about["--method.sh-degree"].endswith("(from 0 to 3; default: 3; draft, standard, fine: 0)")
     assert about["--background"].endswith("(default: white; draft, standard: auto)")
 
 
@@ -99,8 +99,8 @@ def differences(changes: dict[str, Any], settings: Any, place: str = "") -> Iter
 @pytest.mark.parametrize("name", METHODS)
 def test_presets_are_differences_to_the_defaults(name: str) -> None:
     method = METHODS[name]
-    assert {"draft", "standard"} <= set(method.presets) <= set(PRESETS), f"PRESETS of {name}"
-    assert method.presets["standard"] == {}, f"standard of {name} is not its defaults"
+    assert {"draft", "standard", "fine"} <= set(method.presets) <= set(PRESETS), f"PRESETS of {name}"
+    assert method.presets["standard"] == method.presets["fine"] == {}, f"{name} changes more than the steps"
     cheaper = {"photometric", "appearance"}
     assert set(method.presets["draft"].get("method", {})) <= cheaper, f"draft of {name}: more than losses and features"
     assert "settings" not in method.presets["draft"]

@@ -43,12 +43,12 @@ class Method:
     def presets(self) -> Mapping[str, Differences]:
         """How each preset of `mien.training.PRESETS` that the method has differs from the defaults.
 
-        Every method has `draft` and `standard`. The module of its settings adds to the former, and adds others, by
-        `PRESETS`.
+        Every method has `draft`, `standard` and `fine`. The module of its settings adds to the first, and adds
+        others, by `PRESETS`.
         """
         with _imports(self.config_class):
             own = getattr(importlib.import_module(self.config_class.split(":")[0]), "PRESETS", {})
-        return {"draft": {}, "standard": {}, **own}
+        return {"draft": {}, "standard": {}, "fine": {}, **own}
 
     @property
     def avatar(self) -> "type[Avatar]":

@@ -18,7 +18,7 @@ class Command:
     out: Path = Path("out/demo")
     """Workspace folder. The video is written there, too."""
     preset: PresetName = "draft"
-    """How thorough the training is, as for `mien create`: draft, standard, paper or paper-cpu."""
+    """How thorough the training is, as for `mien create`: draft, standard, fine, paper or paper-cpu."""
     steps: int = 0
     """Number of optimiser steps. 0 means the preset's number."""
     seconds: float = 0.0

@@ -46,9 +46,9 @@ class TrainOptions:
     """A .json with settings, for example the config.json of a run to repeat (docs/settings.md). Options override the
     file, and the file overrides the preset."""
     preset: PresetName = "standard"
-    """How thorough the training is. draft has fewer steps; standard has the defaults, and gives the figures of
-    docs/results.md; paper repeats the method's paper in days on a processor, and paper-cpu does so in a
-    small size, if the method has them (docs/paper_preset.md)."""
+    """How thorough the training is. draft has fewer steps; standard has the defaults; fine has twice as many steps, for
+    0.1 to 0.7 dB; paper repeats the method's paper in days on a processor, and paper-cpu does so in a small size, if
+    the method has them (docs/paper_preset.md)."""
     split: Split = "blocks"
     """Frames held out for scoring: every fifth block of 10 frames (blocks), the last 20 % (tail), or nothing (none).
     gaussian-avatars: the sequence and the camera that the paper holds out, for its subjects (docs/using.md)."""
