@@ -56,8 +56,9 @@ def test_evaluate_writes_metrics_and_report(workspace: tuple[Path, Path]) -> Non
     assert wanted <= set(stored["training"])
     assert stored["training"]["steps"] == STEPS
     page = (run_dir / "report.html").read_text()
-    assert page.count("<img") == 38, "34, and a filmed frame and the strip of faces"
+    assert page.count("<img") == 40, "34, truth and avatar over dark blue, a filmed frame, and the strip of faces"
     assert "Filmed and made up" in page
+    assert page.count(", over dark blue</figcaption>") == 2
     assert f"{entry['psnr']:.2f} dB" in page
 
 

@@ -70,7 +70,7 @@ def test_help_all_shows_where_presets_differ(method: str, capsys: pytest.Capture
 def test_help_all_with_a_preset_shows_its_values(capsys: pytest.CaptureFixture[str]) -> None:
     about = about_options(help_of(capsys, "create", "--preset", "paper", "--help-all"))
     assert about["--method.sh-degree"].endswith("(from 0 to 3; default: 3; draft, standard, fine: 0)")
-    assert about["--background"].endswith("(default: white; draft, standard: auto)")
+    assert about["--background"].endswith("(default: white; draft, standard, fine: auto)")
 
 
 def test_help_all_shows_what_a_file_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

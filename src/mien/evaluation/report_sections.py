@@ -10,12 +10,12 @@ import torch
 
 from mien import runtime
 from mien.avatar import Avatar
-from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
+from mien.evaluation.experiment import DARK, Experiment, avatar_image, head_box, target_image
 from mien.evaluation.living import SIDE, strip, to_bytes
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import BASELINE_NAMES
+from mien.evaluation.metrics_file import BASELINE_NAMES, OVER_DARK_NAME
 from mien.evaluation.page import Card, Cell, DataTable, Picture, Video, figure_text, picture_of, video_of
-from mien.evaluation.protocols import AVATAR, MESH, Evaluation
+from mien.evaluation.protocols import AVATAR, MESH, OVER_DARK, Evaluation
 from mien.pictures import Box, error_heat, picture_uri, to_uint8
 from mien.plots import Axes, Series, line_chart
 from mien.render.mesh import render_mesh
@@ -220,7 +220,10 @@ def _overlay(experiment: Experiment, frame: Frame) -> Picture:
 
 
 def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> list[Picture]:
-    """The median held-out frame as truth, mean training picture, coloured mesh and avatar; none without baselines."""
+    """The median held-out frame as truth, mean training picture, coloured mesh and avatar; none without baselines.
+
+    If the avatar is scored over dark blue, truth and avatar are shown over it, too: holes do not show over white.
+    """
     if evaluation.baselines is None:
         return []
     frame = evaluation.frames[evaluation.ranked()[len(evaluation.frames) // 2]]
@@ -230,6 +233,9 @@ def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> list[Pi
         BASELINE_NAMES["mesh"]: evaluation.baselines.mesh_image(experiment, frame),
         "avatar": avatar_image(experiment, frame),
     }
+    if OVER_DARK in evaluation.scores:
+        pictures[f"truth, {OVER_DARK_NAME}"] = target_image(experiment, frame, DARK)
+        pictures[f"avatar, {OVER_DARK_NAME}"] = avatar_image(experiment, frame, background=DARK)
     return [picture_of(to_uint8(picture), name, _PICTURE_SIZE, name) for name, picture in pictures.items()]
 
 
