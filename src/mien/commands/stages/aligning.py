@@ -77,6 +77,7 @@ def run_alignment_stage(
         for other in workspace.root.glob("sequences/.alignment-*"):
             if other != folder and other.is_dir():
                 remove_tree(other)  # kept for another tracking or other settings
+        say(f"{', '.join(names)}: frames are aligned to a quick avatar, which is trained first")
         faces = align(before, face_model, settings, training, folder)
         aligned = {"fingerprint": fingerprint, **_choices(settings, training)}
         for sequence, face in zip(before, faces, strict=True):

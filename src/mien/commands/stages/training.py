@@ -22,6 +22,7 @@ from mien.training import (
     with_named_split,
     with_own_split,
 )
+from mien.training.run import is_finished
 from mien.training.trainer import check_trackings
 from mien.workspace import Workspace
 
@@ -110,6 +111,8 @@ def run_training_stage(
     loaded, face_model = read_together(workspace, sequences)
     _tell_covered(loaded, settings)
     with ExitStack() as closing:
+        if not is_finished(run_dir):
+            say(f"{run}: looks for what the pictures show of the head, before the first step")
         live = LiveView(run, loaded[0].tracking.cameras[0]) if view else None
         if live is not None:
             closing.callback(live.close)
