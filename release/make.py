@@ -21,7 +21,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_SDIST_BYTES = 6_000_000
-"""Largest sdist. 4.5 MB of it are MediaPipe's networks, which the package needs."""
+"""Largest sdist. What a wheel needs takes 5.6 MB, compressed: MediaPipe's networks 4.0 MB, the landmarks' calibration
+0.3 MB, Python and C++ 1.2 MB. Without the networks, a wheel from source lacks the webcam and the litert detector."""
 PARTS = ("sdist", "wheels", "npm", "docs")
 
 
