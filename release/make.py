@@ -105,12 +105,18 @@ def copy_tracked(folder: Path) -> None:
 
 def make_wheels(out: Path, pythons: Sequence[str]) -> None:
     """Wheels for many machines by cibuildwheel, or for this machine alone."""
-    if shutil.which("docker") or shutil.which("podman"):
+    if has_containers():
         run("uv", "tool", "run", "cibuildwheel", "--output-dir", str(out), str(ROOT))
         return
     for python in pythons:
         run("uv", "build", "--wheel", "--python", python, "--out-dir", str(out), str(ROOT))
     (out / ".gitignore").unlink(missing_ok=True)
+
+
+def has_containers() -> bool:
+    """Say whether Docker or Podman answers. Docker's command is often installed where its service does not run."""
+    engines = filter(shutil.which, ("docker", "podman"))
+    return any(subprocess.run([engine, "info"], capture_output=True, check=False).returncode == 0 for engine in engines)
 
 
 def make_npm(out: Path) -> None:

@@ -84,6 +84,18 @@ def test_the_source_distribution_is_small(tmp_path: Path, monkeypatch: pytest.Mo
     assert not [name for name in names if name.startswith(unneeded)]
 
 
+@pytest.mark.parametrize(("code", "answers"), [(0, True), (1, False), (None, False)])
+def test_containers_need_a_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None, answers: bool
+) -> None:
+    """Without one, wheels are those of this machine."""
+    if code is not None:
+        (tmp_path / "docker").write_text(f"#!/bin/sh\nexit {code}\n")
+        (tmp_path / "docker").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert make.has_containers() is answers
+
+
 def test_a_folder_with_files_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "old.whl").write_bytes(b"")
     assert make.main(["--out", str(tmp_path), "--parts", "sdist"]) == 2
