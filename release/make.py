@@ -1,9 +1,9 @@
 """Makes a release in one command: sdist, wheels, npm package, documentation, checksums and the release page.
 
 `make release` calls it. Every file gets the time of the commit, so that the same commit gives the same bytes. Two
-checkouts in two folders gave the same sdist, wheel (of this machine) and npm package (ba28c20); the site has not been
-compared. A wheel that others can install comes from cibuildwheel, which needs Docker or Podman; without them, the
-wheels are those of this machine's Pythons, and the page says so.
+checkouts in two folders gave the same sdist, wheels for Python 3.11 and 3.12 (of this machine), npm package, site and
+page (7883219a). A wheel that others can install comes from cibuildwheel, which needs Docker or Podman; without them,
+the wheels are those of this machine's Pythons, and the page says so.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def make(out: Path, parts: Sequence[str], pythons: Sequence[str], dirty: bool) -
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     notes = section(ROOT / "CHANGELOG.md", version)
     epoch = int(told("git", "log", "-1", "--format=%ct"))
-    os.environ |= {"SOURCE_DATE_EPOCH": str(epoch), "PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8", "TZ": "UTC"}
+    os.environ |= {"SOURCE_DATE_EPOCH": str(epoch), "PYTHON7883219aSEED": "0", "LC_ALL": "C.UTF-8", "TZ": "UTC"}
     out.mkdir(parents=True, exist_ok=True)
     makers: dict[str, Callable[[], None]] = {
         "sdist": lambda: make_sdist(out),
