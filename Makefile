@@ -168,8 +168,8 @@ release: setup
 
 # The native core for other systems: built by zig, run under qemu-user (aarch64) and Wine (Windows), linked for macOS.
 elsewhere: setup
-	@for program in qemu-aarch64-static wine; do command -v $$program >/dev/null || { \
-	  echo "No $$program: run 'apt-get install qemu-user-static wine'."; exit 1; }; done
+	@for program in qemu-aarch64-static wine /usr/aarch64-linux-gnu/lib/ld-linux-aarch64.so.1; do command -v $$program >/dev/null || { \
+	  echo "No $$program: run 'apt-get install qemu-user-static libc6-arm64-cross wine'."; exit 1; }; done
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --require-hashes --no-deps -r requirements/ziglang.txt
 	$(MAKE) -C native/checks elsewhere ZIG="$(abspath $(BIN))/python -m ziglang"
 

@@ -7,9 +7,9 @@
 namespace mien::MIEN_ISA {
 namespace {
 
-constexpr float kSharpness = 100.0f, kOctaves = 144.26950409f;  // 100 / ln 2
-constexpr float kStep = 0.0069314718f;                          // ln 2 / 100
-constexpr float kLeast = -64.0f;  // 2^x below this is nothing beside 1, and still in the range of exp2_fast
+constexpr float kOctaves = 144.26950409f;  // 100 / ln 2
+constexpr float kStep = 0.0069314718f;     // ln 2 / 100
+constexpr float kLeast = -64.0f;           // 2^x below this is nothing beside 1, and still in the range of exp2_fast
 
 // ln(1 + exp(100 x)) / 100
 MIEN_INLINE F softplus(F x) {

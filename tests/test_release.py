@@ -63,6 +63,39 @@ def test_the_source_has_what_git_knows_alone(tmp_path: Path) -> None:
     assert {path.stat().st_mode & 0o777 for path in (tmp_path / "source").rglob("*.py")} == {0o644}
 
 
+def test_the_source_distribution_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has what a wheel is built from, without history, tests and pictures."""
+    from scikit_build_core.build import build_sdist
+
+    make.copy_tracked(tmp_path / "source")
+    monkeypatch.chdir(tmp_path / "source")
+    archive = tmp_path / build_sdist(str(tmp_path))
+    assert archive.stat().st_size < make.MOST_SDIST_BYTES
+    with tarfile.open(archive) as tar:
+        names = {name.partition("/")[2] for name in tar.getnames()}
+    needed = {
+        "pyproject.toml",
+        "CMakeLists.txt",
+        "native/bindings.cpp",
+        "src/mien/export/landmarker/face_landmarker.task",
+    }
+    assert needed <= names
+    unneeded = ("tests/", "web/", ".ci/", "benchmarks/", "docs/images/", "docs/pictures/", "docs/log.md")
+    assert not [name for name in names if name.startswith(unneeded)]
+
+
+@pytest.mark.parametrize(("code", "answers"), [(0, True), (1, False), (None, False)])
+def test_containers_need_a_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None, answers: bool
+) -> None:
+    """Without one, wheels are those of this machine."""
+    if code is not None:
+        (tmp_path / "docker").write_text(f"#!/bin/sh\nexit {code}\n")
+        (tmp_path / "docker").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert make.has_containers() is answers
+
+
 def test_a_folder_with_files_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "old.whl").write_bytes(b"")
     assert make.main(["--out", str(tmp_path), "--parts", "sdist"]) == 2
