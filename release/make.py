@@ -60,7 +60,7 @@ def make(out: Path, parts: Sequence[str], pythons: Sequence[str], dirty: bool) -
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     notes = section(ROOT / "CHANGELOG.md", version)
     epoch = int(told("git", "log", "-1", "--format=%ct"))
-    os.environ |= {"SOURCE_DATE_EPOCH": str(epoch), "PYTHON7883219aSEED": "0", "LC_ALL": "C.UTF-8", "TZ": "UTC"}
+    os.environ |= {"SOURCE_DATE_EPOCH": str(epoch), "PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8", "TZ": "UTC"}
     out.mkdir(parents=True, exist_ok=True)
     makers: dict[str, Callable[[], None]] = {
         "sdist": lambda: make_sdist(out),
