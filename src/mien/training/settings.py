@@ -193,5 +193,5 @@ PRESETS = {
         Preset("paper-cpu", _OPEN, published=True),
     )
 }
-"""Presets by name. `standard` is the defaults. `fine` takes twice as many steps. `paper` repeats the method's paper, and
-`paper-cpu` is the same in a size that a processor can train; not every method has them."""
+"""Presets by name. `standard` is the defaults. `fine` takes twice as many steps. `paper` repeats the method's paper,
+and `paper-cpu` is the same in a size that a processor can train; not every method has them."""
