@@ -1,11 +1,16 @@
 """The process of a row for trials of engines: it appends to a list of begins, waits, and fails where it is told to.
 
+A lock of its own, apart from mien's, tells whether a row runs twice at the same time: the list then has `overlap NAME`.
+
 Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`.
 """
 
+import fcntl
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from mien.batch import Batch, Row, row_process
@@ -22,6 +27,12 @@ def stub_row(name: str, *steps: tuple[str, str], memory_mb: float = 100.0) -> Ro
 def do_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
     """Run the stub steps. Begins and ends are appended to one file, so that overlaps and losses show."""
     place = batch.root / "begins.txt"
+    with watched(place, row.name):
+        return do_steps(place, row)
+
+
+def do_steps(place: Path, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
+    """Run the steps, with a begin and an end."""
     note(place, f"begin {row.name} {os.getpid()}\n")
     value = 0.0
     for what, argument in row.steps:
@@ -37,6 +48,19 @@ def do_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, object], ...], dict
     return ({"run": "stub", "method": "stub", "psnr": value},), {"sleep": 0.0}
 
 
+@contextmanager
+def watched(place: Path, name: str) -> Iterator[None]:
+    """Hold a lock on the row, and note it if another process or thread holds it."""
+    folder = place.parent / "watch"
+    folder.mkdir(exist_ok=True)
+    with (folder / name).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            note(place, f"overlap {name} {os.getpid()}\n")
+        yield
+
+
 def note(path: Path, line: str) -> None:
     """Append a line at once."""
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
@@ -46,7 +70,7 @@ def note(path: Path, line: str) -> None:
 
 def tries(path: Path, name: str) -> int:
     """How often a row began."""
-    return path.read_text().split().count(name) if path.exists() else 0
+    return path.read_text().count(f"begin {name} ") if path.exists() else 0
 
 
 if __name__ == "__main__":
