@@ -119,6 +119,13 @@ def test_mistakes_in_a_table_are_named_before_any_work(table: Path, text: str, w
     assert "\n" not in str(caught.value)
 
 
+def test_a_row_that_ends_well_is_claimed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    claims = []
+    monkeypatch.setattr("mien.batch.row.hold", lambda *places: claims.append(places) or hold(*places))
+    assert run_stubs(Batch(tmp_path), [stub_row("good", ("sleep", "0"))]) == {"good": "done"}
+    assert claims == []  # the row's own process has the only claim
+
+
 @pytest.fixture
 def subjects(tmp_path: Path) -> Path:
     """Return a folder with ten people of IMavatar's layout."""
