@@ -2,7 +2,8 @@
 
 A lock of its own, apart from mien's, tells whether a row runs twice at the same time: the list then has `overlap NAME`.
 
-Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`.
+Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`,
+`make NAME` (a file in the workspace, and `drop NAME` removes it), `size PATH` (of a file, as the value).
 """
 
 import fcntl
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from mien.batch import Batch, Row, row_process
 from mien.batch.row import RowFailedError
+from mien.batch.store import fetched
 
 PROGRAM = (sys.executable, str(Path(__file__).resolve()))
 
@@ -28,10 +30,10 @@ def do_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, object], ...], dict
     """Run the stub steps. Begins and ends are appended to one file, so that overlaps and losses show."""
     place = batch.root / "begins.txt"
     with watched(place, row.name):
-        return do_steps(place, row)
+        return do_steps(batch, place, row)
 
 
-def do_steps(place: Path, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
+def do_steps(batch: Batch, place: Path, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
     """Run the steps, with a begin and an end."""
     note(place, f"begin {row.name} {os.getpid()}\n")
     value = 0.0
@@ -44,6 +46,12 @@ def do_steps(place: Path, row: Row) -> tuple[tuple[dict[str, object], ...], dict
             _ = bytearray(int(argument) << 20)
         elif what == "value":
             value = float(argument)
+        elif what == "size":
+            value = float(Path(fetched(argument, batch.root / "inputs")).stat().st_size)
+        elif what in ("make", "drop"):
+            path = batch.workspace(row.name) / argument
+            path.parent.mkdir(parents=True, exist_ok=True)
+            note(path, f"{row.name}\n") if what == "make" else path.unlink()
     note(place, f"end {row.name} {os.getpid()}\n")
     return ({"run": "stub", "method": "stub", "psnr": value},), {"sleep": 0.0}
 

@@ -22,7 +22,7 @@ from typing import Any
 from batch_stub import do_stub, stub_row
 from mien.batch import Batch, Driver, EngineOptions, Row, State, run_row, write_results
 
-_JOBS = 64
+_JOBS = int(os.environ.get("MIEN_TRIAL_JOBS", "64"))
 _PER_KILL_SECONDS = 8.0
 """Mean time between two kills."""
 

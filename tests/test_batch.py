@@ -1,6 +1,7 @@
 """`mien batch`: tables become rows, rows run once, failures stay alone, and results tell what came of them."""
 
 import csv
+import importlib
 import json
 import os
 import signal
@@ -8,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,6 +37,7 @@ from mien.cli import main
 from mien.commands.stages.batch_table import read_table
 from mien.errors import UserError
 from mien.locks import hold
+from needs import NO_ENGINE
 
 
 def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
@@ -254,9 +257,50 @@ def test_memory_is_counted_before_rows_run_side_by_side(tmp_path: Path, monkeypa
 
 def test_workspaces_go_through_a_store(tmp_path: Path):
     pytest.importorskip("fsspec")
+    store = tmp_path / "store"
     batch = Batch(tmp_path / "batch")
-    rows = [stub_row("away", ("value", "22"))]
-    assert run_stubs(batch, rows, store=f"file://{tmp_path / 'store'}") == {"away": "done"}
+    check_store(batch, f"file://{store}")
+    assert sorted(path.name for path in (store / "away").iterdir()) == ["kept"]
+    assert (store / "away" / "kept").read_text() == "away\naway\n"
+
+
+@pytest.mark.slow
+def test_workspaces_go_through_an_object_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    server = needed("moto.server").ThreadedMotoServer("127.0.0.1", 0)
+    s3fs = needed("s3fs")
+    server.start()
+    for name, value in (("ACCESS_KEY_ID", "here"), ("SECRET_ACCESS_KEY", "here"), ("DEFAULT_REGION", "us-east-1")):
+        monkeypatch.setenv(f"AWS_{name}", value)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*server.get_host_and_port()))
+    try:
+        files = s3fs.S3FileSystem(skip_instance_cache=True)
+        files.mkdir("bucket")
+        files.pipe_file("bucket/clips/ann.mp4", b"a video")
+        batch = Batch(tmp_path)
+        check_store(batch, "s3://bucket/people", ("size", "s3://bucket/clips/ann.mp4"))
+        state = batch.read_state("away")
+        assert state is not None
+        assert state.runs[0]["psnr"] == 7.0
+        assert files.find("bucket/people") == ["bucket/people/away/kept"]
+        assert files.cat_file("bucket/people/away/kept") == b"away\naway\n"
+    finally:
+        server.stop()
+
+
+def needed(name: str) -> Any:
+    """A module that `make batch-engines` installs."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError:
+        pytest.skip(NO_ENGINE)
+
+
+def check_store(batch: Batch, store: str, *steps: tuple[str, str]) -> None:
+    """Run a row through a store whose second try finds the workspace of the first."""
+    first = [stub_row("away", ("make", "kept"), ("make", "passing"), ("fail", "no face"))]
+    assert run_stubs(batch, first, store=store, retry=0) == {"away": "failed"}
+    row = stub_row("away", ("make", "kept"), ("drop", "passing"), *steps)
+    assert run_stubs(batch, [row], store=store) == {"away": "done"}
     assert (batch.log_file("away")).is_file()
     assert not (batch.root / "begins.txt").exists()  # it ran elsewhere
 
