@@ -126,7 +126,8 @@ def main() -> None:
         if "driver" in what:
             drivers[-1].wait()
             drivers.append(subprocess.Popen(command))
-    print("exit code", drivers[-1].wait())
+    code = drivers[-1].wait() or subprocess.call(command)
+    print("exit code", code)
     tell(root)
 
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from mien.batch import (
     Driver,
     EngineOptions,
     Row,
+    State,
     batch_progress,
     latex_table,
     markdown_table,
@@ -38,6 +40,7 @@ from mien.commands.stages.batch_table import read_table
 from mien.errors import UserError
 from mien.locks import hold
 from needs import NO_ENGINE
+from other_process import Holder
 
 
 def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
@@ -127,6 +130,54 @@ def test_a_row_that_ends_well_is_claimed_once(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("mien.batch.row.hold", lambda *places: claims.append(places) or hold(*places))
     assert run_stubs(Batch(tmp_path), [stub_row("good", ("sleep", "0"))]) == {"good": "done"}
     assert claims == []  # the row's own process has the only claim
+
+
+def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(
+    tmp_path: Path, mortal: Holder, monkeypatch: pytest.MonkeyPatch
+):
+    batch, row, queued = Batch(tmp_path / "people"), stub_row("long", ("sleep", "0")), tmp_path / "queued"
+    batch.write_plan([row])
+    for path, text in (
+        (tmp_path / "squeue", f"#!/bin/sh\ncat {queued} 2>/dev/null; true\n"),
+        (queued, "77_0 RUNNING\n"),
+    ):
+        path.write_text(text)
+        path.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr("mien.batch.engines.slurm._POLL_SECONDS", 0.05)
+    (batch.root / "slurm").mkdir()
+    (batch.root / "slurm" / "jobs.txt").write_text("77")
+
+    def finish() -> None:
+        with mortal.holding(batch.state_file("long")):
+            held.set()
+            time.sleep(0.5)
+            batch.write_state(State("long", "done", row.fingerprint))
+        queued.unlink()
+
+    held = threading.Event()
+    task = threading.Thread(target=finish)
+    task.start()
+    assert held.wait(30)
+    driver(batch, engine="slurm").run([row])
+    assert not queued.exists()
+    assert batch.is_done(row)
+    task.join()
+
+
+def test_what_killed_processes_left_beside_the_states_is_removed_in_the_end(tmp_path: Path):
+    batch, long = Batch(tmp_path), "l" * 120
+    rows = [stub_row("killed", ("sleep", "0")), stub_row(long, ("sleep", "0")), stub_row("other", ("sleep", "0"))]
+    assert set(run_stubs(batch, rows).values()) == {"done"}
+    left = [tmp_path / "states" / name for name in (".killed.json.ab_9.json", f".{long[:100]}.ab_9.json")]
+    left.append(tmp_path / "states" / ".killed.json.lock")
+    held = tmp_path / "states" / ".other.json.ab_9.json"
+    for path in (*left, held):
+        path.touch()
+    with hold(batch.state_file("other")):
+        run_stubs(batch, rows)
+        assert held.exists()
+    assert sorted(path.name for path in (tmp_path / "states").glob(".*")) == [held.name]
 
 
 @pytest.fixture
@@ -311,8 +362,6 @@ def scored(batch: Batch) -> list[dict[str, object]]:
     for person, light in (("ann", "sun"), ("bob", "lamp"), ("eve", "sun")):
         rows.append(Row(person, (), {"light": light}))
     batch.write_plan(rows)
-    from mien.batch import State
-
     for index, row in enumerate(rows[:2]):
         runs = tuple(
             {"run": m, "method": m, "psnr": 30.0 + index + gain, "perceptual": 0.1}

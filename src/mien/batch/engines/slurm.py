@@ -9,16 +9,20 @@ import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from mien.batch.engines import EngineOptions, Work
 from mien.batch.plan import Batch, Row
 from mien.errors import UserError
 from mien.files import write_atomically
+from mien.progress import say
 
 _MOST_TASKS = 1000
 """Largest number of tasks of an array. Slurm's default limit is 1001."""
 _POLL_SECONDS = 2.0
+_NOTED = "slurm/jobs.txt"
+"""The file in the batch's folder that has the numbers of jobs which have not ended."""
 _DEFAULT_MINUTES, _SLACK, _LEAST_MINUTES = 24 * 60, 3.0, 10
 
 
@@ -41,14 +45,10 @@ class _Task:
 
 def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
     """Run the rows as job arrays, one for each class of memory. See `mien.batch.engines`."""
-    batch, noted = Batch(options.root), options.root / "slurm" / "jobs.txt"
-    left, refused = list(rows), dict[str, UserError]()
-    if noted.is_file():  # an earlier driver has submitted them
-        _wait(noted.read_text(encoding="utf-8").strip())
-        left = [row for row in rows if not batch.is_done(row)]
-    numbers: list[str] = []
-    size = math.ceil(len(left) / _MOST_TASKS)
-    for alike in _by_memory(left):
+    batch, noted = Batch(options.root), options.root / _NOTED
+    numbers, refused = list[str](), dict[str, UserError]()
+    size = math.ceil(len(rows) / _MOST_TASKS)
+    for alike in _by_memory(rows):
         try:
             numbers.append(_submit(work, alike, options, size))
         except UserError as error:
@@ -59,6 +59,15 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
     noted.unlink(missing_ok=True)
     for row in rows:
         yield row, refused.get(row.name) or batch.read_state(row.name)
+
+
+def wait_for_earlier(root: Path) -> None:
+    """Wait for the jobs of a driver that has ended before them. Their rows run, so no other driver could take them."""
+    noted = root / _NOTED
+    if noted.is_file():
+        say("waiting for the rows that an earlier command has given to Slurm")
+        _wait(noted.read_text(encoding="utf-8").strip())
+        noted.unlink(missing_ok=True)
 
 
 def _by_memory(rows: Sequence[Row]) -> list[list[Row]]:
