@@ -1,15 +1,22 @@
 """The process of a row for trials of engines: it appends to a list of begins, waits, and fails where it is told to.
 
-Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`.
+A lock of its own, apart from mien's, tells whether a row runs twice at the same time: the list then has `overlap NAME`.
+
+Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`,
+`make NAME` (a file in the workspace, and `drop NAME` removes it), `size PATH` (of a file, as the value).
 """
 
+import fcntl
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from mien.batch import Batch, Row, row_process
 from mien.batch.row import RowFailedError
+from mien.batch.store import fetched
 
 PROGRAM = (sys.executable, str(Path(__file__).resolve()))
 
@@ -22,6 +29,12 @@ def stub_row(name: str, *steps: tuple[str, str], memory_mb: float = 100.0) -> Ro
 def do_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
     """Run the stub steps. Begins and ends are appended to one file, so that overlaps and losses show."""
     place = batch.root / "begins.txt"
+    with watched(place, row.name):
+        return do_steps(batch, place, row)
+
+
+def do_steps(batch: Batch, place: Path, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
+    """Run the steps, with a begin and an end."""
     note(place, f"begin {row.name} {os.getpid()}\n")
     value = 0.0
     for what, argument in row.steps:
@@ -33,8 +46,27 @@ def do_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, object], ...], dict
             _ = bytearray(int(argument) << 20)
         elif what == "value":
             value = float(argument)
+        elif what == "size":
+            value = float(Path(fetched(argument, batch.root / "inputs")).stat().st_size)
+        elif what in ("make", "drop"):
+            path = batch.workspace(row.name) / argument
+            path.parent.mkdir(parents=True, exist_ok=True)
+            note(path, f"{row.name}\n") if what == "make" else path.unlink()
     note(place, f"end {row.name} {os.getpid()}\n")
     return ({"run": "stub", "method": "stub", "psnr": value},), {"sleep": 0.0}
+
+
+@contextmanager
+def watched(place: Path, name: str) -> Iterator[None]:
+    """Hold a lock on the row, and note it if another process or thread holds it."""
+    folder = place.parent / "watch"
+    folder.mkdir(exist_ok=True)
+    with (folder / name).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            note(place, f"overlap {name} {os.getpid()}\n")
+        yield
 
 
 def note(path: Path, line: str) -> None:
@@ -46,7 +78,7 @@ def note(path: Path, line: str) -> None:
 
 def tries(path: Path, name: str) -> int:
     """How often a row began."""
-    return path.read_text().split().count(name) if path.exists() else 0
+    return path.read_text().count(f"begin {name} ") if path.exists() else 0
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # Starts a real Slurm of two nodes on this host, as root, with a folder for its files: tests/slurm_here.sh FOLDER
+# SLURM_HERE_CPUS says how many cores each node claims to have, 2 by default.
 # Prints SLURM_CONF=FILE. `tests/slurm_here.sh FOLDER stop` ends what it started. It needs Debian's slurm-wlm and munge.
 set -euo pipefail
 folder=$(mkdir -p "$1" && cd "$1" && pwd)
@@ -33,14 +34,15 @@ ReturnToService=2
 MpiDefault=none
 JobRequeue=1
 KillWait=5
+SlurmdParameters=config_overrides
 SchedulerParameters=sched_min_interval=100000
-NodeName=n1 NodeHostname=$host NodeAddr=127.0.0.1 Port=17818 CPUs=2 RealMemory=4000 State=UNKNOWN
-NodeName=n2 NodeHostname=$host NodeAddr=127.0.0.1 Port=17819 CPUs=2 RealMemory=4000 State=UNKNOWN
+NodeName=n1 NodeHostname=$host NodeAddr=127.0.0.1 Port=17818 CPUs=${SLURM_HERE_CPUS:-2} RealMemory=4000 State=UNKNOWN
+NodeName=n2 NodeHostname=$host NodeAddr=127.0.0.1 Port=17819 CPUs=${SLURM_HERE_CPUS:-2} RealMemory=4000 State=UNKNOWN
 PartitionName=main Nodes=n1,n2 Default=YES MaxTime=INFINITE State=UP
 END
 export SLURM_CONF=$folder/slurm.conf
 slurmctld -L "$folder/slurmctld.log"
-for node in n1 n2; do slurmd -N "$node" -L "$folder/$node.log"; done
+for node in n1 n2; do nice -n 10 slurmd -N "$node" -L "$folder/$node.log"; done
 for _ in $(seq 60); do
   [ "$(sinfo -h -N -t idle 2>/dev/null | wc -l)" = 2 ] && break
   sleep 0.5

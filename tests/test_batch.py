@@ -1,13 +1,16 @@
 """`mien batch`: tables become rows, rows run once, failures stay alone, and results tell what came of them."""
 
 import csv
+import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from mien.batch import (
     Driver,
     EngineOptions,
     Row,
+    State,
     batch_progress,
     latex_table,
     markdown_table,
@@ -35,6 +39,8 @@ from mien.cli import main
 from mien.commands.stages.batch_table import read_table
 from mien.errors import UserError
 from mien.locks import hold
+from needs import NO_ENGINE
+from other_process import Holder
 
 
 def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
@@ -117,6 +123,61 @@ def test_mistakes_in_a_table_are_named_before_any_work(table: Path, text: str, w
         read_table(table)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_row_that_ends_well_is_claimed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    claims = []
+    monkeypatch.setattr("mien.batch.row.hold", lambda *places: claims.append(places) or hold(*places))
+    assert run_stubs(Batch(tmp_path), [stub_row("good", ("sleep", "0"))]) == {"good": "done"}
+    assert claims == []  # the row's own process has the only claim
+
+
+def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(
+    tmp_path: Path, mortal: Holder, monkeypatch: pytest.MonkeyPatch
+):
+    batch, row, queued = Batch(tmp_path / "people"), stub_row("long", ("sleep", "0")), tmp_path / "queued"
+    batch.write_plan([row])
+    for path, text in (
+        (tmp_path / "squeue", f"#!/bin/sh\ncat {queued} 2>/dev/null; true\n"),
+        (queued, "77_0 RUNNING\n"),
+    ):
+        path.write_text(text)
+        path.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr("mien.batch.engines.slurm._POLL_SECONDS", 0.05)
+    (batch.root / "slurm").mkdir()
+    (batch.root / "slurm" / "jobs.txt").write_text("77")
+
+    def finish() -> None:
+        with mortal.holding(batch.state_file("long")):
+            held.set()
+            time.sleep(0.5)
+            batch.write_state(State("long", "done", row.fingerprint))
+        queued.unlink()
+
+    held = threading.Event()
+    task = threading.Thread(target=finish)
+    task.start()
+    assert held.wait(30)
+    driver(batch, engine="slurm").run([row])
+    assert not queued.exists()
+    assert batch.is_done(row)
+    task.join()
+
+
+def test_what_killed_processes_left_beside_the_states_is_removed_in_the_end(tmp_path: Path):
+    batch, long = Batch(tmp_path), "l" * 120
+    rows = [stub_row("killed", ("sleep", "0")), stub_row(long, ("sleep", "0")), stub_row("other", ("sleep", "0"))]
+    assert set(run_stubs(batch, rows).values()) == {"done"}
+    left = [tmp_path / "states" / name for name in (".killed.json.ab_9.json", f".{long[:100]}.ab_9.json")]
+    left.append(tmp_path / "states" / ".killed.json.lock")
+    held = tmp_path / "states" / ".other.json.ab_9.json"
+    for path in (*left, held):
+        path.touch()
+    with hold(batch.state_file("other")):
+        run_stubs(batch, rows)
+        assert held.exists()
+    assert sorted(path.name for path in (tmp_path / "states").glob(".*")) == [held.name]
 
 
 @pytest.fixture
@@ -247,9 +308,50 @@ def test_memory_is_counted_before_rows_run_side_by_side(tmp_path: Path, monkeypa
 
 def test_workspaces_go_through_a_store(tmp_path: Path):
     pytest.importorskip("fsspec")
+    store = tmp_path / "store"
     batch = Batch(tmp_path / "batch")
-    rows = [stub_row("away", ("value", "22"))]
-    assert run_stubs(batch, rows, store=f"file://{tmp_path / 'store'}") == {"away": "done"}
+    check_store(batch, f"file://{store}")
+    assert sorted(path.name for path in (store / "away").iterdir()) == ["kept"]
+    assert (store / "away" / "kept").read_text() == "away\naway\n"
+
+
+@pytest.mark.slow
+def test_workspaces_go_through_an_object_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    server = needed("moto.server").ThreadedMotoServer("127.0.0.1", 0)
+    s3fs = needed("s3fs")
+    server.start()
+    for name, value in (("ACCESS_KEY_ID", "here"), ("SECRET_ACCESS_KEY", "here"), ("DEFAULT_REGION", "us-east-1")):
+        monkeypatch.setenv(f"AWS_{name}", value)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*server.get_host_and_port()))
+    try:
+        files = s3fs.S3FileSystem(skip_instance_cache=True)
+        files.mkdir("bucket")
+        files.pipe_file("bucket/clips/ann.mp4", b"a video")
+        batch = Batch(tmp_path)
+        check_store(batch, "s3://bucket/people", ("size", "s3://bucket/clips/ann.mp4"))
+        state = batch.read_state("away")
+        assert state is not None
+        assert state.runs[0]["psnr"] == 7.0
+        assert files.find("bucket/people") == ["bucket/people/away/kept"]
+        assert files.cat_file("bucket/people/away/kept") == b"away\naway\n"
+    finally:
+        server.stop()
+
+
+def needed(name: str) -> Any:
+    """A module that `make batch-engines` installs."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError:
+        pytest.skip(NO_ENGINE)
+
+
+def check_store(batch: Batch, store: str, *steps: tuple[str, str]) -> None:
+    """Run a row through a store whose second try finds the workspace of the first."""
+    first = [stub_row("away", ("make", "kept"), ("make", "passing"), ("fail", "no face"))]
+    assert run_stubs(batch, first, store=store, retry=0) == {"away": "failed"}
+    row = stub_row("away", ("make", "kept"), ("drop", "passing"), *steps)
+    assert run_stubs(batch, [row], store=store) == {"away": "done"}
     assert (batch.log_file("away")).is_file()
     assert not (batch.root / "begins.txt").exists()  # it ran elsewhere
 
@@ -260,8 +362,6 @@ def scored(batch: Batch) -> list[dict[str, object]]:
     for person, light in (("ann", "sun"), ("bob", "lamp"), ("eve", "sun")):
         rows.append(Row(person, (), {"light": light}))
     batch.write_plan(rows)
-    from mien.batch import State
-
     for index, row in enumerate(rows[:2]):
         runs = tuple(
             {"run": m, "method": m, "psnr": 30.0 + index + gain, "perceptual": 0.1}

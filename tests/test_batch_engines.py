@@ -9,8 +9,10 @@ import shutil
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,15 +23,15 @@ from test_batch import wait_for_begin
 
 
 @pytest.fixture
-def ray_address() -> Iterator[str | None]:
-    """A cluster of two nodes on this host; the second is the last of the processes."""
+def ray_cluster() -> Iterator[Any]:
+    """A cluster of two nodes on this host. Its second node is the only one in `worker_nodes`."""
     try:
         from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         pytest.skip(NO_ENGINE)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "object_store_memory": 80 << 20})
     cluster.add_node(num_cpus=2, object_store_memory=80 << 20)
-    yield cluster.address
+    yield cluster
     cluster.shutdown()
 
 
@@ -41,9 +43,15 @@ def run_with(engine: str, root: Path, rows: list, fault: object = None, **option
     if thread is not None:
         thread.start()
     Driver(batch, engine, EngineOptions(root, 0, 1, **options), 1, "", PROGRAM).run(rows)  # type: ignore[arg-type]
-    assert {row["status"] for row in batch_progress(batch)["rows"]} == {"done"}
     states = [batch.read_state(row.name) for row in rows]
-    return {state.name: state.runs[0]["psnr"] for state in states if state is not None}
+    return {state.name: state.runs[0]["psnr"] for state in states if state is not None and state.status == "done"}
+
+
+def too_large(root: Path) -> str:
+    """The error of the row that needs more memory than any node has."""
+    found = {row["name"]: row for row in batch_progress(Batch(root))["rows"]}
+    assert found["large"]["status"] == "failed"
+    return found["large"]["error"]
 
 
 def rows_of(count: int, seconds: str) -> list:
@@ -51,18 +59,20 @@ def rows_of(count: int, seconds: str) -> list:
 
 
 def overlaps(root: Path) -> int:
-    """How often a row began a second time while its first process was not over."""
-    open_rows: dict[str, str] = {}
-    found = 0
-    for line in (root / "begins.txt").read_text().splitlines():
-        what, name, pid = line.split()
-        if what == "end":
-            open_rows.pop(name, None)
-        else:
-            before = open_rows.get(name)
-            found += before is not None and Path(f"/proc/{before}").exists()
-            open_rows[name] = pid
-    return found
+    """How often a row ran in two processes at the same time."""
+    return (root / "begins.txt").read_text().count("overlap ")
+
+
+def ancestors(process: int) -> Iterator[int]:
+    """The parent of a process, its parent, and so on, as far as they live."""
+    while process > 1 and (place := Path(f"/proc/{process}/stat")).exists():
+        process = int(place.read_text().rpartition(")")[2].split()[1])
+        yield process
+
+
+def lines_of(path: Path) -> list[str]:
+    """The lines of a file that may be missing."""
+    return path.read_text().splitlines() if path.exists() else []
 
 
 EXPECTED = {f"row{index}": 20.0 + index for index in range(4)}
@@ -70,15 +80,54 @@ EXPECTED = {f"row{index}": 20.0 + index for index in range(4)}
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(tmp_path: Path, ray_address: str | None):
+def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(tmp_path: Path, ray_cluster: Any):
     def kill() -> None:
-        row = wait_for_begin(tmp_path, "row1")
-        parent = int(Path(f"/proc/{row}/stat").read_text().rpartition(")")[2].split()[1])
-        os.kill(parent, signal.SIGKILL)
+        os.kill(next(ancestors(wait_for_begin(tmp_path, "row1"))), signal.SIGKILL)
 
-    assert run_with("ray", tmp_path, rows_of(4, "2"), kill, address=ray_address) == EXPECTED
+    assert run_with("ray", tmp_path, rows_of(4, "2"), kill, address=ray_cluster.address) == EXPECTED
     assert overlaps(tmp_path) == 0
     assert (tmp_path / "begins.txt").read_text().count("begin row1 ") == 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: Any):
+    lost = []
+
+    def kill() -> None:
+        processes = [process.pid for _, process in list(ray_cluster.worker_nodes)[0].live_processes()]
+        until = time.monotonic() + 60
+        while not lost and time.monotonic() < until:
+            begun = [line.split() for line in lines_of(tmp_path / "begins.txt")]
+            lost.extend(name for _, name, row in begun if set(ancestors(int(row))) & set(processes))
+            time.sleep(0.05)
+        for process in processes:
+            os.kill(process, signal.SIGKILL)
+
+    assert run_with("ray", tmp_path, rows_of(4, "4"), kill, address=ray_cluster.address) == EXPECTED
+    assert overlaps(tmp_path) == 0
+    assert (tmp_path / "begins.txt").read_text().count(f"begin {lost[0]} ") == 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_row_that_no_node_of_ray_can_hold_fails_alone(
+    tmp_path: Path, ray_cluster: Any, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("mien.batch.engines.on_ray._LOOK_SECONDS", 0.5)
+    monkeypatch.setattr("mien.batch.engines.on_ray._PATIENCE_SECONDS", 1.0)
+    rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of(4, "0.1")]
+    assert run_with("ray", tmp_path, rows, address=ray_cluster.address) == EXPECTED
+    assert "enough memory" in too_large(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("SLURM_CONF" not in os.environ or shutil.which("sbatch") is None, reason=NO_ENGINE)
+def test_a_row_that_no_node_of_slurm_can_hold_fails_alone(tmp_path: Path):
+    pytest.importorskip("submitit")
+    rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of(4, "0.1")]
+    assert run_with("slurm", tmp_path, rows) == EXPECTED
+    assert "Slurm does not take it" in too_large(tmp_path)
 
 
 @pytest.mark.slow

@@ -215,7 +215,8 @@ def _run(name: str, rest: list[str]) -> int:
     asked_threads()
     command.check()
     with orderly_stops():
-        _use_one_torch_thread()
+        if getattr(module, "NEEDS_TORCH", True):
+            _use_one_torch_thread()
         _check_instruction_set()
         command.run()
     return 0

@@ -11,8 +11,6 @@ from importlib.resources import files
 import jinja2
 from markupsafe import Markup, escape
 
-from mien.pictures import ERROR_LIMIT, heat_gradient
-
 
 def render(template: str, **content: object) -> Markup:
     """HTML from a template, which is named by its path in `mien`. Text in `content` is escaped, `Markup` is not."""
@@ -35,5 +33,18 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.filters["with_code"] = with_code
-    environment.globals |= {"heat_gradient": heat_gradient(), "error_limit": f"{ERROR_LIMIT * 255:.0f}"}
+    environment.globals |= {"heat_gradient": _heat_gradient, "error_limit": _error_limit}
     return environment
+
+
+def _heat_gradient() -> str:
+    # Pictures need torch, and pages without them do not.
+    from mien.pictures import heat_gradient
+
+    return heat_gradient()
+
+
+def _error_limit() -> str:
+    from mien.pictures import ERROR_LIMIT
+
+    return f"{ERROR_LIMIT * 255:.0f}"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from mien.batch.engines import PLACES, Engine, EngineOptions, Work
+from mien.batch.engines import EARLIER, PLACES, Engine, EngineOptions, Work
 from mien.batch.plan import Batch, Row, State
 from mien.batch.row import PROGRAM, attempt
 from mien.batch.store import Returned, attempt_in_store
@@ -49,6 +49,8 @@ class Driver:
     def run(self, rows: Sequence[Row]) -> None:
         """Run the rows until each is done, has failed too often, or is run by another command."""
         engine: Engine = named(PLACES[self.engine])
+        if self.engine in EARLIER:
+            named(EARLIER[self.engine])(self.options.root)
         left = [row for row in rows if not self.batch.is_done(row)]
         say(f"{counted(len(rows), 'row')}: {len(rows) - len(left)} done before, {len(left)} to do on {self.engine}")
         with progress_bar("batch", len(rows), len(rows) - len(left)) as advance:
@@ -64,6 +66,7 @@ class Driver:
                 left = [row for row in left if not self.batch.is_done(row)]
                 if not left:
                     break
+        self.batch.remove_leftovers(rows)
 
     def _taken(self, rows: Sequence[Row], claims: ExitStack) -> list[Row]:
         """The rows that no other command runs. With a store, this process claims them, since nodes see no locks."""

@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,14 @@ from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
 from mien.files import expect_whole, read_json, write_atomically, write_json
 from mien.inside import inside, is_plain_name
+from mien.locks import BeingWrittenError, hold
 
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
 WORKSPACE = "{workspace}"
 """Stands for the row's workspace in the words of its steps."""
 _MAX_PLAN_BYTES, _MAX_STATE_BYTES = 256 << 20, 1 << 20
+_KEPT_OF_NAME = 100
+"""Number of characters of a state's name that its temporary file keeps (`mien.files`)."""
 _AGAIN = "run `mien batch TABLE --out DIR` again"
 
 
@@ -134,6 +138,18 @@ class Batch:
     def write_state(self, state: State) -> None:
         """Write the state of a row. The caller holds its lock."""
         write_json(self.state_file(state.name), *STATE, asdict(state))
+
+    def remove_leftovers(self, rows: Sequence[Row]) -> None:
+        """Remove the temporary files and locks that killed processes of these rows left beside the states."""
+        kept = {self.state_file(row.name).name[:_KEPT_OF_NAME]: row.name for row in rows}
+        folder = self.root / "states"
+        for entry in list(os.scandir(folder)) if folder.is_dir() else ():
+            lock = entry.name.endswith(".lock")
+            name = kept.get(entry.name.removeprefix(".").rsplit(".", 1 if lock else 2)[0][:_KEPT_OF_NAME])
+            if entry.name.startswith(".") and name is not None:
+                with suppress(BeingWrittenError), hold(self.state_file(name)):  # the end of `hold` removes a lock
+                    if not lock:
+                        Path(entry.path).unlink(missing_ok=True)
 
     def is_done(self, row: Row) -> bool:
         """Whether the row is done with its present inputs."""

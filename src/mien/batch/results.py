@@ -11,8 +11,8 @@ from typing import Any
 
 from mien.batch.plan import Batch
 from mien.errors import UserError
-from mien.evaluation.metrics_file import COLUMNS
 from mien.files import write_atomically
+from mien.metric_names import COLUMNS
 
 HIGHER = {name: higher for name, _, _, higher in COLUMNS}
 DIGITS = {name: digits for name, _, digits, _ in COLUMNS}

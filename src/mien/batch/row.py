@@ -117,6 +117,9 @@ def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int
 
 def _concluded(batch: Batch, row: Row, code: int) -> State | None:
     """The state after the row's process has ended. If it could not write one itself, this writes why."""
+    found = batch.read_state(row.name)
+    if not code and found is not None and found.status != "running" and found.fingerprint == row.fingerprint:
+        return found  # the row's process wrote it; a lock would double the operations on a shared file system
     try:
         with hold(batch.state_file(row.name)):
             state = batch.read_state(row.name)

@@ -5,9 +5,15 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from mien.batch.plan import Batch, Row, State
 from mien.batch.row import PROGRAM, attempt
+
+_PART = ".mien-part"
+"""Ending of a file that is being copied to a store."""
+_WHOLE = frozenset({"s3", "gs", "az", "abfs", "memory"})
+"""Stores in which a file appears when it is whole."""
 
 
 def is_url(word: str) -> bool:
@@ -60,11 +66,26 @@ def attempt_in_store(store: str, row: Row, program: Sequence[str] = PROGRAM, thr
         if fs.exists(place):
             workspace.parent.mkdir(parents=True)
             fs.get(place, str(workspace), recursive=True)
+            for path in list(workspace.rglob(f"*{_PART}")):
+                path.unlink()
         state = attempt(batch.root, row, program, threads)
         if workspace.is_dir():
-            for path in sorted(path for path in workspace.rglob("*") if path.is_file()):
-                target = f"{place}/{path.relative_to(workspace).as_posix()}"
-                fs.makedirs(target.rpartition("/")[0], exist_ok=True)
-                fs.put_file(str(path), target)
+            _copy_out(fs, workspace, place)
         kept = [*batch.root.glob("thumbs/*"), *batch.root.glob("logs/*")]
         return Returned(state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept})
+
+
+def _copy_out(fs: Any, workspace: Path, place: str) -> None:
+    """Make the store's copy of a workspace equal to it. A kill in between leaves whole files, old or new."""
+    ours = set()
+    for path in sorted(path for path in workspace.rglob("*") if path.is_file()):
+        target = f"{place}/{path.relative_to(workspace).as_posix()}"
+        fs.makedirs(target.rpartition("/")[0], exist_ok=True)
+        if _WHOLE.isdisjoint([fs.protocol] if isinstance(fs.protocol, str) else fs.protocol):
+            fs.put_file(str(path), target + _PART)
+            fs.mv(target + _PART, target)
+        else:
+            fs.put_file(str(path), target)
+        ours.add(target)
+    for gone in set(fs.find(place)) - ours:
+        fs.rm_file(gone)

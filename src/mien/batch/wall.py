@@ -5,8 +5,8 @@ from typing import Any
 
 from mien.batch.plan import Batch
 from mien.batch.results import DIGITS, HIGHER, paired
-from mien.evaluation.metrics_file import COLUMNS
 from mien.files import write_atomically
+from mien.metric_names import COLUMNS
 from mien.pages import render
 from mien.terminal import counted
 

@@ -23,8 +23,8 @@ from mien.capture.fields import Deinterlace, FieldOrder, combs, deinterlace, no_
 from mien.capture.sound import add_sound
 from mien.capture.video_file import TOO_MANY_PIXELS, create_video, open_video, read_container_tags
 from mien.errors import UserError
+from mien.files import write_atomically
 from mien.progress import say
-from mien.storage import write_atomically
 
 _THREADS = 2
 DEFAULT_FPS = 25.0

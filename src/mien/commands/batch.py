@@ -14,6 +14,8 @@ from mien.errors import UserError
 from mien.terminal import show
 
 _WATCH_SECONDS = 5.0
+NEEDS_TORCH = False
+"""Rows run in processes of their own. Without torch, the driver of thousands stays small."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,8 @@ class Command:
         driver.run(shard_of(rows, self.shard) if self.shard else rows)
         write_wall(batch, write_results(batch))
         progress = batch_progress(batch)
-        say(progress_text(progress))
+        for line in progress_text(progress).splitlines():
+            say(line)
         say(f"Look at {self.out / 'index.html'}; the figures are in {self.out / 'results.csv'}")
         failed = progress["counts"].get("failed", 0)
         if failed:

@@ -14,7 +14,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, head_box, targe
 from mien.evaluation.living import FILM
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import COLUMNS, PROTOCOL_NAMES, figure
+from mien.evaluation.metrics_file import PROTOCOL_NAMES, figure
 from mien.evaluation.page import (
     GLOSSARY,
     Card,
@@ -27,6 +27,7 @@ from mien.evaluation.page import (
     picture_of,
 )
 from mien.evaluation.report_sections import frame_name
+from mien.metric_names import COLUMNS
 from mien.pages import render
 from mien.pictures import Box, data_uri, error_heat, picture_uri, to_uint8
 from mien.plots import Axes, Series, line_chart

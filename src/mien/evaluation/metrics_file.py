@@ -6,18 +6,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 from mien.evaluation.experiment import Edges
-from mien.evaluation.scoring import METRICS
 from mien.face import PARTS
 from mien.inside import is_one_line
+from mien.metric_names import METRICS
 from mien.storage import expect_whole, read_json
 
 FORMAT, VERSION = "mien.metrics", 1
 _REMEDY = "delete this file, not its folder, and run `mien evaluate` again"
-COLUMNS = (
-    ("psnr", "PSNR, dB", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False),
-    ("perceptual", "ST-LPIPS", 3, False),
-)  # fmt: skip
-"""Metric, heading, number of digits, whether higher is better."""
 PROTOCOL_NAMES = {
     "self_reenactment": "Self-reenactment",
     "self_reenactment_tail": "Self-reenactment, last part of the sequence",

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
-from mien.evaluation.metrics_file import COLUMNS
+from mien.metric_names import COLUMNS
 from mien.pictures import data_uri, picture_uri, shrink
 
 GLOSSARY = {

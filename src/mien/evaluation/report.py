@@ -16,7 +16,6 @@ from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,
-    COLUMNS,
     FITTED_NAME,
     OVER_DARK_NAME,
     PART_NAMES,
@@ -35,6 +34,7 @@ from mien.evaluation.page import (
     metric_headings,
 )
 from mien.evaluation.protocols import Evaluation
+from mien.metric_names import COLUMNS
 from mien.pages import render
 from mien.storage import write_atomically
 from mien.training.footage import Coverage

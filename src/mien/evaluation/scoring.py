@@ -16,12 +16,12 @@ from torch import Tensor
 
 from mien.evaluation.metrics import Border, crop_to, l1, psnr, ssim
 from mien.face import PARTS
+from mien.metric_names import METRICS
 from mien.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
 from mien.perceptual.lpips import Lpips, load_lpips
 from mien.pictures import Box, to_uint8
 from mien.threads import asked_threads
 
-METRICS = ("psnr", "ssim", "l1", "perceptual")
 LPIPS = "lpips"
 """Exact LPIPS, which stands beside them if its user has the weights."""
 _MAX_THREADS = 8

@@ -41,3 +41,5 @@ PLACES = {
     "ray": "mien.batch.engines.on_ray:run",
 }
 """Name of an engine -> where its function is."""
+EARLIER = {"slurm": "mien.batch.engines.slurm:wait_for_earlier"}
+"""Name of an engine whose rows go on when the driver ends -> where the function is that waits for them."""

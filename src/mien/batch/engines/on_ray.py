@@ -5,6 +5,7 @@ Ray starts a row again if its node is lost. The batch's folder must be shared by
 
 import logging
 import os
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -16,6 +17,12 @@ _LOST_NODES = 3
 """How often Ray starts a row again whose node or worker was lost."""
 _WAITING = 200
 """Rows that are handed to Ray at a time, if no number of jobs is given."""
+_LOOK_SECONDS, _PATIENCE_SECONDS = 30.0, 600.0
+"""How often rows are looked for that fit no node, and how long a cluster may take to start a node for them."""
+_NO_NODE = (
+    f"no node of Ray has had enough memory, cores or GPUs for it for {_PATIENCE_SECONDS / 60:.0f} min; "
+    "see `ray status`, memory_gb, --threads and --gpus"
+)
 
 
 def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
@@ -33,27 +40,48 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
         raise UserError(f"Ray cannot be reached or started ({why}); see `ray status`, and --ray-address") from None
     task = ray.remote(_call)
     running: dict[Any, Row] = {}
+    unfitting: dict[Any, float] = {}
     waiting = list(reversed(rows))
     try:
         while waiting or running:
             while waiting and len(running) < (options.jobs or _WAITING):
                 row = waiting.pop()
-                asked = task.options(
-                    num_cpus=options.threads or 2,
-                    num_gpus=options.gpus,
-                    memory=round(row.memory_mb * 1e6),
-                    max_retries=_LOST_NODES,
-                    name=f"mien {row.name}",
-                )
-                running[asked.remote(work, row)] = row
-            (first, *_), _ = ray.wait(list(running), num_returns=1)
-            row = running.pop(first)
-            try:
-                yield row, ray.get(first)
-            except (RayError, OSError) as error:
-                yield row, error
+                asked = {"num_cpus": options.threads or 2, "num_gpus": options.gpus, "memory": _bytes(row)}
+                asked |= {"max_retries": _LOST_NODES, "name": f"mien {row.name}"}
+                running[task.options(**asked).remote(work, row)] = row
+            ended, _ = ray.wait(list(running), num_returns=1, timeout=_LOOK_SECONDS)
+            for first in ended:
+                row = running.pop(first)
+                try:
+                    yield row, ray.get(first)
+                except (RayError, UserError, OSError) as error:
+                    yield row, error
+            if not ended:
+                for late in _never_started(ray, running, unfitting, options):
+                    ray.cancel(late)
+                    yield running.pop(late), UserError(_NO_NODE)
     finally:
         ray.shutdown()
+
+
+def _bytes(row: Row) -> int:
+    return round(row.memory_mb * 1e6)
+
+
+def _never_started(ray: Any, running: dict[Any, Row], since: dict[Any, float], options: EngineOptions) -> list[Any]:
+    """The tasks that no node of the cluster has been large enough for, for so long that no new one will come.
+
+    Ray would wait for such a node for ever.
+    """
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    now, found = time.monotonic(), []
+    for task, row in running.items():
+        asked = {"CPU": options.threads or 2, "GPU": options.gpus, "memory": _bytes(row)}
+        if any(all(node.get(kind, 0) >= amount for kind, amount in asked.items()) for node in nodes):
+            since.pop(task, None)
+        elif now - since.setdefault(task, now) >= _PATIENCE_SECONDS:
+            found.append(task)
+    return found
 
 
 def _call(work: Work, row: Row) -> Any:

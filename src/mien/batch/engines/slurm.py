@@ -8,16 +8,21 @@ import math
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from mien.batch.engines import EngineOptions, Work
 from mien.batch.plan import Batch, Row
 from mien.errors import UserError
 from mien.files import write_atomically
+from mien.progress import say
 
 _MOST_TASKS = 1000
 """Largest number of tasks of an array. Slurm's default limit is 1001."""
 _POLL_SECONDS = 2.0
+_NOTED = "slurm/jobs.txt"
+"""The file in the batch's folder that has the numbers of jobs which have not ended."""
 _DEFAULT_MINUTES, _SLACK, _LEAST_MINUTES = 24 * 60, 3.0, 10
 
 
@@ -29,7 +34,8 @@ class _Task:
 
     def __call__(self, rows: Sequence[Row]) -> None:
         for row in rows:
-            self.work(row)
+            with suppress(UserError, OSError):  # such as a full disk: the next row may fit
+                self.work(row)
 
     def checkpoint(self, rows: Sequence[Row]) -> Any:
         import submitit  # pyright: ignore[reportMissingImports]
@@ -38,28 +44,62 @@ class _Task:
 
 
 def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
-    """Run the rows as a job array. See `mien.batch.engines`."""
-    import submitit  # pyright: ignore[reportMissingImports]
-
-    batch, folder = Batch(options.root), options.root / "slurm"
-    noted = folder / "jobs.txt"
-    left = list(rows)
-    if noted.is_file():  # an earlier driver has submitted them
-        _wait(noted.read_text(encoding="utf-8").strip())
-        left = [row for row in rows if not batch.is_done(row)]
-    if left:
-        folder.mkdir(parents=True, exist_ok=True)
-        size = math.ceil(len(left) / _MOST_TASKS)
-        tasks = [left[start : start + size] for start in range(0, len(left), size)]
-        executor = submitit.SlurmExecutor(folder, max_num_timeout=10)
-        executor.update_parameters(**_parameters(batch, left, options, size))
-        jobs = executor.map_array(_Task(work), tasks)
-        number = str(jobs[0].job_id).partition("_")[0]
-        write_atomically(noted, lambda aside: aside.write_text(number, encoding="utf-8"))
-        _wait(number)
+    """Run the rows as job arrays, one for each class of memory. See `mien.batch.engines`."""
+    batch, noted = Batch(options.root), options.root / _NOTED
+    numbers, refused = list[str](), dict[str, UserError]()
+    size = math.ceil(len(rows) / _MOST_TASKS)
+    for alike in _by_memory(rows):
+        try:
+            numbers.append(_submit(work, alike, options, size))
+        except UserError as error:
+            refused |= {row.name: error for row in alike}
+            continue
+        write_atomically(noted, lambda aside: aside.write_text(",".join(numbers), encoding="utf-8"))
+    _wait(",".join(numbers))
     noted.unlink(missing_ok=True)
     for row in rows:
-        yield row, batch.read_state(row.name)
+        yield row, refused.get(row.name) or batch.read_state(row.name)
+
+
+def wait_for_earlier(root: Path) -> None:
+    """Wait for the jobs of a driver that has ended before them. Their rows run, so no other driver could take them."""
+    noted = root / _NOTED
+    if noted.is_file():
+        say("waiting for the rows that an earlier command has given to Slurm")
+        _wait(noted.read_text(encoding="utf-8").strip())
+        noted.unlink(missing_ok=True)
+
+
+def _by_memory(rows: Sequence[Row]) -> list[list[Row]]:
+    """The rows whose memory lies between the same powers of two.
+
+    An array asks for the memory of its largest row: one would keep all others from small nodes, or from being taken.
+    """
+    found: dict[int, list[Row]] = {}
+    for row in rows:
+        found.setdefault(math.ceil(math.log2(max(row.memory_mb, 1.0))), []).append(row)
+    return [found[each] for each in sorted(found)]
+
+
+def _submit(work: Work, rows: Sequence[Row], options: EngineOptions, size: int) -> str:
+    """Submit an array with `size` rows in each task, and return its number.
+
+    Raises:
+        UserError: Slurm does not take it.
+    """
+    import submitit  # pyright: ignore[reportMissingImports]
+    from submitit.core.utils import FailedJobError, FailedSubmissionError  # pyright: ignore[reportMissingImports]
+
+    folder = options.root / "slurm"
+    folder.mkdir(parents=True, exist_ok=True)
+    executor = submitit.SlurmExecutor(folder, max_num_timeout=10)
+    executor.update_parameters(**_parameters(Batch(options.root), rows, options, size))
+    try:
+        jobs = executor.map_array(_Task(work), [rows[start : start + size] for start in range(0, len(rows), size)])
+    except (FailedJobError, FailedSubmissionError) as error:
+        why = " ".join(str(error).split())
+        raise UserError(f"Slurm does not take it ({why[-300:]}); see `sinfo -N -o '%N %c %m'`, and memory_gb") from None
+    return str(jobs[0].job_id).partition("_")[0]
 
 
 def _parameters(batch: Batch, rows: Sequence[Row], options: EngineOptions, size: int) -> dict[str, Any]:
@@ -82,10 +122,10 @@ def _parameters(batch: Batch, rows: Sequence[Row], options: EngineOptions, size:
     return found
 
 
-def _wait(number: str) -> None:
-    """Wait until a job has left the queue."""
-    while number.isdigit():
-        asked = subprocess.run(["squeue", "-h", "-j", number], capture_output=True, text=True)
+def _wait(numbers: str) -> None:
+    """Wait until jobs, whose numbers have commas between them, have left the queue."""
+    while numbers and numbers.replace(",", "").isdecimal():
+        asked = subprocess.run(["squeue", "-h", "-j", numbers], capture_output=True, text=True)
         if asked.returncode and "Invalid job id" not in asked.stderr:
             raise UserError(f"squeue: {asked.stderr.strip()[:300]}; correct that and run the same command again")
         if not asked.stdout.strip():

@@ -7,7 +7,7 @@ from mien.capture import CaptureSettings
 from mien.capture.video import probe_video
 from mien.errors import UserError
 from mien.overall import Piece
-from mien.tracking import TrackingSettings, overlay_stride
+from mien.tracking import TrackingSettings
 from mien.training import AlignmentSettings, TrainSettings
 
 _FIND, _CAPTURE, _LANDMARKS, _PIXELS, _SCORING, _OVERLAY = 0.005, 0.036, 0.062, 0.07, 0.015, 0.055
@@ -54,6 +54,8 @@ def expected_pieces(
         overlay: Frames in the overlay: auto, all or none.
         alignment: Settings of the alignment. None if there is none.
     """
+    from mien.tracking import overlay_stride  # it needs torch
+
     pieces, total = [], sum(frames)
     for count in frames:
         pieces += [Piece("capture", "find the face in", _FIND * count), Piece("capture", "capture ", _CAPTURE * count)]
