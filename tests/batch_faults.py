@@ -64,7 +64,7 @@ def kill(process: int) -> None:
 def slurm_task(row: int) -> str:
     """The task of Slurm that runs a row: the number that Slurm gave to its process."""
     words = Path(f"/proc/{row}/environ").read_bytes().decode().split("\0")
-    told = dict(word.partition("=")[::2] for word in words)
+    told = {name: value for name, _, value in (word.partition("=") for word in words)}
     return f"{told['SLURM_ARRAY_JOB_ID']}_{told['SLURM_ARRAY_TASK_ID']}"
 
 
@@ -120,7 +120,8 @@ def main() -> None:
     command += ["--program", program, *(["--ray-address", given.address] if given.address else []), *extra]
     drivers = [subprocess.Popen(command)]
     names = [line.split(",")[0] for line in Path(given.table).read_text().splitlines()[1:]]
-    for name, words, what, make in faults_of(given.engine, *names[:2], lambda: drivers[-1].pid, given.node):
+    first, second = names[:2]
+    for name, words, what, make in faults_of(given.engine, first, second, lambda: drivers[-1].pid, given.node):
         make(wait_until(root, name, words))
         print(f"{name}, {words.strip(': ')}: {what}", flush=True)
         if "driver" in what:
