@@ -32,7 +32,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
     address = options.address or os.environ.get("RAY_ADDRESS")
-    started = {} if address else {"include_dashboard": False}
+    started: dict[str, Any] = {} if address else {"include_dashboard": False}
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, **started)
     except Exception as error:  # Ray has no class of its own for this
