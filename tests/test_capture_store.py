@@ -1,9 +1,12 @@
 """Captures on disk survive a round trip, keep a cache, and report damage."""
 
 import dataclasses
+import importlib.util
 import os
 import shutil
+import sys
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,7 +14,7 @@ import torch
 from capture_helpers import assert_same_capture, random_capture, tree_bytes
 from damage import edit_json
 from mien.camera import camera_from_fov
-from mien.capture import read_capture, read_capture_hash, write_capture
+from mien.capture import frame_files, read_capture, read_capture_hash, write_capture
 from mien.errors import UserError
 
 
@@ -31,6 +34,20 @@ def test_round_trip_is_exact_and_maps_memory(tmp_path):
     assert isinstance(read.mattes, np.memmap)
     assert read_capture_hash(tmp_path / "capture") == capture_hash
     assert [entry.name for entry in tmp_path.iterdir()] == ["capture"]
+
+
+def test_opencv_that_cannot_choose_the_filter_of_pngs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV 4.11, which plain pip installs with mediapipe. The module is run anew, beside the one in use."""
+    for name in ("IMWRITE_PNG_FILTER", "IMWRITE_PNG_FILTER_UP"):
+        monkeypatch.delattr(cv2, name)
+    spec = importlib.util.spec_from_file_location("frame_files_of_old_opencv", frame_files.__file__)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    assert frame_files._PNG_OPTIONS[:4] == module._PNG_OPTIONS
+    assert len(frame_files._PNG_OPTIONS) == 6
 
 
 def test_calibration_comes_back_and_belongs_to_the_hash(tmp_path):

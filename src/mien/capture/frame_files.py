@@ -25,7 +25,8 @@ REMEDY = "run `mien capture` on its video again, which repairs it"
 _PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
-    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
+    # Plain pip installs OpenCV 4.11 with mediapipe, which cannot choose the filter (docs/platforms.md).
+    *((cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP) if hasattr(cv2, "IMWRITE_PNG_FILTER") else ()),
 )
 """These options take half the time of OpenCV's default for level 1 and make smaller files."""
 _MAX_QUEUED = 8
