@@ -70,7 +70,14 @@ def no_native_step(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("a native operation away from float32 on a CPU")
 
     parts = ("ride", "rig_forward", "pose_face", "sigmoid", "head_poses", "rasterize_views", "photometric_loss")
-    for name in (*parts, "triangle_penalties", "observe_view", "adam_update", "mean_squared_difference"):
+    for name in (
+        *parts,
+        "triangle_penalties",
+        "observe_view",
+        "adam_update",
+        "mean_squared_difference",
+        "absolute_difference",
+    ):
         monkeypatch.setattr(_native, name, refuse)
 
 
