@@ -123,7 +123,7 @@ def main() -> None:
 
 
 def start(engine: str, root: Path) -> tuple[dict[str, Any], list[Callable[[], str | None]]]:
-    """What the engine needs (a Ray of two nodes on this host), and the faults that can be made."""
+    """The engine gets what it needs, such as a Ray of two nodes. The faults that can be made are returned."""
     faults: list[Callable[[], str | None]] = [partial(kill_one, "--drive", root)]
     if engine == "slurm":
         faults += [partial(kill_one, "submitit.core._submit", root), partial(slurm_command, "scancel")]

@@ -1,6 +1,5 @@
 """`mien batch`: tables become rows, rows run once, failures stay alone, and results tell what came of them."""
 
-import csv
 import importlib
 import json
 import os
@@ -12,9 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from batch_stub import PROGRAM, do_stub, stub_row
 from mien.batch import (
@@ -24,18 +21,10 @@ from mien.batch import (
     Row,
     State,
     batch_progress,
-    latex_table,
-    markdown_table,
-    means_by,
     progress_text,
     run_row,
     shard_of,
-    write_results,
-    write_wall,
 )
-from mien.batch.steps import _write_strip
-from mien.capture.video import write_video
-from mien.cli import main
 from mien.commands.stages.batch_table import read_table
 from mien.errors import UserError
 from mien.locks import hold
@@ -354,71 +343,3 @@ def check_store(batch: Batch, store: str, *steps: tuple[str, str]) -> None:
     assert run_stubs(batch, [row], store=store) == {"away": "done"}
     assert (batch.log_file("away")).is_file()
     assert not (batch.root / "begins.txt").exists()  # it ran elsewhere
-
-
-def scored(batch: Batch) -> list[dict[str, object]]:
-    """A batch of three people and two methods, with figures."""
-    rows = []
-    for person, light in (("ann", "sun"), ("bob", "lamp"), ("eve", "sun")):
-        rows.append(Row(person, (), {"light": light}))
-    batch.write_plan(rows)
-    for index, row in enumerate(rows[:2]):
-        runs = tuple(
-            {"run": m, "method": m, "psnr": 30.0 + index + gain, "perceptual": 0.1}
-            for m, gain in (("a", 0.0), ("b", 1.0 + index))
-        )
-        batch.write_state(State(row.name, "done", "", runs=runs, stages={"training": 3.0}))
-    batch.write_state(State("eve", "failed", "", error="=cmd: <b>no face</b>"))
-    return write_results(batch)
-
-
-def test_results_have_all_figures_and_paired_differences(tmp_path: Path):
-    batch = Batch(tmp_path)
-    rows = scored(batch)
-    with (tmp_path / "results.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert [(row["name"], row["run"], row["psnr"]) for row in table[:2]] == [("ann", "a", "30.0"), ("ann", "b", "31.0")]
-    assert table[-1]["error"] == "'=cmd: <b>no face</b>"
-    content = json.loads((tmp_path / "results.json").read_text())
-    difference = next(each for each in content["comparison"] if each.get("minus") == "b" and each["metric"] == "psnr")
-    assert difference["mean"] == -1.5
-    # t(0.975, 1) = 12.7062, standard error 0.5
-    assert difference["interval"] == pytest.approx([-7.8531, 4.8531], abs=1e-4)
-    table = means_by(rows, "method", ["psnr", "lpips"])
-    assert table == [
-        ["method", "n", "psnr", "lpips"],
-        ["a", "2", "30.50 ± 0.71", "0.100 ± 0.000"],
-        ["b", "2", "32.00 ± 1.41", "0.100 ± 0.000"],
-    ]
-    assert markdown_table(table).splitlines()[1] == "|---|---|---|---|"
-    assert r"30.50 $\pm$ 0.71" in latex_table(table)
-    with pytest.raises(UserError, match="no such column"):
-        means_by(rows, "gone", ["psnr"])
-
-
-def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
-    batch = Batch(tmp_path)
-    write_wall(batch, scored(batch))
-    page = (tmp_path / "index.html").read_text()
-    assert page.index('data-psnr="30.0"') < page.index('data-psnr="31.0"') < page.index('data-psnr="33.0"')
-    assert "&lt;b&gt;no face" in page
-    assert "<b>no face" not in page
-
-
-def test_status_and_table_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    scored(Batch(tmp_path))
-    assert main(["batch", "status", str(tmp_path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["counts"] == {"done": 2, "failed": 1}
-    assert main(["batch", "table", str(tmp_path), "--rows", "light", "--columns", "psnr"]) == 0
-    assert "| sun | 2 |" in capsys.readouterr().out
-    assert main(["batch", "status", str(tmp_path / "gone")]) == 2
-    assert "is not the folder of a batch" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("count", [1, 3, 40])
-def test_a_film_of_any_length_has_a_thumbnail(count: int, tmp_path: Path):
-    pictures = (np.full((32, 32, 3), 6 * index, np.uint8) for index in range(count))
-    write_video(tmp_path / "film.mp4", pictures, 25)
-    _write_strip(tmp_path / "film.mp4", tmp_path / "strip.jpg")
-    with Image.open(tmp_path / "strip.jpg") as strip:
-        assert strip.size == (12 * 160, 160)

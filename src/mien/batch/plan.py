@@ -15,7 +15,7 @@ from typing import Any
 
 from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
-from mien.files import expect_whole, read_json, write_atomically, write_json
+from mien.files import expect_whole, read_json, remove_leftovers, write_atomically, write_json
 from mien.inside import inside, is_plain_name
 from mien.locks import BeingWrittenError, hold
 
@@ -23,8 +23,8 @@ PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
 WORKSPACE = "{workspace}"
 """Stands for the row's workspace in the words of its steps."""
 _MAX_PLAN_BYTES, _MAX_STATE_BYTES = 256 << 20, 1 << 20
-_KEPT_OF_NAME = 100
-"""Number of characters of a state's name that its temporary file keeps (`mien.files`)."""
+_COMPARED = 50
+"""Number of characters by which leftovers are told, before `mien.files` looks at them exactly."""
 _AGAIN = "run `mien batch TABLE --out DIR` again"
 
 
@@ -141,15 +141,14 @@ class Batch:
 
     def remove_leftovers(self, rows: Sequence[Row]) -> None:
         """Remove the temporary files and locks that killed processes of these rows left beside the states."""
-        kept = {self.state_file(row.name).name[:_KEPT_OF_NAME]: row.name for row in rows}
         folder = self.root / "states"
-        for entry in list(os.scandir(folder)) if folder.is_dir() else ():
-            lock = entry.name.endswith(".lock")
-            name = kept.get(entry.name.removeprefix(".").rsplit(".", 1 if lock else 2)[0][:_KEPT_OF_NAME])
-            if entry.name.startswith(".") and name is not None:
-                with suppress(BeingWrittenError), hold(self.state_file(name)):  # the end of `hold` removes a lock
-                    if not lock:
-                        Path(entry.path).unlink(missing_ok=True)
+        hidden = [entry.name for entry in os.scandir(folder) if entry.name.startswith(".")] if folder.is_dir() else []
+        for row in rows if hidden else ():
+            path = self.state_file(row.name)
+            # Names of temporary files begin like that of the state, and long ones are cut.
+            if any(name.startswith(f".{path.name[:_COMPARED]}") for name in hidden):
+                with suppress(BeingWrittenError), hold(path):  # the end of `hold` removes a lock
+                    remove_leftovers(path)
 
     def is_done(self, row: Row) -> bool:
         """Whether the row is done with its present inputs."""
