@@ -131,7 +131,8 @@ double mean_squared_difference(const Array<const float>& image, const Array<cons
 }
 
 void absolute_difference(const Array<const float, nb::ndim<2>>& values, const Array<const uint8_t, nb::ndim<2>>& target,
-                         float weight, const Array<float, nb::ndim<2>>& gradient, const Array<float, nb::shape<>>& loss) {
+                         float weight, const Array<float, nb::ndim<2>>& gradient,
+                         const Array<float, nb::shape<>>& loss) {
   require(same_shape(values, target) && same_shape(values, gradient), "the pictures must be equally large");
   const nb::gil_scoped_release release;
   *loss.data() = static_cast<float>(mien::absolute_difference(

@@ -136,7 +136,7 @@ double absolute_difference(const float* values, const uint8_t* bytes, float shar
 }  // namespace
 
 extern const TrainingKernels training_kernels;
-const TrainingKernels training_kernels = {adam, penalties, observe, any_nonzero, squared_difference,
-                                          absolute_difference};
+const TrainingKernels training_kernels = {adam,        penalties,          observe,
+                                          any_nonzero, squared_difference, absolute_difference};
 
 }  // namespace mien::MIEN_ISA
