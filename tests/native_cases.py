@@ -17,6 +17,7 @@ from mien import _native
 
 sys.path.insert(0, str(Path(__file__).parent / "fuzzing"))
 from native_baselines import BASELINES  # noqa: E402
+from native_calls import bound_names  # noqa: E402
 
 F32, I32, I64 = np.float32, np.int32, np.int64
 MOST = 2**31 - 1
@@ -204,6 +205,11 @@ def adam(place: int, value: Any) -> None:
     _native.adam_update([(*task[:place], value, *task[place + 1 :])])
 
 
+def functions_without_a_valid_call() -> str:
+    """Names that only the core or only the fuzzer's valid calls have: `make fuzz-native` stops at one."""
+    return ", ".join(sorted(bound_names(_native) ^ set(BASELINES))) or "none"
+
+
 CASES: dict[str, Callable[[], Any]] = {
     "short view": lambda: draw(wide_splats(1, 64)[:-1]),
     "short group in a view": lambda: draw(wide_splats(1, 64)._replace(gaussians=(np.zeros((1, 3), F32),))),
@@ -252,6 +258,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "negative threads": lambda: _native.set_thread_count(-3),
     "memory that is not there": memory_that_is_not_there,
     "memory for several views": memory_for_several_views,
+    "functions without a valid call": functions_without_a_valid_call,
     "threads that cannot be had": threads_that_cannot_be_had,
 }  # fmt: skip
 

@@ -56,6 +56,7 @@ EXPECTED = {
     "negative threads": (VALUE, "is -3"),
     "memory that is not there": ("accepted", "failures"),
     "memory for several views": (MEMORY, ""),
+    "functions without a valid call": ("accepted", "none"),
     "threads that cannot be had": ("accepted", "fewer"),
 }
 

@@ -362,6 +362,11 @@ def mean_squared_difference(native: Any, rng: Rng) -> Arguments:
     return [normal(rng, *size), below(rng, 256, *size, dtype=U8)]
 
 
+def absolute_difference(native: Any, rng: Rng) -> Arguments:
+    size = picture(rng)
+    return [normal(rng, *size), below(rng, 256, *size, dtype=U8), 0.5, empty(*size), empty()]
+
+
 def box_of_nonzero(native: Any, rng: Rng) -> Arguments:
     return [np.maximum(normal(rng, *picture(rng)) - 2, 0).astype(F32)]
 
@@ -387,7 +392,7 @@ BASELINES: dict[str, Baseline] = {
         align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
         rasterize_views, rasterize_views_backward, photometric_loss, adam_update,
         triangle_penalties, observe_view, keep_on_surface, clear_rows, mean_squared_difference,
-        box_of_nonzero, composite,
+        absolute_difference, box_of_nonzero, composite,
     )
 } | {
     "AlignSurface": align_surface,
