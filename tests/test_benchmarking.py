@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from mien.avatar import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
 from mien.lab.benchmarking import device as device_benchmark
-from mien.lab.benchmarking import headgas_step, mono_step, train_step
+from mien.lab.benchmarking import headgas_step, mono_step, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
 from mien.lab.benchmarking.charts import write_scaling_chart
 from mien.lab.benchmarking.scenes import head_scene
@@ -106,6 +107,34 @@ def test_a_training_case_trains() -> None:
     assert not torch.equal(before, state.avatar.gaussian_store()["sh_constant"])
     target = data.targets[0].target(0, 0, np.full(3, 255, np.uint8), keep=False)
     assert 0.2 < (target.matte > 127).float().mean() < 0.7  # the head fills about half of the picture
+
+
+def test_parts_of_a_step_add_up_to_it() -> None:
+    """All that a step does is in some row, each native operation in its own, and nothing stays watched."""
+    state, data, settings = step_parts.default_case(load_face_model(), 9_500, (96, 80))
+    before = dict(vars(_native))
+    began = time.perf_counter()
+    rows = step_parts.step_parts(state, data, settings, seconds=0.01)
+    elapsed = 1e3 * (time.perf_counter() - began) / step_parts.ROUND
+    assert 0.5 * elapsed < sum(row.ms for row in rows) < elapsed
+    found = {(row.phase, row.operation) for row in rows}
+    rest = step_parts.REST
+    assert len(found) == len(rows)
+    assert found >= {
+        ("pose and draw", "rasterize_views"), ("pose and draw", "feature_network"), ("pose and draw", rest),
+        ("losses of pictures", "photometric_loss"), ("perceptual loss", rest), ("backward", "rasterize_views_backward"),
+        ("side views", "rasterize_mesh"), ("update", "adam_update"), ("update", "factored_update"),
+        ("after update", "keep_on_surface"), ("after backward", "clear_rows"), ("other", rest),
+    }  # fmt: skip
+    assert dict(vars(_native)) == before
+    shown = step_parts.format_parts(rows)
+    assert "a step, " in shown
+    assert shown.count("feature_network_backward") == 1
+
+
+def test_parts_are_those_of_the_default_on_the_cpu(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "train-step", "--parts", "--method", "headgas"]) == 2
+    assert "--parts --method headgas" in capsys.readouterr().err
 
 
 def test_a_headgas_case_trains() -> None:

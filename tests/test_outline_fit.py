@@ -86,6 +86,17 @@ def test_offsets_that_tracking_found_are_kept(anny: FaceModel) -> None:
     assert float((found - own).norm(dim=1).max()) < _SLACK
 
 
+def test_a_frame_without_a_person_says_nothing(anny: FaceModel, low: tuple[Sequence, torch.Tensor]) -> None:
+    """Its distances from the matte are infinite."""
+    sequence, offsets = low
+    mattes = sequence.capture.mattes.copy()
+    mattes[1] = 0
+    found = _fitted(anny, replace(sequence, capture=replace(sequence.capture, mattes=mattes)))
+    assert float((found - offsets).norm(dim=1).max()) < 0.005
+    nobody = replace(sequence.capture, mattes=np.zeros_like(mattes))
+    assert not _fitted(anny, replace(sequence, capture=nobody)).any()
+
+
 def test_smooth_weights_are_shares_of_near_points() -> None:
     line = torch.linspace(0, 0.1, 101)[:, None] * torch.tensor([1.0, 0.0, 0.0])
     weights = smooth_weights(line, line[spread_points(line, 0.008)], reach=0.01)

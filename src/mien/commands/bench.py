@@ -101,7 +101,8 @@ class TrainStep:
     method: StepMethod = DEFAULT_METHOD
     """Method to measure. All but the default are measured on the CPU at 512x512, with the sizes of their papers or of
     the preset standard."""
-
+    parts: bool = False
+    """Measure the parts of a step of the default, with all of its losses: 45,000 Gaussians, 512x512."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
     seconds: float = 3.0
@@ -115,9 +116,16 @@ class TrainStep:
         _check_seconds(self.seconds)
         if STEP_BENCHMARKS[self.method].on_gpu is None and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
+        if self.parts and self.method != DEFAULT_METHOD:
+            raise UserError(f"--parts --method {self.method}: parts are measured of {DEFAULT_METHOD} only")
+        if self.parts and self.device == "cuda":
+            raise UserError("--parts --device cuda: parts are measured on the CPU only; leave out --device")
 
     def run(self) -> None:
         """Measure and print the rows."""
+        if self.parts:
+            _show_parts(self.seconds, self.as_json)
+            return
         benchmark = STEP_BENCHMARKS[self.method]
         like = None if benchmark.on_gpu is None else _gpu(self.device)
         if benchmark.on_gpu is None or like is None:
@@ -249,6 +257,25 @@ class Command:
 def _check_seconds(seconds: float) -> None:
     if not 0 < seconds < math.inf:
         raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for that long")
+
+
+def _show_parts(seconds: float, as_json: bool) -> None:
+    """Print the machine and the parts of a training step, for one thread and for all, or everything as json."""
+    import torch
+
+    from mien.lab.benchmarking.step_parts import format_parts, parts_suite
+    from mien.lab.benchmarking.timing import format_machine, measure_machine
+
+    torch.set_num_threads(1)
+    machine, shown = measure_machine(), []
+    if not as_json:
+        show(format_machine(machine))
+    for rows in parts_suite(seconds):
+        shown += rows
+        if not as_json:
+            show(format_parts(rows))
+    if as_json:
+        show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
 
 
 def _gpu(name: DeviceName) -> "torch.Tensor | None":

@@ -163,4 +163,5 @@ def paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
             rendering = rasterize(gaussians, sequence.tracking.cameras[0], like.new_ones(3))
         picture = 255 * rendering.image.cpu().numpy() + noise.normal(0, 20, rendering.image.shape)
         sequence.capture.images[timestep, 0] = picture.clip(0, 255).astype(np.uint8)
-        sequence.scoring[timestep, 0] = (255 * rendering.alpha.cpu().numpy()).astype(np.uint8)
+        matte = (255 * rendering.alpha.cpu().numpy()).astype(np.uint8)
+        sequence.scoring[timestep, 0] = sequence.capture.mattes[timestep, 0] = matte

@@ -29,6 +29,8 @@ from mien.training.whole_head.unseen import fills_sides
 
 _FIRST, _SECOND = 0.8, 0.95
 """Decay of the running means of the gradient and of its square (Adam; Kingma and Ba 2015)."""
+_OPAQUE = 128
+"""Least alpha of a pixel that belongs to the person, 0..255."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,8 @@ def fit_to_outlines(
         face_model: The face model, float32 on the CPU.
         sequences: The sequences that the frames count in.
         faces: Face parameters of each sequence, with all its timesteps.
-        frames: The frames to look at. At most `outline_frames` of them, evenly spread, are used.
+        frames: The frames to look at. At most `outline_frames` of them, evenly spread, are used. Of these, frames with
+            an empty matte say nothing.
         threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
     """
     given = faces[0].vertex_offsets
@@ -103,7 +106,12 @@ def fit_to_outlines(
         world = face_model(face)[0].detach()[outer]
         return _View(sequence.tracking.cameras[frame.camera], outside, world, face.T_world_head[0, :3, :3])
 
-    views = list(stream_in_threads(view, spread_frames(frames, WHOLE_HEAD.outline_frames), threads))
+    def shows_person(frame: Frame) -> bool:
+        return bool((sequences[frame.sequence].capture.mattes[frame[1:]] >= _OPAQUE).any())
+
+    # Without an opaque pixel, all distances are infinite.
+    looked = [frame for frame in spread_frames(frames, WHOLE_HEAD.outline_frames) if shows_person(frame)]
+    views = list(stream_in_threads(view, looked, threads))
     rounds = WHOLE_HEAD.outline_rounds if views else 0
     shifts, first, second = (torch.zeros(weights.shape[1], 3) for _ in range(3))
     random = torch.Generator().manual_seed(0)
@@ -184,4 +192,4 @@ def _outer_vertices(face_model: FaceModel) -> Bool[Tensor, " v"]:
 
 def _distance(matte: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """The distance of each pixel from the half opaque part of a matte, in pixels."""
-    return cv2.distanceTransform((matte < 128).astype(np.uint8), cv2.DIST_L2, 5)
+    return cv2.distanceTransform((matte < _OPAQUE).astype(np.uint8), cv2.DIST_L2, 5)

@@ -1,0 +1,206 @@
+"""Measure the parts of a training step of the default: whole heads, features, and all losses.
+
+Run as `mien bench train-step --parts`. The steps are those of `mien train`, on a drawn head that needs no footage. Each
+native operation has a row of its own. What remains of a phase is the work of Python and PyTorch in it.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+from unittest.mock import patch
+
+import torch
+
+from mien import _native
+from mien.face import FaceModel, load_face_model
+from mien.lab.benchmarking.render import thread_counts
+from mien.lab.benchmarking.train_step import benchmark_sequence, empty_statistics, paint_targets, training_case
+from mien.training import PRESETS, trainer
+from mien.training.checkpoint import TrainingState
+from mien.training.footage import FrameOrder, Targets, training_frames
+from mien.training.parts import TrainingPart
+from mien.training.settings import TrainSettings
+from mien.training.trainer import TrainingData, start, step
+
+COUNT, SIZE = 45_000, (512, 512)
+"""What the aims of speed are given for."""
+ROUND = 48
+"""Number of steps that are measured together: rare losses are due in the same number of them each time."""
+REST = "Python and PyTorch"
+_STEPS, _BEGUN = 10_000_000, 6_000_000
+"""Length of the run, and the step at which it is measured: all losses have begun, and no density control is due."""
+_PHASES: dict[str, tuple[Any, str]] = {
+    "frame": (trainer, "next_batch"),
+    "pose and draw": (trainer, "draw"),
+    "losses of pictures": (trainer, "compare"),
+    "perceptual loss": (trainer, "compare_features"),
+    "backward": (torch.autograd, "backward"),
+    "update": (trainer, "_update"),
+}
+"""The parts of `trainer.step`, by name: where each function is looked up, and its name there."""
+_OF_PARTS = {"losses": "side views", "after_backward": "after backward", "after_update": "after update"}
+"""Functions of parts, and their phases."""
+
+
+@dataclass(frozen=True)
+class PartRow:
+    """A row of the profile."""
+
+    phase: str
+    operation: str
+    """Name of a native operation, or `REST` for what remains of the phase."""
+    ms: float
+    """Mean over the steps of the fastest round, in milliseconds a step."""
+    threads: int
+
+
+@dataclass(eq=False)
+class Stopwatch:
+    """Times of nested calls by phase and operation, in seconds. No call counts what another one inside it takes."""
+
+    seconds: dict[tuple[str, str], float] = field(default_factory=dict)
+    _open: list[tuple[str, str]] = field(default_factory=list)
+    _since: float = 0.0
+
+    def phase(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return `function`, whose time belongs to a phase."""
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            with self._running((name, REST)):
+                return function(*arguments, **named)
+
+        return call
+
+    def operation(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return `function`, whose time belongs to an operation of the phase that calls it, if there is one."""
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            if not self._open:
+                return function(*arguments, **named)
+            with self._running((self._open[-1][0], name)):
+                return function(*arguments, **named)
+
+        return call
+
+    @contextmanager
+    def _running(self, key: tuple[str, str]) -> Iterator[None]:
+        self._tick()
+        self._open.append(key)
+        try:
+            yield
+        finally:
+            self._tick()
+            self._open.pop()
+
+    def _tick(self) -> None:
+        """Give the time since the last tick to what runs now."""
+        now = time.perf_counter()
+        if self._open:
+            self.seconds[self._open[-1]] = self.seconds.get(self._open[-1], 0.0) + now - self._since
+        self._since = now
+
+
+def parts_suite(seconds: float = 3.0) -> Iterator[list[PartRow]]:
+    """Measure the parts of a step of the default, by number of threads."""
+    state, data, settings = default_case(load_face_model())
+    for threads in thread_counts():
+        _native.set_thread_count(threads)
+        yield step_parts(state, data, settings, seconds)
+
+
+def format_parts(rows: list[PartRow]) -> str:
+    """Return the table of one number of threads: the phases with the longest first, and their operations."""
+    phases: dict[str, float] = {}
+    for row in rows:
+        phases[row.phase] = phases.get(row.phase, 0.0) + row.ms
+    whole = sum(phases.values())
+    lines = [f"{'a step, ' + str(rows[0].threads) + ' threads':44} {whole:8.2f} ms"]
+    for phase, ms in sorted(phases.items(), key=lambda item: -item[1]):
+        lines.append(f"  {phase:42} {ms:8.2f} ms {100 * ms / whole:5.1f} %")
+        own = sorted((row for row in rows if row.phase == phase), key=lambda row: -row.ms)
+        lines += [f"    {row.operation:40} {row.ms:8.2f} ms {100 * row.ms / whole:5.1f} %" for row in own]
+    return "\n".join(lines)
+
+
+def step_parts(
+    state: TrainingState, data: TrainingData, settings: TrainSettings, seconds: float = 3.0
+) -> list[PartRow]:
+    """Measure the parts of some steps: whole rounds for about `seconds`, of which the fastest counts.
+
+    The state moves on. Native operations are watched wherever they are called, so every one of a step is counted.
+    """
+    fastest: dict[tuple[str, str], float] = {}
+    end = time.perf_counter() + seconds
+    step(state, data, settings)  # warms up
+    while not fastest or time.perf_counter() < end:
+        watch = Stopwatch()
+        with _watched(watch, state) as watched:
+            whole = watch.phase("other", step)
+            for _ in range(ROUND):
+                whole(watched, data, settings)
+        state.step = watched.step
+        if not fastest or sum(watch.seconds.values()) < sum(fastest.values()):
+            fastest = watch.seconds
+    threads = _native.thread_count()
+    return [PartRow(*key, 1e3 * spent / ROUND, threads) for key, spent in fastest.items()]
+
+
+def default_case(
+    face_model: FaceModel, count: int = COUNT, size: tuple[int, int] = SIZE
+) -> tuple[TrainingState, TrainingData, TrainSettings]:
+    """Return a state of a run of the default with `count` Gaussians, its pictures, and its settings.
+
+    One camera films the head, so sides are filled. Every trained Gaussian has features.
+    """
+    preset = PRESETS["standard"]
+    settings = replace(preset.settings_of("gaussian_avatars"), steps=_STEPS, split="none")
+    sequence = benchmark_sequence(face_model, *size)
+    painter, _ = training_case(face_model, len(face_model.faces), *size)
+    paint_targets(sequence, painter.avatar, torch.zeros(()))
+    state = start([sequence], face_model, preset.config("gaussian_avatars"), settings)
+    for part in state.parts:
+        settings = part.settings(settings)
+    _grow(state, count)
+    state.step = _BEGUN
+    order = FrameOrder(training_frames([sequence], settings), seed=0)
+    targets = Targets(sequence, 0, cleaned=True)
+    return state, TrainingData(order, (targets,)), settings
+
+
+def _grow(state: TrainingState, count: int) -> None:
+    """Grow an avatar as density control would: several small Gaussians per triangle, all of which have features."""
+    store, generator = state.avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    opened = (store["opacity_logits"].detach() < 0).nonzero()[:, 0]  # Fills are opaque from the start.
+    store.append(opened[torch.arange(max(0, count - len(store))) % len(opened)])
+    trained = (store["opacity_logits"].detach() < 0).nonzero()[:, 0]
+    spread = 0.5 * torch.randn(len(trained), 3, generator=generator)
+    drawn = {
+        "means": store["means"].detach()[trained] + 0.3 * torch.randn(len(trained), 3, generator=generator),
+        "quats": torch.randn(len(trained), 4, generator=generator),
+        "log_scales": spread - 1.8,
+        "opacity_logits": 2 + 1.5 * torch.randn(len(trained), generator=generator),
+    }
+    for name in ("feature_bases", "neutral_features"):
+        drawn[name] = 0.1 * torch.randn(len(trained), *store[name].shape[1:], generator=generator)
+    for name, values in drawn.items():
+        store.assign_rows(name, trained, values)
+    state.density.load_state(empty_statistics(len(store)))
+
+
+@contextmanager
+def _watched(watch: Stopwatch, state: TrainingState) -> Iterator[TrainingState]:
+    """The state, all of whose phases and native operations are watched."""
+    with ExitStack() as stack:
+        for name, (room, function) in _PHASES.items():
+            stack.enter_context(patch.object(room, function, watch.phase(name, getattr(room, function))))
+        for name in dir(_native):
+            operation = getattr(_native, name)
+            if callable(operation) and not isinstance(operation, type) and not name.startswith("_"):
+                stack.enter_context(patch.object(_native, name, watch.operation(name, operation)))
+        yield replace(state, parts=tuple(_watched_part(watch, part) for part in state.parts))
+
+
+def _watched_part(watch: Stopwatch, part: TrainingPart) -> TrainingPart:
+    return replace(part, **{name: watch.phase(phase, getattr(part, name)) for name, phase in _OF_PARTS.items()})
