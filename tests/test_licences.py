@@ -37,6 +37,7 @@ def test_no_licence_is_unknown_and_so_none_forbids_commercial_use():
     ("expression", "kind"),
     [
         ("MIT", "permissive"),
+        ("MIT-0", "public domain"),
         ("MIT OR GPL-2.0-or-later", "permissive"),
         ("BSD-3-Clause AND LGPL-2.1-or-later", "weak copyleft"),
         ("MPL-2.0 AND MIT", "weak copyleft"),

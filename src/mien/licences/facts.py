@@ -9,6 +9,7 @@ Kind = Literal["public domain", "permissive", "weak copyleft", "strong copyleft"
 KINDS: dict[str, Kind] = {
     "0BSD": "public domain",
     "CC0-1.0": "public domain",
+    "MIT-0": "public domain",
     "Unlicense": "public domain",
     "Apache-2.0": "permissive",
     "Apache-2.0 WITH LLVM-exception": "permissive",
