@@ -3,7 +3,8 @@
 A lock of its own, apart from mien's, tells whether a row runs twice at the same time: the list then has `overlap NAME`.
 
 Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`,
-`make NAME` (a file in the workspace, and `drop NAME` removes it), `size PATH` (of a file, as the value).
+`make NAME` (a file in the workspace, and `drop NAME` removes it), `size PATH` (of a file, as the value). Commands of
+mien do nothing.
 """
 
 import fcntl
@@ -37,7 +38,7 @@ def do_steps(batch: Batch, place: Path, row: Row) -> tuple[tuple[dict[str, objec
     """Run the steps, with a begin and an end."""
     note(place, f"begin {row.name} {os.getpid()}\n")
     value = 0.0
-    for what, argument in row.steps:
+    for what, argument, *_ in row.steps:
         if what == "sleep":
             time.sleep(float(argument))
         elif what == "fail" or (what == "once" and tries(place, row.name) == 1):
