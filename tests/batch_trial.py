@@ -87,9 +87,9 @@ def slurm_command(*command: str) -> str | None:
 
 def ray_node(cluster: Any) -> str | None:
     """Kill all processes of a second node of Ray, and start another one."""
-    node = cluster["node"]
-    for process in node.live_processes():
-        os.kill(process[1].pid, signal.SIGKILL)
+    for _, process in cluster["node"].live_processes():
+        process.kill()
+        process.wait()  # workers take a node that nobody has waited for as alive
     cluster["node"] = cluster["cluster"].add_node(num_cpus=_JOBS // 2, object_store_memory=80 << 20)
     return "kill -9 of a node of Ray"
 
@@ -132,7 +132,7 @@ def start(engine: str, root: Path) -> tuple[dict[str, Any], list[Callable[[], st
         return {}, faults
     from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
-    own = {"num_cpus": _JOBS // 2, "object_store_memory": 80 << 20}
+    own = {"num_cpus": _JOBS // 2, "object_store_memory": 80 << 20, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=own)
     held = {"cluster": cluster, "node": cluster.add_node(**own)}
     return held, [*faults, partial(kill_one, "ray::", root), partial(ray_node, held)]
