@@ -2,8 +2,9 @@
 
 A lock of its own, apart from mien's, tells whether a row runs twice at the same time: the list then has `overlap NAME`.
 
-Its steps are words: `sleep SECONDS`, `fail TEXT`, `once TEXT` (fail in the first try), `eat MEGABYTES`, `value NUMBER`,
-`make NAME` (a file in the workspace, and `drop NAME` removes it), `size PATH` (of a file, as the value).
+Its steps are words: `sleep SECONDS`, `wait NAME` (until the batch's folder has that file), `fail TEXT`, `once TEXT`
+(fail in the first try), `eat MEGABYTES`, `value NUMBER`, `make NAME` (a file in the workspace, and `drop NAME` removes
+it), `size PATH` (of a file, as the value). Commands of mien do nothing.
 """
 
 import fcntl
@@ -37,9 +38,12 @@ def do_steps(batch: Batch, place: Path, row: Row) -> tuple[tuple[dict[str, objec
     """Run the steps, with a begin and an end."""
     note(place, f"begin {row.name} {os.getpid()}\n")
     value = 0.0
-    for what, argument in row.steps:
+    for what, argument, *_ in row.steps:
         if what == "sleep":
             time.sleep(float(argument))
+        elif what == "wait":
+            while not (batch.root / argument).exists():
+                time.sleep(0.05)
         elif what == "fail" or (what == "once" and tries(place, row.name) == 1):
             raise RowFailedError(argument)
         elif what == "eat":

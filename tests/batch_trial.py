@@ -15,6 +15,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,8 @@ from batch_stub import do_stub, stub_row
 from mien.batch import Batch, Driver, EngineOptions, Row, State, run_row, write_results
 
 _JOBS = int(os.environ.get("MIEN_TRIAL_JOBS", "64"))
-_PER_KILL_SECONDS = 8.0
-"""Mean time between two kills."""
+_BYTES_A_ROW = 40
+"""Bytes that the begin and the end of a row take in their list."""
 
 
 def rows_of(count: int, seconds: float) -> list[Row]:
@@ -66,13 +67,13 @@ def children_named(word: str, root: Path) -> list[int]:
     return found
 
 
-def kill_one(word: str, root: Path) -> str | None:
-    """Kill a random process of the trial by SIGKILL, and say which kind it was."""
+def kill_one(what: str, word: str, root: Path) -> str | None:
+    """Kill a random process of the trial whose command line has a word by SIGKILL, and say what it was."""
     found = children_named(word, root)
     if not found:
         return None
     os.kill(random.choice(found), signal.SIGKILL)
-    return f"kill -9 of {word.strip(':')}"
+    return f"kill -9 of {what}"
 
 
 def slurm_command(*command: str) -> str | None:
@@ -87,11 +88,14 @@ def slurm_command(*command: str) -> str | None:
 
 def ray_node(cluster: Any) -> str | None:
     """Kill all processes of a second node of Ray, and start another one."""
-    node = cluster["node"]
-    for process in node.live_processes():
-        os.kill(process[1].pid, signal.SIGKILL)
-    cluster["node"] = cluster["cluster"].add_node(num_cpus=_JOBS // 2, object_store_memory=80 << 20)
-    return "kill -9 of a node of Ray"
+    for _, process in cluster["node"].live_processes():
+        process.kill()
+        process.wait()  # workers take a node that nobody has waited for as alive
+    for _ in range(5):
+        with suppress(Exception):  # Ray has no class of its own for a node that a busy machine has not started in time
+            cluster["node"] = cluster["cluster"].add_node(num_cpus=_JOBS // 2, object_store_memory=80 << 20)
+            break
+    return "kill -9 of a node"
 
 
 def main() -> None:
@@ -116,7 +120,9 @@ def main() -> None:
     cluster, faults = start(given.engine, root)
     address = cluster["cluster"].address if cluster else ""
     command = [sys.executable, __file__, given.engine, str(root), "--drive", "--address", address]
-    run(command, faults, given.kills, root)
+    # Moments are sizes of the list of begins and ends, so that kills are spread over the rows on any machine.
+    moments = sorted(random.uniform(0, 0.9) * _BYTES_A_ROW * given.rows for _ in range(given.kills))
+    run(command, faults, moments, root)
     tell(batch, root)
     if cluster:
         cluster["cluster"].shutdown()
@@ -124,32 +130,32 @@ def main() -> None:
 
 def start(engine: str, root: Path) -> tuple[dict[str, Any], list[Callable[[], str | None]]]:
     """The engine gets what it needs, such as a Ray of two nodes. The faults that can be made are returned."""
-    faults: list[Callable[[], str | None]] = [partial(kill_one, "--drive", root)]
+    faults: list[Callable[[], str | None]] = [partial(kill_one, "the driver", "--drive", root)]
     if engine == "slurm":
-        faults += [partial(kill_one, "submitit.core._submit", root), partial(slurm_command, "scancel")]
+        faults += [partial(kill_one, "a worker", "submitit.core._submit", root), partial(slurm_command, "scancel")]
         faults += [partial(slurm_command, "scontrol", "requeue")]
     if engine != "ray":
         return {}, faults
     from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
-    own = {"num_cpus": _JOBS // 2, "object_store_memory": 80 << 20}
+    own = {"num_cpus": _JOBS // 2, "object_store_memory": 80 << 20, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=own)
     held = {"cluster": cluster, "node": cluster.add_node(**own)}
-    return held, [*faults, partial(kill_one, "ray::", root), partial(ray_node, held)]
+    return held, [*faults, partial(kill_one, "a worker", "ray::", root), partial(ray_node, held)]
 
 
-def run(command: list[str], faults: list[Callable[[], str | None]], kills: int, root: Path) -> None:
-    """Run the driver to its end, with faults at random times. A driver that was killed is started again."""
+def run(command: list[str], faults: list[Callable[[], str | None]], moments: list[float], root: Path) -> None:
+    """Run the driver to its end, with a fault at each moment. A driver that was killed is started again."""
     began, cpu, peak, made = time.monotonic(), 0.0, 0, Counter[str]()
-    pause = time.monotonic() + _PER_KILL_SECONDS
     while True:
         driver = subprocess.Popen(command, stderr=(root / "driver.log").open("ab"))
         while (ended := os.wait4(driver.pid, os.WNOHANG))[0] == 0:
             time.sleep(0.2)
-            if made.total() < kills and time.monotonic() > pause:
+            if moments and (root / "begins.txt").exists() and (root / "begins.txt").stat().st_size > moments[0]:
                 what = random.choice(faults)()
-                made.update([what] if what else [])
-                pause = time.monotonic() + random.uniform(0.2, 1.8) * _PER_KILL_SECONDS
+                if what:
+                    made[what] += 1
+                    moments = moments[1:]
         _, status, used = ended
         cpu, peak = cpu + used.ru_utime + used.ru_stime, max(peak, used.ru_maxrss)
         if not os.WIFSIGNALED(status):

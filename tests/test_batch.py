@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from mien.errors import UserError
 from mien.locks import hold
 from needs import NO_ENGINE
 from other_process import Holder
+from test_startup import HEAVY, modules_after
 
 
 def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
@@ -167,6 +169,16 @@ def test_what_killed_processes_left_beside_the_states_is_removed_in_the_end(tmp_
         run_stubs(batch, rows)
         assert held.exists()
     assert sorted(path.name for path in (tmp_path / "states").glob(".*")) == [held.name]
+
+
+def test_the_driver_imports_neither_torch_nor_what_only_rows_need(table: Path, tmp_path: Path):
+    run = ["batch", str(table), "--out", "people", "--program", shlex.join(PROGRAM)]
+    looks = [["batch", "status", "people"], ["batch", "table", "people", "--columns", "psnr"]]
+    for lines, needed in (([run], {"av", "cv2", "mien._native"}), (looks, {"mien._native"})):
+        for code, modules in modules_after(lines, tmp_path):
+            assert code == 0
+            assert not modules & HEAVY - needed, f"{lines} imports {sorted(modules & HEAVY - needed)}"
+    assert len(list((tmp_path / "people" / "states").glob("*.json"))) == 2
 
 
 @pytest.fixture

@@ -62,6 +62,8 @@ def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
     assert page.index('data-psnr="30.0"') < page.index('data-psnr="31.0"') < page.index('data-psnr="33.0"')
     assert "&lt;b&gt;no face" in page
     assert "<b>no face" not in page
+    assert "PSNR 30.00 dB" in page
+    assert "Methods compared" in page
 
 
 def test_status_and_table_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -80,7 +80,8 @@ def progress_text(found: dict[str, Any]) -> str:
 
 
 def _words(row: dict[str, Any]) -> str:
-    where = f"{row['status']} on {row['host']}, {row['seconds']:.0f} s, try {row['tries']}"
+    seconds = f", {row['seconds']:.0f} s" if row["seconds"] else ""  # nobody wrote how long an interrupted row took
+    where = f"{row['status']} on {row['host']}{seconds}, try {row['tries']}"
     stage = f", {row['stage']}" if row.get("stage") else ""
     percent = f", {row['percent']} %" if row.get("percent") is not None else ""
     return f"{where}{stage}{percent}" + (f": {row['error']}" if row.get("error") else "")

@@ -23,6 +23,7 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
         if not row.get("run")
     ]
     failed = [row for row in missing if row["status"] == "failed"]
+    compared = paired(rows)
     text = render(
         "batch/templates/wall.html",
         heading=batch.root.resolve().name,
@@ -32,7 +33,8 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
         orders=[
             (name, _HEADINGS[name], HIGHER[name]) for name in HIGHER if any(name in card["figures"] for card in shown)
         ],
-        comparison=[_compared(entry) for entry in paired(rows)],
+        comparison=[_compared(entry) for entry in compared],
+        several=any("minus" in entry for entry in compared),
     )
     write_atomically(batch.root / "index.html", lambda aside: aside.write_text(text, encoding="utf-8"))
 
@@ -47,8 +49,14 @@ def _card(batch: Batch, row: dict[str, Any]) -> dict[str, Any]:
         "thumbnail": thumbnail if (batch.root / thumbnail).is_file() else None,
         "report": report if (batch.root / report).is_file() else None,
         "figures": figures,
-        "words": ", ".join(f"{_HEADINGS[name]} {value:.{DIGITS[name]}f}" for name, value in figures.items()),
+        "words": [_figure(name, value) for name, value in figures.items()],
     }
+
+
+def _figure(name: str, value: float) -> str:
+    """A figure with its name before it and its unit behind it, such as PSNR 25.31 dB."""
+    heading, _, unit = _HEADINGS[name].partition(", ")
+    return f"{heading} {value:.{DIGITS[name]}f} {unit}".rstrip()
 
 
 def _compared(entry: dict[str, Any]) -> list[str]:

@@ -71,8 +71,7 @@ class Command:
         if self._task() is not None:
             if len(self.what) != 2:
                 raise UserError(f"mien batch {self.what[0]}: give the folder of one batch")
-            Batch(Path(self.what[1])).read_plan()
-            return
+            return  # the task reads the plan at once
         if len(self.what) != 1:
             raise UserError("give one table of captures, or one folder of videos; see mien batch --help")
         if self.out is None:

@@ -46,28 +46,25 @@ class _Task:
 def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
     """Run the rows as job arrays, one for each class of memory. See `mien.batch.engines`."""
     batch, noted = Batch(options.root), options.root / _NOTED
-    numbers, refused = list[str](), dict[str, UserError]()
+    numbers, taken = list[str](), list[Row]()
     size = math.ceil(len(rows) / _MOST_TASKS)
     for alike in _by_memory(rows):
         try:
             numbers.append(_submit(work, alike, options, size))
         except UserError as error:
-            refused |= {row.name: error for row in alike}
-            continue
-        write_atomically(noted, lambda aside: aside.write_text(",".join(numbers), encoding="utf-8"))
-    _wait(",".join(numbers))
-    noted.unlink(missing_ok=True)
-    for row in rows:
-        yield row, refused.get(row.name) or batch.read_state(row.name)
+            yield from ((row, error) for row in alike)
+        else:
+            taken += alike
+            write_atomically(noted, lambda aside: aside.write_text(",".join(numbers), encoding="utf-8"))
+    _wait(noted)
+    yield from ((row, batch.read_state(row.name)) for row in taken)
 
 
 def wait_for_earlier(root: Path) -> None:
     """Wait for the jobs of a driver that has ended before them. Their rows run, so no other driver could take them."""
-    noted = root / _NOTED
-    if noted.is_file():
+    if (root / _NOTED).is_file():
         say("waiting for the rows that an earlier command has given to Slurm")
-        _wait(noted.read_text(encoding="utf-8").strip())
-        noted.unlink(missing_ok=True)
+        _wait(root / _NOTED)
 
 
 def _by_memory(rows: Sequence[Row]) -> list[list[Row]]:
@@ -90,10 +87,19 @@ def _submit(work: Work, rows: Sequence[Row], options: EngineOptions, size: int) 
     import submitit  # pyright: ignore[reportMissingImports]
     from submitit.core.utils import FailedJobError, FailedSubmissionError  # pyright: ignore[reportMissingImports]
 
-    folder = options.root / "slurm"
-    folder.mkdir(parents=True, exist_ok=True)
-    executor = submitit.SlurmExecutor(folder, max_num_timeout=10)
-    executor.update_parameters(**_parameters(Batch(options.root), rows, options, size))
+    (options.root / "slurm").mkdir(parents=True, exist_ok=True)
+    executor = submitit.SlurmExecutor(options.root / "slurm", max_num_timeout=10)
+    executor.update_parameters(
+        job_name="mien-batch",
+        time=(options.minutes or _minutes(Batch(options.root))) * size,
+        mem=f"{math.ceil(max(row.memory_mb for row in rows))}M",
+        cpus_per_task=options.threads or 2,
+        gpus_per_task=math.ceil(options.gpus) or None,
+        partition=options.partition or None,
+        array_parallelism=options.jobs or 256,
+        stderr_to_stdout=True,
+        additional_parameters={"requeue": True},
+    )
     try:
         jobs = executor.map_array(_Task(work), [rows[start : start + size] for start in range(0, len(rows), size)])
     except (FailedJobError, FailedSubmissionError) as error:
@@ -102,32 +108,20 @@ def _submit(work: Work, rows: Sequence[Row], options: EngineOptions, size: int) 
     return str(jobs[0].job_id).partition("_")[0]
 
 
-def _parameters(batch: Batch, rows: Sequence[Row], options: EngineOptions, size: int) -> dict[str, Any]:
-    """The resources of each task of the array, as Slurm is asked for them."""
-    finished = [state.seconds for row in batch.read_plan() if (state := batch.read_state(row.name)) and state.runs]
-    minutes = max(_LEAST_MINUTES, math.ceil(_SLACK * max(finished) / 60)) if finished else _DEFAULT_MINUTES
-    found: dict[str, Any] = {
-        "job_name": "mien-batch",
-        "time": (options.minutes or minutes) * size,
-        "mem": f"{math.ceil(max(row.memory_mb for row in rows))}M",
-        "cpus_per_task": options.threads or 2,
-        "array_parallelism": options.jobs or 256,
-        "stderr_to_stdout": True,
-        "additional_parameters": {"requeue": True},
-    }
-    if options.partition:
-        found["partition"] = options.partition
-    if options.gpus:
-        found["gpus_per_task"] = math.ceil(options.gpus)
-    return found
+def _minutes(batch: Batch) -> int:
+    """The time limit of a row: three times the longest finished row, at first a day."""
+    longest = max((state.seconds for state in batch.read_states().values() if state.runs), default=0.0)
+    return max(_LEAST_MINUTES, math.ceil(_SLACK * longest / 60)) if longest else _DEFAULT_MINUTES
 
 
-def _wait(numbers: str) -> None:
-    """Wait until jobs, whose numbers have commas between them, have left the queue."""
-    while numbers and numbers.replace(",", "").isdecimal():
+def _wait(noted: Path) -> None:
+    """Wait until the jobs of a note have left the queue, and remove the note."""
+    numbers = noted.read_text(encoding="utf-8").strip() if noted.is_file() else ""
+    while numbers.replace(",", "").isdecimal():
         asked = subprocess.run(["squeue", "-h", "-j", numbers], capture_output=True, text=True)
         if asked.returncode and "Invalid job id" not in asked.stderr:
             raise UserError(f"squeue: {asked.stderr.strip()[:300]}; correct that and run the same command again")
         if not asked.stdout.strip():
-            return
+            break
         time.sleep(_POLL_SECONDS)
+    noted.unlink(missing_ok=True)
