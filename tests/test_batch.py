@@ -250,21 +250,23 @@ def test_a_row_whose_process_is_killed_fails_alone_or_is_tried_again(tmp_path: P
     assert (state.status, state.tries, state.runs[0]["psnr"]) == ("done", 2, 21.0)
 
 
-def test_rows_stop_when_their_driver_is_killed_and_the_same_command_continues(tmp_path: Path):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_rows_stop_when_their_driver_is_stopped_and_the_same_command_continues(tmp_path: Path, number: int):
     batch = Batch(tmp_path)
     rows = [stub_row("long", ("sleep", "30"))]
     batch.write_plan(rows)
     script = (
         "import sys; from pathlib import Path; from test_batch import driver; from mien.batch import Batch; "
-        "b = Batch(Path(sys.argv[1])); driver(b).run(b.read_plan())"
+        "from mien.stops import orderly_stops; b = Batch(Path(sys.argv[1]))\n"
+        "with orderly_stops(): driver(b).run(b.read_plan())"
     )
     running = subprocess.Popen(
         [sys.executable, "-c", script, str(tmp_path)], cwd=Path(__file__).parent, stderr=subprocess.DEVNULL
     )
     pid = wait_for_begin(tmp_path, "long")
     assert batch_progress(batch)["rows"][0]["status"] == "running"
-    running.kill()
-    running.wait()
+    running.send_signal(number)
+    running.wait(20)
     until = time.monotonic() + 10
     while Path(f"/proc/{pid}").exists() and time.monotonic() < until:
         time.sleep(0.05)

@@ -37,6 +37,8 @@ EXIT_BUSY = 75
 _PATIENCE_SECONDS, _STEP_SECONDS = 15.0, 0.5
 """How long a row waits for its lock. The process that held it may be about to end, because its node was lost."""
 _TAIL_BYTES = 8192
+_waited_for: dict[subprocess.Popen[bytes], bool] = {}
+"""Processes of rows that `attempt` waits for, in any thread of this process, and whether each was told to stop."""
 
 
 class RowFailedError(Exception):
@@ -86,7 +88,9 @@ def _claimed(batch: Batch, row: Row, do: Do) -> State:
 
 
 def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None) -> State | None:
-    """Run a row in a process of its own and wait for it. Return its state, or None if another process holds the row.
+    """Run a row in a process of its own and wait for it. Return its state.
+
+    None if another process holds the row, or if `stop_attempts` stopped it, which then counts as interrupted.
 
     Args:
         root: Folder of the batch.
@@ -106,13 +110,24 @@ def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int
     with suppress(OSError):  # it has ended already
         process.stdin.write(json.dumps(asdict(row)).encode() + b"\n")
         process.stdin.flush()
+    _waited_for[process] = False
     try:
         code = process.wait()
     finally:
+        stopped = _waited_for.pop(process)
         with suppress(OSError):
             process.stdin.close()
         process.wait()
-    return None if code == EXIT_BUSY else _concluded(batch, row, code)
+    return None if stopped or code == EXIT_BUSY else _concluded(batch, row, code)
+
+
+def stop_attempts() -> None:
+    """Let the processes of all rows that this process waits for stop, as if it had ended. Does not wait for them."""
+    for process in list(_waited_for):
+        _waited_for[process] = True
+        assert process.stdin is not None
+        with suppress(OSError):
+            process.stdin.close()
 
 
 def _concluded(batch: Batch, row: Row, code: int) -> State | None:

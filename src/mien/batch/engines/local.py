@@ -3,23 +3,29 @@
 import os
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed, wait
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from mien.batch.engines import EngineOptions, Work
 from mien.batch.plan import Row
+from mien.batch.row import stop_attempts
 from mien.errors import UserError
 
 _ASSUMED_MB = 8000.0
 """Free memory of systems that do not tell it."""
 _SHARE = 0.9
 """Share of the available memory that rows may take."""
+_STOP_SECONDS = 0.5
+"""Seconds between two requests to stop. A row may start after the first one."""
 
 
 def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
-    """Run the rows here, as many at once as jobs and memory allow. See `mien.batch.engines`."""
+    """Run the rows here, as many at once as jobs and memory allow. See `mien.batch.engines`.
+
+    Whatever stops this function (Ctrl-C, SIGTERM) stops the rows, too.
+    """
     memory = _Memory(_SHARE * free_memory_mb())
 
     def one(row: Row) -> Any:
@@ -35,7 +41,9 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
             for future in as_completed(futures):
                 yield futures.pop(future), future.result()
         finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
+            while wait(futures, _STOP_SECONDS).not_done:
+                stop_attempts()
 
 
 def jobs_here(rows: Sequence[Row], options: EngineOptions) -> int:
