@@ -14,6 +14,7 @@ from unittest.mock import patch
 import torch
 
 from mien import _native
+from mien.avatar import DEFAULT_METHOD
 from mien.face import FaceModel, load_face_model
 from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.train_step import benchmark_sequence, empty_statistics, paint_targets, training_case
@@ -155,11 +156,11 @@ def default_case(
     One camera films the head, so sides are filled. Every trained Gaussian has features.
     """
     preset = PRESETS["standard"]
-    settings = replace(preset.settings_of("gaussian_avatars"), steps=_STEPS, split="none")
+    settings = replace(preset.settings_of(DEFAULT_METHOD), steps=_STEPS, split="none")
     sequence = benchmark_sequence(face_model, *size)
     painter, _ = training_case(face_model, len(face_model.faces), *size)
     paint_targets(sequence, painter.avatar, torch.zeros(()))
-    state = start([sequence], face_model, preset.config("gaussian_avatars"), settings)
+    state = start([sequence], face_model, preset.config(DEFAULT_METHOD), settings)
     for part in state.parts:
         settings = part.settings(settings)
     _grow(state, count)
