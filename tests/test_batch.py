@@ -287,6 +287,28 @@ def wait_for_begin(root: Path, name: str) -> int:
     raise AssertionError(f"{name} never began")
 
 
+def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path):
+    batch, row = Batch(tmp_path), stub_row("long")
+    batch.write_plan([row])
+    log = batch.log_file("long")
+    log.parent.mkdir(parents=True)
+
+    def told(text: str) -> tuple[str | None, int | None]:
+        log.write_text(text, encoding="utf-8")
+        found = batch_progress(batch)["rows"][0]
+        return found["stage"], found["percent"]
+
+    with hold(batch.state_file("long")):
+        batch.write_state(State("long", "running", row.fingerprint, 1, "here", time.time()))
+        early = "stage 2 of 4 (tracking), about 9 min left\nOverlay: 100/100 in 5 s\n"
+        assert told("") == (None, None)
+        assert told(early) == ("tracking (2 of 4)", 100)
+        late = early + "stage 3 of 4 (training), about 3 min left\n"
+        assert told(late) == ("training (3 of 4)", None)
+        late += "training: 200/800 in 10 s, ETA 64 s\rstage 3 of 4 (training), about 2 min left\n"
+        assert told(late) == ("training (3 of 4)", 25)
+
+
 def test_a_row_that_another_command_holds_is_left_to_it(tmp_path: Path):
     batch, row = Batch(tmp_path), stub_row("held", ("sleep", "0"))
     with hold(batch.state_file("held")):

@@ -51,10 +51,14 @@ def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:
 
 def _stage(batch: Batch, state: State) -> dict[str, Any]:
     """The stage that a running row is in, and the percentage of its present part, from its log."""
-    text = tail(batch.log_file(state.name))
-    stages, parts = _STAGE.findall(text), _PART.findall(text)
-    found: dict[str, Any] = {"stage": f"{stages[-1][2]} ({stages[-1][0]} of {stages[-1][1]})" if stages else None}
-    return found | {"percent": round(100 * int(parts[-1][0]) / max(int(parts[-1][1]), 1)) if parts else None}
+    stage = percent = None
+    for line in tail(batch.log_file(state.name)).replace("\r", "\n").splitlines():
+        if named := _STAGE.search(line):
+            words = f"{named[3]} ({named[1]} of {named[2]})"
+            stage, percent = words, percent if words == stage else None
+        elif part := _PART.search(line):
+            percent = round(100 * int(part[1]) / max(int(part[2]), 1))
+    return {"stage": stage, "percent": percent}
 
 
 def progress_text(found: dict[str, Any]) -> str:
