@@ -287,7 +287,7 @@ def wait_for_begin(root: Path, name: str) -> int:
     raise AssertionError(f"{name} never began")
 
 
-def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path):
+def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Holder):
     batch, row = Batch(tmp_path), stub_row("long")
     batch.write_plan([row])
     log = batch.log_file("long")
@@ -298,7 +298,7 @@ def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path):
         found = batch_progress(batch)["rows"][0]
         return found["stage"], found["percent"]
 
-    with hold(batch.state_file("long")):
+    with mortal.holding(batch.state_file("long")):
         batch.write_state(State("long", "running", row.fingerprint, 1, "here", time.time()))
         early = "stage 2 of 4 (tracking), about 9 min left\nOverlay: 100/100 in 5 s\n"
         assert told("") == (None, None)
