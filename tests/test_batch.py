@@ -253,7 +253,7 @@ def test_a_row_whose_process_is_killed_fails_alone_or_is_tried_again(tmp_path: P
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_rows_stop_when_their_driver_is_stopped_and_the_same_command_continues(tmp_path: Path, number: int):
     batch = Batch(tmp_path)
-    rows = [stub_row("long", ("sleep", "30"))]
+    rows = [stub_row(name, ("sleep", "30")) for name in ("long", "second", "queued")]
     batch.write_plan(rows)
     script = (
         "import sys; from pathlib import Path; from test_batch import driver; from mien.batch import Batch; "

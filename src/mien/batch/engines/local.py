@@ -42,7 +42,8 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
                 yield futures.pop(future), future.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-            while wait(futures, _STOP_SECONDS).not_done:
+            running = [future for future in futures if not future.cancelled()]
+            while wait(running, _STOP_SECONDS).not_done:
                 stop_attempts()
 
 

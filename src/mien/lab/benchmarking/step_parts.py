@@ -17,7 +17,14 @@ from mien import _native
 from mien.avatar import DEFAULT_METHOD
 from mien.face import FaceModel, load_face_model
 from mien.lab.benchmarking.render import thread_counts
-from mien.lab.benchmarking.train_step import benchmark_sequence, empty_statistics, paint_targets, training_case
+from mien.lab.benchmarking.train_step import (
+    TIMESTEPS,
+    benchmark_sequence,
+    empty_statistics,
+    paint_targets,
+    training_case,
+)
+from mien.terminal import counted
 from mien.training import PRESETS, trainer
 from mien.training.checkpoint import TrainingState
 from mien.training.footage import FrameOrder, Targets, training_frames
@@ -117,7 +124,7 @@ def format_parts(rows: list[PartRow]) -> str:
     for row in rows:
         phases[row.phase] = phases.get(row.phase, 0.0) + row.ms
     whole = sum(phases.values())
-    lines = [f"{'a step, ' + str(rows[0].threads) + ' threads':44} {whole:8.2f} ms"]
+    lines = [f"{'a step, ' + counted(rows[0].threads, 'thread'):44} {whole:8.2f} ms"]
     for phase, ms in sorted(phases.items(), key=lambda item: -item[1]):
         lines.append(f"  {phase:42} {ms:8.2f} ms {100 * ms / whole:5.1f} %")
         own = sorted((row for row in rows if row.phase == phase), key=lambda row: -row.ms)
@@ -133,8 +140,9 @@ def step_parts(
     The state moves on. Native operations are watched wherever they are called, so every one of a step is counted.
     """
     fastest: dict[tuple[str, str], float] = {}
+    for _ in range(TIMESTEPS):  # until each picture was made once
+        step(state, data, settings)
     end = time.perf_counter() + seconds
-    step(state, data, settings)  # warms up
     while not fastest or time.perf_counter() < end:
         watch = Stopwatch()
         with _watched(watch, state) as watched:
