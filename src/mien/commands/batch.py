@@ -70,7 +70,8 @@ class Command:
 
         if self._task() is not None:
             if len(self.what) != 2:
-                raise UserError(f"mien batch {self.what[0]}: give the folder of one batch")
+                task = f"batch {self.what[0]}"
+                raise UserError(f"{task}: give the folder of one batch, as in `mien {task} people`")
             return  # the task reads the plan at once
         if len(self.what) != 1:
             raise UserError("give one table of captures, or one folder of videos; see mien batch --help")

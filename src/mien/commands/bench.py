@@ -102,7 +102,9 @@ class TrainStep:
     """Method to measure. All but the default are measured on the CPU at 512x512, with the sizes of their papers or of
     the preset standard."""
     parts: bool = False
-    """Measure the parts of a step of the default, with all of its losses: 45,000 Gaussians, 512x512."""
+    """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
+    A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the
+    fastest round."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
     seconds: float = 3.0
@@ -117,7 +119,7 @@ class TrainStep:
         if STEP_BENCHMARKS[self.method].on_gpu is None and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
         if self.parts and self.method != DEFAULT_METHOD:
-            raise UserError(f"--parts --method {self.method}: parts are measured of {DEFAULT_METHOD} only")
+            raise UserError(f"--parts --method {self.method}: only {DEFAULT_METHOD} has parts; leave out one")
         if self.parts and self.device == "cuda":
             raise UserError("--parts --device cuda: parts are measured on the CPU only; leave out --device")
 

@@ -105,25 +105,30 @@ def _expression(declared: str, package: Distribution) -> str:
 def _reasons(found: dict[str, Distribution]) -> dict[str, str]:
     """Why each package is there, for those that mien asks for, directly or through others."""
     reasons = {"mien": "is mien itself"}
-    direct = [("base" if extra is None else extra, name) for name, extra in _requirements(found.get("mien"))]
-    pending = []
-    for extra, name in sorted(direct, key=lambda each: (each[0] != "base", each)):
-        if name in found and name not in reasons:
-            reasons[name] = f"mien[{extra}]" if extra != "base" else "mien"
-            pending.append((name, reasons[name]))
+    direct = [("base" if extra is None else extra, name, own) for name, own, extra in _requirements(found.get("mien"))]
+    pending: list[tuple[str, frozenset[str], str]] = []
+    for extra, name, own in sorted(direct, key=lambda each: (each[0] != "base", each[:2])):
+        if name in found:
+            reasons.setdefault(name, f"mien[{extra}]" if extra != "base" else "mien")
+            pending.append((name, own, reasons[name]))
+    followed = set(pending)
     while pending:
-        asker, root = pending.pop(0)
-        for name, extra in _requirements(found[asker]):
-            if extra is None and name in found and name not in reasons:
-                reasons[name] = f"{root}, by {asker}"
-                pending.append((name, root))
+        asker, extras, root = pending.pop(0)
+        for name, own, extra in _requirements(found[asker]):
+            if name not in found or not (extra is None or extra in extras):
+                continue
+            reasons.setdefault(name, f"{root}, by {asker}")
+            if (name, own, root) not in followed:
+                followed.add((name, own, root))
+                pending.append((name, own, root))
     return reasons
 
 
-def _requirements(package: Distribution | None) -> Iterator[tuple[str, str | None]]:
-    """Name of each package that one asks for, and the extra that asks."""
+def _requirements(package: Distribution | None) -> Iterator[tuple[str, frozenset[str], str | None]]:
+    """Name of each package that one asks for, the extras that it asks for of it, and the own extra that asks."""
     for line in (package.requires or []) if package is not None else []:
         text, _, marker = line.partition(";")
         match, extra = _REQUIREMENT.match(text), _EXTRA.search(marker)
         if match is not None:
-            yield canonical(match.group(1)), extra.group(1) if extra else None
+            asked = frozenset(canonical(one.strip()) for one in (match.group(2) or "").split(",") if one.strip())
+            yield canonical(match.group(1)), asked, canonical(extra.group(1)) if extra else None
