@@ -33,7 +33,7 @@ from mien.training.settings import TrainSettings
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, SIZE = 45_000, (512, 512)
-"""What the aims of speed are given for."""
+"""Gaussians and picture size that the aims of speed are given for."""
 ROUND = 48
 """Number of steps that are measured together: rare losses are due in the same number of them each time."""
 REST = "Python and PyTorch"
