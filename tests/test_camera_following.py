@@ -12,7 +12,7 @@ import torch
 from mien import runtime
 from mien.capture.camera_names import CameraName, camera_named
 from mien.capture.faces import LandmarkDetector
-from mien.capture.live_camera import LiveCamera
+from mien.capture.live_camera import LiveCamera, LiveFrame
 from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
 from mien.cli import main
 from mien.driving.live import Follower, FollowOptions, LandmarkFit, OneEuro
@@ -116,6 +116,20 @@ def test_a_camera_that_vanishes_is_taken_up_again(clip: tuple[Path, np.ndarray],
         assert "is back" in said[1]
     assert not camera._thread.is_alive()
     assert camera.error is None
+
+
+class _Counted(LiveCamera):
+    """A camera that knows the number of each frame by its time. On a busy machine, the time alone does not tell it."""
+
+    def __init__(self, name: CameraName, again: bool) -> None:
+        super().__init__(name, again)
+        self.numbers: dict[float, int] = {}
+
+    def newest(self, after: int, seconds: float) -> LiveFrame | None:
+        frame = super().newest(after, seconds)
+        if frame is not None:
+            self.numbers[frame.seconds] = frame.number
+        return frame
 
 
 class _Stream(CameraName):
@@ -269,10 +283,28 @@ def test_meters() -> None:
 
 @pytest.mark.slow
 def test_a_camera_drives_the_viewer_in_real_time(clip: tuple[Path, np.ndarray], record_property: Callable) -> None:
+    told = []
+    for _ in range(3):  # a busy machine may drop too many frames in any one try
+        agreement, frames, median, late = _driven_by(clip)
+        told.append((agreement, frames, median))
+        if min(agreement.values()) >= 0.9 and frames > 30 and median < 0.5:
+            break
+    else:
+        pytest.fail(f"agreement with the truth, frames that were shown, and seconds of delay: {told}")
+    record_property("delay", f"median {1e3 * median:.0f} ms, 95 % {1e3 * late:.0f} ms")
+
+
+def _driven_by(clip: tuple[Path, np.ndarray]) -> tuple[dict[str, float], int, float, float]:
+    """Drive the viewer by the clip once.
+
+    Returns:
+        Correlation of what the avatar shows with the truth, for each expression; how many frames were shown; their
+        median delay, and the delay that 95 % of them keep, in seconds.
+    """
     avatar = runtime.Avatar(drawn_head(5000))
     session = Session(avatar)
-    name = camera_named(f"camera:{clip[0]}", None)
-    switch = CameraSwitch(session, lambda: LiveCamera(name, again=False), follower)
+    camera = _Counted(camera_named(f"camera:{clip[0]}", None), again=False)
+    switch = CameraSwitch(session, lambda: camera, follower)
     loop = DrawingLoop(session.picture)
     session.changed = loop.change
     pictures: list[np.ndarray] = []
@@ -286,8 +318,7 @@ def test_a_camera_drives_the_viewer_in_real_time(clip: tuple[Path, np.ndarray], 
     followed: list[tuple[float, np.ndarray]] = []
     switch.watch = lambda seen: followed.append((seen.seconds, session.face.expression))
     loop.add(1, show)
-    camera = avatar.camera
-    loop.look(1, View(camera.viewmat.astype(float), 0.5, 256, 256))
+    loop.look(1, View(avatar.camera.viewmat.astype(float), 0.5, 256, 256))
     loop.start()
     try:
         assert switch.report() == ["The camera is off."]
@@ -300,19 +331,17 @@ def test_a_camera_drives_the_viewer_in_real_time(clip: tuple[Path, np.ndarray], 
     finally:
         loop.stop()
     assert loop.error is None
-    moments = np.array([seconds for seconds, _ in followed])
-    index = np.round((moments - moments[0]) * FPS).astype(int).clip(0, len(clip[1]) - 1)
+    index = np.array([camera.numbers[seconds] for seconds, _ in followed])
     moving = index > FPS * STILL_SECONDS
-    for expression in FOLLOWED:
-        shown = np.array([values[column(expression)] for _, values in followed])
-        assert correlation(shown[moving], clip[1][index[moving], column(expression)]) >= 0.9, expression
-    assert count > 30
-    assert median < 0.5
+    agreement = {name: 0.0 for name in FOLLOWED}
+    if moving.sum() > 2:
+        shown, true = np.array([values for _, values in followed])[moving], clip[1][index[moving]]
+        agreement = {name: correlation(shown[:, column(name)], true[:, column(name)]) for name in FOLLOWED}
     assert "Following" in lines[0]
     assert any("median" in line for line in lines)
-    record_property("delay", f"median {1e3 * median:.0f} ms, 95 % {1e3 * late:.0f} ms")
     assert not switch.is_on
     np.testing.assert_array_equal(session.face.expression, avatar.face().expression)
+    return agreement, count, median, late
 
 
 def test_the_corner_shows_what_the_camera_saw() -> None:
