@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mien.batch import Batch, Row, State, latex_table, markdown_table, means_by,
 from mien.batch.steps import _write_strip
 from mien.capture.video import write_video
 from mien.cli import main
+from mien.commands import batch as batch_command
 from mien.errors import UserError
 
 
@@ -74,6 +76,41 @@ def test_status_and_table_on_the_command_line(tmp_path: Path, capsys: pytest.Cap
     assert "| sun | 2 |" in capsys.readouterr().out
     assert main(["batch", "status", str(tmp_path / "gone")]) == 2
     assert "is not the folder of a batch" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["status", "DIR", "--rows", "light"], "--rows is for `mien batch table DIR`"),
+        (["table", "DIR", "--watch"], "--watch is for `mien batch status DIR`"),
+        (["TABLE", "--out", "DIR", "--columns", "ssim"], "--columns is for `mien batch table DIR`"),
+        (["table", "EMPTY"], "no row is done yet"),
+        (["status", "OTHER"], "version 99, expected 'mien.batch' version 1"),
+    ],
+)
+def test_what_makes_no_sense_is_told(words: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    scored(Batch(tmp_path / "DIR"))
+    Batch(tmp_path / "EMPTY").write_plan([Row("ann", (("create",),), fingerprint="a")])
+    Batch(tmp_path / "OTHER").write_plan([])
+    plan = tmp_path / "OTHER" / "plan.json"
+    plan.write_text(plan.read_text().replace('"version": 1', '"version": 99'))
+    assert main(["batch", *(str(tmp_path / word) if word.isupper() else word for word in words)]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_missing_engine_is_told_before_rows_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
+    monkeypatch.setattr(batch_command.importlib.util, "find_spec", lambda name: None)
+    (tmp_path / "table.csv").write_text("nonsense\n")
+    assert main(["batch", str(tmp_path / "table.csv"), "--out", str(tmp_path / "out"), "--on", "ray"]) == 2
+    assert "pip install 'mien[batch]'" in capsys.readouterr().err
+
+
+def test_a_damaged_state_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    batch = Batch(tmp_path)
+    scored(batch)
+    batch.state_file("ann").write_text("{")
+    assert main(["batch", "status", str(tmp_path)]) == 0
+    assert "ann: failed, try 1: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("count", [1, 3, 40])

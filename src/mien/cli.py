@@ -15,7 +15,6 @@ import tempfile
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import mien
 from mien.bounded import MAX_SIDE
@@ -66,22 +65,6 @@ _USERS_ERRNOS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
 )
 """Errors that mien cannot prevent: the disk is full, read-only, protected or broken."""
-_USELESS = ("For full helptext", "Argument helptext")
-_REWORDED = (
-    (r"^Error parsing (\S+): invalid literal for int\(\) with base 10: ", r"\1: give a whole number instead of "),
-    (r"^Error parsing (\S+): could not convert string to float: ", r"\1: give a number instead of "),
-    (r"^Error parsing (\S+): no type matching (.+?) could be .*? from \[(.*?)\].*", r"\1: give \2 instead of \3"),
-    (r"^invalid choice (.*) for argument '(.+?)'\. Expected one of \((.*?),?\)", r"\2: give one of \3 instead of \1"),
-    (r"^Missing value for argument '(.+?)'\. Expected .* values", r"\1: give it a value"),
-    (r"^Missing from mien [\w -]+: ", "missing: "),
-    (r"^Unrecognized options: ", "unknown: "),
-    (r"^Expected one of \{(.*)\}", r"give one of \1"),
-    (r"^Available subcommands: ", "there are: "),
-    (r"^Perhaps you meant: ", "did you mean "),
-)
-"""Beginnings of tyro's complaints, and what mien says instead."""
-_INDENT_OF_DESCRIPTION = 8
-"""Number of spaces before an option's description in tyro's messages. Option names have fewer."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -169,6 +152,7 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
+    from mien.commands.complaints import complaint_of
     from mien.commands.help_text import at_a_glance, list_options, readable, without_details
     from mien.commands.options import settings_groups, with_settings
 
@@ -207,7 +191,7 @@ def _run(name: str, rest: list[str]) -> int:
             if more:
                 show(more)
             raise
-        complaint = _with_near_options(_in_one_line(complaints.getvalue()), options, style)
+        complaint = complaint_of(complaints.getvalue(), options, style)
         # The short help leaves out the options of groups, whose names have a dot.
         every = "-all" if re.search(r"--[a-z-]+\.[a-z]", complaint) else ""
         raise UserError(f"{complaint}; see mien {name} --help{every}") from None
@@ -220,48 +204,6 @@ def _run(name: str, rest: list[str]) -> int:
         _check_instruction_set()
         command.run()
     return 0
-
-
-def _in_one_line(box: str) -> str:
-    """One line from the box in which tyro reports wrong arguments, without the descriptions of options."""
-    lines = box.splitlines()
-    # If the terminal has no Unicode, the box is a title, a line of dashes, and the content indented by two spaces.
-    lines = lines[1:] if "╭" in box else lines[2:]
-    parts: list[str] = [""]
-    for line in lines:
-        if line.startswith("╰"):
-            continue
-        inner = line[2:].removesuffix("│").rstrip()
-        text = inner.strip()
-        if text and not text.strip("─-"):
-            parts.append("")
-        elif len(inner) - len(inner.lstrip()) < _INDENT_OF_DESCRIPTION:
-            comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
-            parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
-    return "; ".join(_reworded(part.rstrip(".")) for part in parts if part and not part.startswith(_USELESS))
-
-
-def _with_near_options(complaint: str, options: type, style: Any) -> str:
-    """A complaint of unknown options, with the known ones that look like them."""
-    unknown = re.search(r"unknown: ([^;]*)", complaint)
-    if unknown is None or "did you mean" in complaint:
-        return complaint
-    import tyro
-
-    shown = io.StringIO()
-    with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
-        tyro.cli(options, args=["--help"], config=style)
-    known = re.findall(r"^\W*(--[a-z][\w.-]*)", shown.getvalue(), re.MULTILINE)
-    typed = [word for word in unknown[1].split(", ") if word.startswith("--")]
-    near = [found for word in typed for found in difflib.get_close_matches(word, known, 1)]
-    return f"{complaint}; did you mean {', '.join(dict.fromkeys(near))}?" if near else complaint
-
-
-def _reworded(complaint: str) -> str:
-    """A complaint of tyro in the words of mien's own messages: the option, its value, and what to give."""
-    for pattern, words in _REWORDED:
-        complaint = re.sub(pattern, words, complaint)
-    return complaint
 
 
 def _check_instruction_set() -> None:

@@ -98,12 +98,18 @@ class Batch:
         try:
             content = parse_json(read_bytes(path, _MAX_PLAN_BYTES).decode())
         except FileNotFoundError:
-            raise UserError(f"{self.root}: is not the folder of a batch (no plan.json); {_AGAIN}") from None
+            raise UserError(
+                f"{self.root}: is not the folder of a batch (no plan.json); give the one that `mien batch TABLE --out` "
+                "names"
+            ) from None
         except (OSError, ValueError) as error:
             raise UserError(f"{path}: cannot be read as json ({error}); {_AGAIN}") from None
         with expect_whole(path, _AGAIN):
-            if (content["format"], content["version"]) != PLAN:
-                raise ValueError("format or version")
+            if (found := (content["format"], content["version"])) != PLAN:
+                raise UserError(
+                    f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {PLAN[0]!r} version "
+                    f"{PLAN[1]}; {_AGAIN}"
+                )
             return [row_from(each) for each in content["rows"]]
 
     def write_plan(self, rows: Sequence[Row]) -> None:

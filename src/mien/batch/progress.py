@@ -35,7 +35,8 @@ def batch_progress(batch: Batch) -> dict[str, Any]:
 
 
 def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:
-    if state is None or (state.fingerprint != row.fingerprint and state.status != "running"):
+    # The state of a damaged file has no fingerprint. It is shown, because someone has to know.
+    if state is None or (state.fingerprint not in ("", row.fingerprint) and state.status != "running"):
         return {"name": row.name, "status": "waiting"}
     found = {"name": row.name, "status": state.status, "tries": state.tries, "host": state.host}
     found |= {"began": state.began, "seconds": state.seconds}
@@ -85,7 +86,8 @@ def progress_text(found: dict[str, Any]) -> str:
 
 def _words(row: dict[str, Any]) -> str:
     seconds = f", {row['seconds']:.0f} s" if row["seconds"] else ""  # nobody wrote how long an interrupted row took
-    where = f"{row['status']} on {row['host']}{seconds}, try {row['tries']}"
+    host = f" on {row['host']}" if row["host"] else ""  # nobody can read it from a damaged file
+    where = f"{row['status']}{host}{seconds}, try {row['tries']}"
     stage = f", {row['stage']}" if row.get("stage") else ""
     percent = f", {row['percent']} %" if row.get("percent") is not None else ""
     return f"{where}{stage}{percent}" + (f": {row['error']}" if row.get("error") else "")

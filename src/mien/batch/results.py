@@ -102,8 +102,10 @@ def means_by(rows: Sequence[dict[str, Any]], by: str, columns: Sequence[str]) ->
     """A table of means: a heading, then a line for each value of the column `by`.
 
     Raises:
-        UserError: there is no such column, or it has no numbers.
+        UserError: no row is done, or there is no such column.
     """
+    if not any(row.get("method") for row in rows):
+        raise UserError("no row is done yet, so there is nothing to compare; see `mien batch status DIR`")
     known = dict.fromkeys(itertools.chain.from_iterable(rows))
     for name in (by, *(ALIASES.get(column, column) for column in columns)):
         if name not in known:

@@ -1,9 +1,10 @@
 """`mien batch`: a table of captures in, an avatar for each row out."""
 
+import importlib.util
 import json
 import shlex
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,10 @@ from mien.errors import UserError
 from mien.terminal import show
 
 _WATCH_SECONDS = 5.0
+_OF_TASKS = {"status": ("watch",), "table": ("rows", "columns")}
+"""Options of one task only."""
+_ENGINES = {"slurm": ("submitit",), "ray": ("ray",)}
+"""Packages of the engines. One that is missing is told before the rows are read."""
 NEEDS_TORCH = False
 """Rows run in processes of their own. Without torch, the driver of thousands stays small."""
 
@@ -68,15 +73,21 @@ class Command:
         """Check options and paths without heavy libraries."""
         from mien.files import check_writable
 
-        if self._task() is not None:
+        task = self._task()
+        if task is not None:
             if len(self.what) != 2:
-                task = f"batch {self.what[0]}"
-                raise UserError(f"{task}: give the folder of one batch, as in `mien {task} people`")
+                raise UserError(f"batch {task}: give the folder of one batch, as in `mien batch {task} people`")
+            self._check_given("status" if task == "table" else "table", f"`mien batch {task}`")
             return  # the task reads the plan at once
         if len(self.what) != 1:
             raise UserError("give one table of captures, or one folder of videos; see mien batch --help")
         if self.out is None:
             raise UserError("--out is missing; give a folder for the batch")
+        self._check_given("status", "a batch that runs")
+        self._check_given("table", "a batch that runs")
+        for package in _ENGINES.get(self.on, ()):
+            if importlib.util.find_spec(package) is None:
+                raise ModuleNotFoundError(f"No module named {package!r}", name=package)
         check_writable(self.out, folder=True)
         for name, value in (("retry", self.retry), ("jobs", self.jobs), ("threads", self.threads), ("time", self.time)):
             if not 0 <= value <= 100_000:
@@ -101,6 +112,14 @@ class Command:
             self._table(Batch(Path(self.what[1])))
         else:
             self._run_rows()
+
+    def _check_given(self, task: str, where: str) -> None:
+        """Check that no option of a task is given elsewhere, where it would change nothing."""
+        defaults = {each.name: each.default for each in fields(self)}
+        for name in _OF_TASKS[task]:
+            if getattr(self, name) != defaults[name]:
+                option = name.removeprefix("as_")
+                raise UserError(f"--{option} is for `mien batch {task} DIR`, and not for {where}; leave it out")
 
     def _task(self) -> str | None:
         return self.what[0] if self.what and self.what[0] in ("status", "table") else None

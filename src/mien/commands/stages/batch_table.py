@@ -5,8 +5,7 @@ import csv
 import difflib
 import io
 import json
-import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from mien.batch import WORKSPACE, Row, is_url, with_fingerprint
 from mien.bounded import parse_json, read_bytes
 from mien.capture import CaptureSettings
 from mien.commands import create
+from mien.commands.complaints import complaint_of
 from mien.commands.options import TrainOptions, check_method, with_settings
 from mien.errors import UserError
 from mien.inside import is_plain_name
@@ -24,6 +24,12 @@ _MAX_TABLE_BYTES = 64 << 20
 _VIDEOS = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"})
 _OWN = ("name", "video", "videos", "dataset", "method", "methods", "memory-gb")
 """Columns that are no options."""
+_OF_BATCH = {
+    "out": "the row's workspace is rows/NAME in the folder of the batch, so leave that column out",
+    "run-name": "a run has the name of its method, so leave that column out",
+    "view": "nobody watches the rows of a batch, so leave that column out",
+}
+"""Options of `mien create` that are no columns -> why."""
 _PATHS = frozenset(
     {"calibration", "config", "face-model", "capture.mattes", "capture.landmarks", "capture.clean-plate"}
 )
@@ -62,7 +68,7 @@ def _entries(path: Path) -> Iterator[dict[str, Any]]:
         return
     try:
         text = read_bytes(path, _MAX_TABLE_BYTES).decode("utf-8-sig")
-        content = parse_json(text) if path.suffix.lower() == ".json" else list(csv.DictReader(io.StringIO(text)))
+        content = parse_json(text) if path.suffix.lower() == ".json" else _lines(text, path)
     except FileNotFoundError:
         raise UserError(
             f"{path}: no such file or folder; give a csv or json of captures, or a folder of videos"
@@ -76,11 +82,19 @@ def _entries(path: Path) -> Iterator[dict[str, Any]]:
     yield from content
 
 
+def _lines(text: str, path: Path) -> list[dict[str, Any]]:
+    """The lines of a csv. Its reader would keep only the last of two columns with one name."""
+    reader = csv.DictReader(io.StringIO(text))
+    _check_names(reader.fieldnames or (), str(path))
+    return list(reader)
+
+
 def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Row:
     if None in entry:
         raise UserError(f"{where}: has more cells than the heading has columns; put texts with commas in quotes")
-    cells = {str(key).strip().removeprefix("--").replace("_", "-"): _words(value) for key, value in entry.items()}
-    original = {str(key).strip().removeprefix("--").replace("_", "-"): str(key).strip() for key in entry}
+    _check_names(map(str, entry), where)
+    cells = {_column(key): _words(value) for key, value in entry.items()}
+    original = {_column(key): str(key).strip() for key in entry}
     cells = {key: words for key, words in cells.items() if words}
     videos = cells.get("video", []) + cells.get("videos", [])
     dataset = cells.get("dataset", [])
@@ -115,6 +129,23 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Ro
     files = [Path(word) for words in (inputs, *options.values()) for word in words if not is_url(word)]
     row = Row(name, tuple(map(tuple, steps)), labels, _memory(cells, inputs, where))
     return with_fingerprint(row, [path for path in files if path.exists()])
+
+
+def _column(name: str) -> str:
+    """The name of a column as that of an option: capture_size, --capture-size and capture-size are one."""
+    return str(name).strip().removeprefix("--").replace("_", "-")
+
+
+def _check_names(names: Iterable[str], where: str) -> None:
+    """Check that no column is there twice, in any spelling, and that none is an option that the batch sets."""
+    seen: dict[str, str] = {}
+    for name in names:
+        column = _column(name)
+        if column in seen:
+            raise UserError(f"{where}: columns {seen[column]!r} and {name!r} are the same; keep one of them")
+        seen[column] = name
+        if column in _OF_BATCH:
+            raise UserError(f"{where}: column {name!r} cannot be set; {_OF_BATCH[column]}")
 
 
 def _words(value: Any) -> list[str]:
@@ -208,18 +239,18 @@ def _check(steps: list[list[str]], where: str, kinds: set[str]) -> None:
     out = local.index("--out")
     arguments = [*(local[:out] or ["one.mp4"]), "--out", "out", *local[out + 1 :]]
     told = io.StringIO()
+    options: Any = create.Command
+    style = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     try:
         with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
             options = with_settings(create.Command, arguments)
-            command = tyro.cli(options, args=arguments, config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone))
+            command = tyro.cli(options, args=arguments, config=style)
         command.options.check()
         command.capture.check()
         command.tracking.check()
     except SystemExit:
-        why = " ".join(line.strip("╭╮╰╯│─ ") for line in told.getvalue().splitlines())
-        raise UserError(
-            f"{where}: {' '.join(why.split())[:300]}; see {shlex.join(['mien', 'create', '--help-all'])}"
-        ) from None
+        why = complaint_of(told.getvalue(), options, style)
+        raise UserError(f"{where}: {why}; see mien create --help-all") from None
     except UserError as error:
         raise UserError(f"{where}: {error}") from None
 
