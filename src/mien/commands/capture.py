@@ -26,7 +26,7 @@ class Command:
     rig.json --name talk --out out/me
     """
 
-    videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    videos: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH [PATH ...]")]
     """A video file, or a folder of pictures in order. With --calibration, one for each camera, named by the camera's
     id, or one folder that holds them."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]

@@ -25,7 +25,7 @@ class Command:
     avatar is trained on the videos given here.
     """
 
-    videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    videos: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH [PATH ...]")]
     """Video files, or folders of pictures in order."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Workspace folder, new or existing."""

@@ -132,6 +132,7 @@ def export(content: RunContent, out: Path, kind: Format, options: Options) -> No
     """
     moving = content.poses() if kind.holds == "pose" else None
     if moving is None:
+        say(f"{out}: reads the run and writes the file, which takes up to half a minute")
         first, *notes = kind.write(out, content, options).splitlines()
         say(f"{out}: {first}")
         for note in notes:
