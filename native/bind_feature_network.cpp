@@ -88,22 +88,24 @@ struct KeptArrays {
 
 struct GradientArrays {
   static constexpr char kName[] = "FeatureGradients";
-  static constexpr const char* kFields[] = {"outputs", "last",    "features", "weight1",
-                                            "bias1",   "weight2", "bias2",    "inputs"};
+  static constexpr const char* kFields[] = {"outputs", "last",  "features", "weight1", "bias1",
+                                            "weight2", "bias2", "inputs",   "owns"};
   In<-1, -1> outputs;
   In<-1> last;
   Out<-1, -1> features, weight1;
   Out<-1> bias1;
   Out<-1, -1> weight2;
   Out<-1> bias2, inputs;
+  Out<-1, -1> owns;
 
   GradientArrays(const Group<GradientArrays>& group, const NetworkArrays& own, size_t inputs_count) {
-    group.read(outputs, last, features, weight1, bias1, weight2, bias2, inputs);
+    group.read(outputs, last, features, weight1, bias1, weight2, bias2, inputs, owns);
     require(has_shape(outputs, own.count(), own.bias2.shape(0) - 1) && has_shape(last, own.count()),
             "outputs must have one row per Gaussian");
     require(same_shape(features, own.neutral) && same_shape(weight1, own.weight1) && same_shape(bias1, own.bias1) &&
                 same_shape(weight2, own.weight2) && same_shape(bias2, own.bias2) &&
-                (inputs.shape(0) == 0 || has_shape(inputs, inputs_count)),
+                (inputs.shape(0) == 0 || has_shape(inputs, inputs_count)) &&
+                (owns.shape(0) == 0 || same_shape(owns, own.own)),
             "a gradient must have the shape of its array");
   }
 };
@@ -145,7 +147,8 @@ void feature_network_backward(const Group<NetworkArrays>& group, const Bases& ba
   mien::feature_network_backward(
       network, {items.data(), static_cast<int64_t>(items.size())}, {kept.features.data(), kept.hidden.data()},
       {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(), out.bias1.data(),
-       out.weight2.data(), out.bias2.data(), out.inputs.shape(0) == 0 ? nullptr : out.inputs.data()});
+       out.weight2.data(), out.bias2.data(), out.inputs.shape(0) == 0 ? nullptr : out.inputs.data(),
+       out.owns.shape(0) == 0 ? nullptr : out.owns.data()});
 }
 
 void factored_update(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,

@@ -23,7 +23,20 @@ namespace {
 using Floats = Array<float, nb::ndim<1>>;
 using Rows3 = Array<const float, nb::shape<-1, 3>>;
 constexpr double kBeta1 = 0.9, kBeta2 = 0.999;  // for bias correction; the same numbers as in Python
+constexpr int64_t kMostWidth = 1 << 20;
+constexpr size_t kMostTerms = 1 << 10;
 using Radii = Array<const int32_t, nb::ndim<1>>;
+
+struct Corrections {
+  float step_size, second_unbiased;
+};
+
+// Adam's corrections of its running means at the next step, which is counted.
+Corrections next_corrections(const Array<float, nb::shape<>>& steps, double rate) {
+  const double count = *steps.data() += 1;
+  return {static_cast<float>(rate / (1 - std::pow(kBeta1, count))),
+          static_cast<float>(1 / std::sqrt(1 - std::pow(kBeta2, count)))};
+}
 
 // One tensor's arrays, which stay alive while this does.
 struct AdamArrays {
@@ -41,16 +54,31 @@ struct AdamArrays {
             "gradient and moments must have the shape of the values");
   }
   mien::AdamTask step() const {
-    const double count = *steps.data() += 1;
-    return {values.data(),
-            gradient.data(),
-            first.data(),
-            second.data(),
-            static_cast<int64_t>(values.size()),
-            static_cast<float>(rate / (1 - std::pow(kBeta1, count))),
-            static_cast<float>(1 / std::sqrt(1 - std::pow(kBeta2, count)))};
+    const Corrections found = next_corrections(steps, rate);
+    return {values.data(),   gradient.data(),      first.data(), second.data(), static_cast<int64_t>(values.size()),
+            found.step_size, found.second_unbiased};
   }
 };
+
+void factored_adam_update(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,
+                          const std::vector<In<-1>>& columns, const Out<-1, -1, -1>& first,
+                          const Out<-1, -1, -1>& second, const Array<float, nb::shape<>>& steps, double rate) {
+  const size_t count = values.shape(0), inputs = values.shape(1), width = values.shape(2);
+  require(same_shape(first, values) && same_shape(second, values), "moments must have the shape of the values");
+  require(rows.size() == columns.size() && rows.size() <= kMostTerms, "every term needs rows and columns");
+  std::vector<mien::FactoredTerm> terms;
+  for (size_t i = 0; i < rows.size(); ++i) {
+    require(has_shape(rows[i], count, width) && has_shape(columns[i], inputs), "factors must fit the values");
+    terms.push_back({rows[i].data(), columns[i].data()});
+  }
+  const int columns_count = checked_length(inputs, kMostWidth, "inputs");
+  const int row_width = checked_length(width, kMostWidth, "numbers in a row");
+  const Corrections found = next_corrections(steps, rate);
+  const nb::gil_scoped_release release;
+  mien::factored_adam_update({values.data(), terms.data(), first.data(), second.data(), static_cast<int64_t>(count),
+                              columns_count, row_width, static_cast<int>(terms.size()), found.step_size,
+                              found.second_unbiased});
+}
 
 void adam_update(const std::vector<Group<AdamArrays>>& groups) {
   const std::vector<AdamArrays> arrays(groups.begin(), groups.end());
@@ -143,6 +171,9 @@ void absolute_difference(const Array<const float, nb::ndim<2>>& values, const Ar
 
 void bind_training(nb::module_& module) {
   bind_group<AdamArrays>(module);
+  module.def("factored_adam_update", &factored_adam_update, "values"_a.noconvert(), "rows"_a, "columns"_a,
+             "first"_a.noconvert(), "second"_a.noconvert(), "steps"_a.noconvert(), "rate"_a,
+             "Makes one step of Adam with values [n, k, f], whose gradient is a sum of outer products.");
   module.def("adam_update", &adam_update, "tasks"_a,
              "Makes one step of Adam with every tensor. The number of steps grows by one.");
   module.def("triangle_penalties", &triangle_penalties, "thresholds"_a, "weights"_a, "means"_a, "log_scales"_a,

@@ -36,16 +36,17 @@ const float* transpose(const float* from, int64_t rows, int64_t width, int64_t s
   return out.data();
 }
 
-PaddedNetwork pad(const FeatureNetwork& own, bool backward) {
+PaddedNetwork pad(const FeatureNetwork& own, bool backward, bool by_owns = false) {
   thread_local std::vector<float> buffers[6];
   const int64_t in = own.features + own.own;
   PaddedNetwork network{};
   network.own = &own;
-  network.in_stride = padded(in), network.feature_stride = padded(own.features);
+  const int64_t back = by_owns ? in : own.features;  // numbers of a row whose gradients are made
+  network.in_stride = padded(in), network.feature_stride = padded(back);
   network.hidden_stride = padded(own.hidden), network.out_stride = padded(own.width);
   if (backward) {
     network.second_back = pad_rows(own.weight2, own.width, own.hidden, own.hidden, network.hidden_stride, buffers[4]);
-    network.first_back = pad_rows(own.weight1, own.hidden, own.features, in, network.feature_stride, buffers[5]);
+    network.first_back = pad_rows(own.weight1, own.hidden, back, in, network.feature_stride, buffers[5]);
   } else {
     network.first = transpose(own.weight1, own.hidden, in, network.hidden_stride, buffers[0]);
     network.first_bias = pad_rows(own.bias1, 1, own.hidden, own.hidden, network.hidden_stride, buffers[1]);
@@ -121,7 +122,7 @@ void feature_network(const FeatureNetwork& network, const FeatureInputs& inputs,
 
 void feature_network_backward(const FeatureNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
                               const FeatureGradients& gradients) {
-  const PaddedNetwork own = pad(network, true);
+  const PaddedNetwork own = pad(network, true, gradients.owns != nullptr);
   const SumsLayout at = layout_of(own, inputs.count);
   const int64_t pieces = (network.count + kPiece - 1) / kPiece;
   thread_local std::vector<float> buffer;

@@ -44,6 +44,7 @@ struct FeatureGradients {
   float* features;       // [n, f], written: also the gradient of `neutral`
   float *weight1, *bias1, *weight2, *bias2;
   float* inputs;  // one per input, or null
+  float* owns;    // [n, x], or null
 };
 // Gaussians whose outputs have no gradient are not read. The gradient of the bases is never made: that of input k's
 // column is its value times `features`. The result does not depend on the number of threads. Runs on the pool.

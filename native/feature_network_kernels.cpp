@@ -155,6 +155,7 @@ void backward_block(const PaddedNetwork& network, const FeatureInputs& inputs, c
   for (int64_t i = 0; i < block.count; ++i) {
     const float* by_features = block.by_features + i * network.feature_stride;
     copy(gradients.features + block.index[i] * own.features, by_features, own.features);
+    if (gradients.owns) copy(gradients.owns + block.index[i] * own.own, by_features + own.features, own.own);
     if (!gradients.inputs) continue;
     for (int64_t k = 0; k < inputs.count; ++k) {
       const float* row = row_of(inputs.items[k], block.index[i]);
@@ -179,6 +180,7 @@ void backward(const PaddedNetwork& network, const FeatureInputs& inputs, const F
   for (int64_t index = first; index < end; ++index) {
     if (gradients.last[index] == 0 && all_zero(gradients.outputs + index * (own.width - 1), own.width - 1)) {
       memset(gradients.features + index * own.features, 0, sizeof(float) * own.features);
+      if (gradients.owns) memset(gradients.owns + index * own.own, 0, sizeof(float) * own.own);
       continue;
     }
     gather(network, kept, gradients, index, block);

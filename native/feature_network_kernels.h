@@ -16,7 +16,7 @@ struct PaddedNetwork {
   const float *first, *first_bias;    // [f + x, hidden_stride], [hidden_stride]
   const float *second, *second_bias;  // [h, out_stride], [out_stride]
   const float* second_back;           // [o, hidden_stride]
-  const float* first_back;            // [h, feature_stride]
+  const float* first_back;            // [h, feature_stride]: of the features, then of own numbers if that is asked for
 };
 
 // Sums over the Gaussians of a piece: rows padded as above. `inputs` has 16 parts per input.

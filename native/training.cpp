@@ -56,6 +56,14 @@ void adam_update(const AdamTask* tasks, int count) {
                [&](int64_t index) { kernels.adam(tasks[all[index].task], all[index].first, all[index].last); });
 }
 
+void factored_adam_update(const FactoredAdamTask& task) {
+  constexpr int64_t kRows = 64;  // Gaussians in a piece, each with all its columns
+  const TrainingKernels& kernels = training_kernels();
+  parallel_for((task.count + kRows - 1) / kRows, [&](int64_t piece) {
+    kernels.factored_adam(task, piece * kRows, std::min((piece + 1) * kRows, task.count));
+  });
+}
+
 Penalties triangle_penalties(const PenaltyTask& task) {
   const int64_t in_view = std::count_if(task.radii, task.radii + task.count, [](int32_t radius) { return radius > 0; });
   const float share = 1.0f / static_cast<float>(std::max<int64_t>(in_view, 1));

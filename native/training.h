@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "feature_network.h"
+
 namespace mien {
 
 // One tensor's update by Adam (Kingma and Ba 2015).
@@ -19,6 +21,18 @@ struct AdamTask {
 constexpr float kAdamBeta1 = 0.9f, kAdamBeta2 = 0.999f, kAdamEpsilon = 1e-15f;
 
 void adam_update(const AdamTask* tasks, int count);
+
+// The same for values [n, k, f] whose gradient is a sum of outer products, so that it is never made. Bits are those of
+// `adam_update` with that gradient.
+struct FactoredAdamTask {
+  float* values;
+  const FactoredTerm* terms;
+  float *first, *second;  // [n, k, f]
+  int64_t count;
+  int columns_count, width, terms_count;
+  float step_size, second_unbiased;
+};
+void factored_adam_update(const FactoredAdamTask& task);
 
 // Penalties on Gaussians that stray from their triangle (GaussianAvatars, section 3.4), means over those in view:
 // max(|mean| - position_threshold, 0) and |max(exp(log_scales) - scale_threshold, 0)|, each times its weight.

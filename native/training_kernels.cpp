@@ -21,19 +21,37 @@ MIEN_INLINE void store_some(float* to, int64_t valid, F value) {
   }
 }
 
-void adam(const AdamTask& task, int64_t begin, int64_t end) {
+// One vector of a tensor at place i, whose gradient is g.
+template <class Task>
+MIEN_INLINE void adam_vector(const Task& task, int64_t i, int64_t valid, F g) {
   const F beta1 = set1(kAdamBeta1), beta2 = set1(kAdamBeta2);
-  for (int64_t i = begin; i < end; i += W) {
-    const int64_t valid = end - i;
-    const F g = load_some(task.gradient + i, valid);
-    F first = load_some(task.first + i, valid), second = load_some(task.second + i, valid);
-    first = first * beta1 + g * (1.0f - kAdamBeta1);
-    second = second * beta2 + g * g * (1.0f - kAdamBeta2);
-    const F denominator = square_root(second) * task.second_unbiased + kAdamEpsilon;
-    store_some(task.first + i, valid, first);
-    store_some(task.second + i, valid, second);
-    const F value = load_some(task.values + i, valid);
-    store_some(task.values + i, valid, value - task.step_size * first / denominator);
+  F first = load_some(task.first + i, valid), second = load_some(task.second + i, valid);
+  first = first * beta1 + g * (1.0f - kAdamBeta1);
+  second = second * beta2 + g * g * (1.0f - kAdamBeta2);
+  const F denominator = square_root(second) * task.second_unbiased + kAdamEpsilon;
+  store_some(task.first + i, valid, first);
+  store_some(task.second + i, valid, second);
+  const F value = load_some(task.values + i, valid);
+  store_some(task.values + i, valid, value - task.step_size * first / denominator);
+}
+
+void adam(const AdamTask& task, int64_t begin, int64_t end) {
+  for (int64_t i = begin; i < end; i += W) adam_vector(task, i, end - i, load_some(task.gradient + i, end - i));
+}
+
+void factored_adam(const FactoredAdamTask& task, int64_t begin, int64_t end) {
+  [[maybe_unused]] const NoDenormals guard;  // running means of gradients that have ended approach 0
+  for (int64_t index = begin; index < end; ++index) {
+    for (int k = 0; k < task.columns_count; ++k) {
+      const int64_t at = (index * task.columns_count + k) * task.width;
+      for (int i = 0; i < task.width; i += W) {
+        F g{};
+        for (int t = 0; t < task.terms_count; ++t) {
+          g = g + load_some(task.terms[t].rows + index * task.width + i, task.width - i) * task.terms[t].columns[k];
+        }
+        adam_vector(task, at + i, task.width - i, g);
+      }
+    }
   }
 }
 
@@ -136,7 +154,7 @@ double absolute_difference(const float* values, const uint8_t* bytes, float shar
 }  // namespace
 
 extern const TrainingKernels training_kernels;
-const TrainingKernels training_kernels = {adam,        penalties,          observe,
+const TrainingKernels training_kernels = {adam,        factored_adam,      penalties,          observe,
                                           any_nonzero, squared_difference, absolute_difference};
 
 }  // namespace mien::MIEN_ISA

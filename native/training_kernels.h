@@ -8,6 +8,7 @@ namespace mien {
 struct TrainingKernels {
   // Elements, or Gaussians, first .. last - 1.
   void (*adam)(const AdamTask&, int64_t first, int64_t last);
+  void (*factored_adam)(const FactoredAdamTask&, int64_t first, int64_t last);
   // `share` is 1 / number in view.
   Penalties (*penalties)(const PenaltyTask&, float share, int64_t first, int64_t last);
   void (*observe)(const ViewStatistics&, int64_t first, int64_t last);

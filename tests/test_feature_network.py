@@ -5,9 +5,17 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.adam import FactoredGradient, FactoredMoments
+from mien.adam import FactoredGradient, FactoredMoments, Moments
 from mien.avatar.ops.feature_network import Layers, feature_network, feature_network_reference
-from mien.training.adam import FactoredUpdate, factored_update, factored_update_reference
+from mien.training.adam import (
+    FactoredAdamUpdate,
+    FactoredUpdate,
+    Update,
+    factored_adam_update,
+    factored_update,
+    factored_update_reference,
+    update_all,
+)
 
 Sizes = tuple[int, int, int, int, int, int]
 """Gaussians, inputs, features, own numbers, hidden values, outputs."""
@@ -45,9 +53,9 @@ def ours(given: list[Tensor], by: tuple[Tensor, Tensor]) -> list[Tensor]:
     gradient = FactoredGradient()
     leaves = [tensor.clone().requires_grad_() for tensor in given]
     bases, inputs, neutral, own, *layers = leaves
-    outputs = feature_network(bases, inputs, neutral, own.detach(), Layers(*layers), gradient)
+    outputs = feature_network(bases, inputs, neutral, own, Layers(*layers), gradient)
     by = (by[0].to(outputs[0]), by[1].to(outputs[1]))
-    found = torch.autograd.grad(outputs, [inputs, neutral, *layers], by)
+    found = torch.autograd.grad(outputs, [inputs, neutral, own, *layers], by)
     (rows, columns), *others = gradient.take()
     assert not others
     return [tensor.detach() for tensor in (*outputs, rows[:, None] * columns[:, None], *found)]
@@ -58,7 +66,7 @@ def theirs(given: list[Tensor], by: tuple[Tensor, Tensor]) -> list[Tensor]:
     leaves = [tensor.double().requires_grad_() for tensor in given]
     bases, inputs, neutral, own, *layers = leaves
     outputs = feature_network_reference(bases, inputs, neutral, own, Layers(*layers))
-    found = torch.autograd.grad(outputs, [bases, inputs, neutral, *layers], (by[0].double(), by[1].double()))
+    found = torch.autograd.grad(outputs, [bases, inputs, neutral, own, *layers], (by[0].double(), by[1].double()))
     return [tensor.detach() for tensor in (*outputs, *found)]
 
 
@@ -94,6 +102,18 @@ def test_threads_do_not_change_a_bit() -> None:
         results.append(ours(arguments(SIZES[3]), gradients_of(SIZES[3])))
     _native.set_thread_count(before)
     assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
+
+
+def test_gradients_are_the_same_whether_own_numbers_have_one(isa: str) -> None:
+    (bases, inputs, neutral, own, *layers), by = arguments(SIZES[4]), gradients_of(SIZES[4])
+    found = []
+    for wanted in (False, True):
+        leaves = [tensor.clone().requires_grad_() for tensor in (inputs, neutral, *layers)]
+        outputs = feature_network(
+            bases, leaves[0], leaves[1], own.clone().requires_grad_(wanted), Layers(*leaves[2:]), FactoredGradient()
+        )
+        found.append(torch.autograd.grad(outputs, leaves, by))
+    assert all(torch.equal(one, two) for one, two in zip(*found, strict=True))
 
 
 def test_without_gradients_the_outputs_are_the_same() -> None:
@@ -203,3 +223,35 @@ def test_terms_that_cancel_leave_everything_finite(isa: str) -> None:
     factored_update(update._replace(terms=[(rows, columns), (-rows * (1 - 1e-7), columns)]))
     assert update.values.isfinite().all()
     assert (update.moments.second >= 0).all()
+
+
+def published(dtype: torch.dtype, f: int, terms: int) -> FactoredAdamUpdate:
+    """An update by Adam as published, at its fourth step."""
+    one = update_of(dtype, f=f)
+    n, k, _ = one.values.shape
+    first, second = random(n, k, f, seed=5).to(dtype), (random(n, k, f, seed=6).square() + 0.1).to(dtype)
+    more = [(random(n, f, seed=7 + t).to(dtype), random(k, seed=9 + t).to(dtype)) for t in range(terms - 1)]
+    return FactoredAdamUpdate(one.values, [*one.terms, *more], Moments(first, second, torch.tensor(3.0)), one.rate)
+
+
+def changed(update: FactoredAdamUpdate) -> tuple[Tensor, ...]:
+    return update.values, update.moments.first, update.moments.second, update.moments.step
+
+
+@pytest.mark.parametrize(("f", "terms"), [(1, 1), (16, 1), (19, 3), (32, 2)])
+def test_published_update_equals_its_reference(isa: str, f: int, terms: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    native, plain = published(torch.float32, f, terms), published(torch.float64, f, terms)
+    with monkeypatch.context() as only_native:
+        only_native.setattr("mien.training.adam.update_reference", None)
+        factored_adam_update(native)
+    factored_adam_update(plain)
+    for own, expected in zip(changed(native), changed(plain), strict=True):
+        torch.testing.assert_close(own.double(), expected.double(), rtol=1e-5, atol=1e-6)
+
+
+def test_published_update_has_the_bits_of_adam_with_the_whole_gradient(isa: str) -> None:
+    factored, whole = published(torch.float32, 19, 1), published(torch.float32, 19, 1)
+    ((rows, columns),) = whole.terms
+    factored_adam_update(factored)
+    update_all([Update(whole.values, rows[:, None] * columns[:, None], whole.moments, whole.rate)])
+    assert all(torch.equal(one, two) for one, two in zip(changed(factored), changed(whole), strict=True))

@@ -4,6 +4,7 @@
 #include "checks.h"
 #include "feature_network.h"
 #include "pool.h"
+#include "training.h"
 
 namespace checks {
 namespace {
@@ -14,7 +15,7 @@ struct Sizes {
 };
 
 struct NetworkResult {
-  Floats outputs, last, by_features, by_weight1, by_bias1, by_weight2, by_bias2, by_inputs;
+  Floats outputs, last, by_features, by_weight1, by_bias1, by_weight2, by_bias2, by_inputs, by_owns;
   bool operator==(const NetworkResult&) const = default;
 };
 
@@ -55,9 +56,11 @@ NetworkResult run(const Sizes& s, bool by_input) {
   }
   r.by_features.resize(neutral.size()), r.by_weight1.resize(weight1.size()), r.by_bias1.resize(s.hidden);
   r.by_weight2.resize(weight2.size()), r.by_bias2.resize(s.width), r.by_inputs.resize(s.inputs);
-  mien::feature_network_backward(network, inputs, {features.data(), hidden.data()},
-                                 {by_outputs.data(), by_last.data(), r.by_features.data(), r.by_weight1.data(),
-                                  r.by_bias1.data(), r.by_weight2.data(), r.by_bias2.data(), r.by_inputs.data()});
+  r.by_owns.resize(own.size());
+  mien::feature_network_backward(
+      network, inputs, {features.data(), hidden.data()},
+      {by_outputs.data(), by_last.data(), r.by_features.data(), r.by_weight1.data(), r.by_bias1.data(),
+       r.by_weight2.data(), r.by_bias2.data(), r.by_inputs.data(), r.by_owns.data()});
   return r;
 }
 
@@ -69,8 +72,32 @@ void check_network() {
       const NetworkResult serial = run(sizes, by_input);
       CHECK(all_finite(serial.outputs) && all_finite(serial.by_features) && all_finite(serial.by_weight1));
       CHECK(all_finite(serial.by_weight2) && all_finite(serial.by_inputs) && all_finite(serial.by_bias1));
+      CHECK(all_finite(serial.by_owns));
       mien::set_thread_count(3);
       CHECK(run(sizes, by_input) == serial);
+    }
+  }
+}
+
+// Adam on factors has the bits of Adam on their product, for any number of threads.
+void check_adam() {
+  for (int width : {1, 15, 16, 33}) {
+    for (int threads : {1, 3}) {
+      mien::set_thread_count(threads);
+      Random random(6);
+      const int64_t count = 300, columns_count = 5, size = count * columns_count * width;
+      Floats values = random.normal(size), first = random.normal(size), second = random.uniform(size);
+      Floats plain = values, plain_first = first, plain_second = second, gradient(size);
+      const Floats rows = random.normal(count * width), columns = random.normal(columns_count);
+      for (int64_t i = 0; i < size; ++i)
+        gradient[i] = rows[i / (columns_count * width) * width + i % width] * columns[i / width % columns_count];
+      const mien::FactoredTerm term{rows.data(), columns.data()};
+      mien::factored_adam_update({values.data(), &term, first.data(), second.data(), count,
+                                  static_cast<int>(columns_count), width, 1, 0.01f, 2.0f});
+      const mien::AdamTask task{plain.data(), gradient.data(), plain_first.data(), plain_second.data(), size, 0.01f,
+                                2.0f};
+      mien::adam_update(&task, 1);
+      CHECK(values == plain && first == plain_first && second == plain_second);
     }
   }
 }
@@ -108,6 +135,7 @@ void check_update() {
 void check_feature_network() {
   check_network();
   check_update();
+  check_adam();
 }
 
 }  // namespace checks

@@ -246,6 +246,14 @@ class AdamTask(NamedTuple):
     """Of no axes."""
     rate: float
 
+def factored_adam_update(
+    values: Tensor, rows: list[Tensor], columns: list[Tensor], first: Tensor, second: Tensor, steps: Tensor, rate: float
+) -> None:
+    """Updates `values`, `first` and `second` [n, k, f], and counts the step.
+
+    The gradient is the sum of rows [n, f] times columns [k] over all terms.
+    """
+
 def adam_update(tasks: Sequence[AdamTask | tuple[Any, Any, Any, Any, Any, float]]) -> None: ...
 def triangle_penalties(
     thresholds: tuple[float, float],
@@ -438,6 +446,8 @@ class FeatureGradients(NamedTuple):
     bias2: Tensor
     inputs: Tensor
     """Of the inputs of all bases, in their order. Empty if it is not wanted."""
+    owns: Tensor
+    """[n, x], of the Gaussians' own numbers. Without rows if it is not wanted."""
 
 def feature_network(
     network: FeatureNetwork, bases: Sequence[FeatureBases], kept: FeatureKept | None, outputs: Tensor, last: Tensor

@@ -98,7 +98,10 @@ def feature_network_backward(native: Any, rng: Rng) -> Arguments:
     kept = native.FeatureKept(normal(rng, n, f), normal(rng, n, -(-h // 16) * 16))
     by_layers = [np.empty_like(array) for array in network[2:]]
     by_inputs = empty(sum(len(one.inputs) for one in bases))
-    gradients = native.FeatureGradients(normal(rng, n, o - 1), normal(rng, n), empty(n, f), *by_layers, by_inputs)
+    by_own = np.empty_like(network.own) if rng.random() < 0.5 else empty(0, 0)
+    gradients = native.FeatureGradients(
+        normal(rng, n, o - 1), normal(rng, n), empty(n, f), *by_layers, by_inputs, by_own
+    )
     return [network, bases, kept, gradients]
 
 
@@ -324,6 +327,12 @@ def photometric_loss(native: Any, rng: Rng) -> Arguments:
     return [box, (0.8, 0.2), normal(rng, h, w, 3), target, drawn, gradient, empty()]
 
 
+def factored_adam_update(native: Any, rng: Rng) -> Arguments:
+    values, rows, columns, *_ = factored_update(native, rng)
+    first, second = normal(rng, *values.shape), np.abs(normal(rng, *values.shape))
+    return [values, rows, columns, first, second, np.float32(rng.integers(0, 9)).reshape(()), 0.01]
+
+
 def adam_update(native: Any, rng: Rng) -> Arguments:
     def task() -> Any:
         shape = few(rng), int(rng.integers(1, 4))
@@ -390,7 +399,7 @@ BASELINES: dict[str, Baseline] = {
         compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
         barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,
         align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
-        rasterize_views, rasterize_views_backward, photometric_loss, adam_update,
+        rasterize_views, rasterize_views_backward, photometric_loss, adam_update, factored_adam_update,
         triangle_penalties, observe_view, keep_on_surface, clear_rows, mean_squared_difference,
         absolute_difference, box_of_nonzero, composite,
     )

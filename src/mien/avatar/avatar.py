@@ -57,6 +57,8 @@ class ParameterGroup:
     """Times at which the rate is halved, as fractions of the run."""
     epsilon: float = EPSILON
     """Adam's epsilon. It does not reach gradients that are `factored`."""
+    factored_moments: type[Moments] | type[FactoredMoments] = FactoredMoments
+    """State of the optimiser for gradients that are `factored`: `Moments` are Adam's as published."""
 
     def rate_at(self, progress: Progress) -> float:
         """The learning rate at a step."""
@@ -69,9 +71,16 @@ def store_group(store: GaussianStore, name: str, rate: Rate, *, times_extent: bo
     return ParameterGroup(name, {name: store[name]}, rate, store.moments, times_extent)
 
 
-def factored_group(store: GaussianStore, name: str, rate: Rate, gradient: FactoredGradient) -> ParameterGroup:
+def factored_group(
+    store: GaussianStore,
+    name: str,
+    rate: Rate,
+    gradient: FactoredGradient,
+    moments: type[Moments] | type[FactoredMoments] = FactoredMoments,
+) -> ParameterGroup:
     """The group of one per-Gaussian tensor [n, k, f] whose gradient is a sum of outer products."""
-    return ParameterGroup(name, {name: store[name]}, rate, store.moments, factored={name: gradient})
+    own = {name: store[name]}
+    return ParameterGroup(name, own, rate, store.moments, factored={name: gradient}, factored_moments=moments)
 
 
 def network_group(name: str, network: nn.Module, rate: Rate) -> ParameterGroup:

@@ -35,14 +35,23 @@ class FactoredUpdate(NamedTuple):
     rate: float
 
 
+class FactoredAdamUpdate(NamedTuple):
+    """The same by Adam as published, with two running means of every number."""
+
+    values: Float[Tensor, "n k f"]
+    terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]
+    moments: Moments
+    rate: float
+
+
 _State = TypeVar("_State", Moments, FactoredMoments)
 
 
 class Adam:
     """Adam (Kingma and Ba 2015) with the constants of 3D Gaussian Splatting. One native call updates all tensors.
 
-    A tensor with a factored gradient has an update of its own (`factored_update`). The state of per-Gaussian tensors is
-    in their store, that of networks is here.
+    A tensor with a factored gradient has an update of its own (`factored_update`, `factored_adam_update`). The state
+    of per-Gaussian tensors is in their store, that of networks is here.
     """
 
     def __init__(self) -> None:
@@ -57,8 +66,7 @@ class Adam:
                 if name in group.factored:
                     terms = group.factored[name].take()
                     if terms and rate > 0:
-                        state = self._state(group, name, tensor, FactoredMoments)
-                        factored_update(FactoredUpdate(tensor, terms, state, rate))
+                        self._update_by_factors(group, name, tensor, terms, rate)
                     continue
                 gradient = tensor.grad
                 if gradient is None:
@@ -68,6 +76,19 @@ class Adam:
                     state = self._state(group, name, tensor, Moments)
                     updates.append(Update(tensor, gradient, state, rate, group.epsilon))
         update_all(updates)
+
+    def _update_by_factors(
+        self,
+        group: ParameterGroup,
+        name: str,
+        tensor: Tensor,
+        terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]],
+        rate: float,
+    ) -> None:
+        if group.factored_moments is Moments:
+            factored_adam_update(FactoredAdamUpdate(tensor, terms, self._state(group, name, tensor, Moments), rate))
+        else:
+            factored_update(FactoredUpdate(tensor, terms, self._state(group, name, tensor, FactoredMoments), rate))
 
     def state(self) -> dict[str, Moments | FactoredMoments]:
         """The state of all tensors that have no store, by group and tensor."""
@@ -161,3 +182,23 @@ def factored_update_reference(update: FactoredUpdate) -> None:
     weights = torch.where(touched, moments.weights, torch.ones_like(moments.weights))
     deviations = (moments.second / weights[:, None]).sqrt() + EPSILON
     values.sub_(rate * gradient / deviations[:, None])
+
+
+def factored_adam_update(update: FactoredAdamUpdate) -> None:
+    """Apply an update in place: natively, without making the gradient, if tensors are float32, contiguous, on a CPU.
+
+    With one term, it has the bits of `update_all` with the whole gradient. That would be the largest tensor of a step.
+    """
+    values, terms, moments, rate = update
+    terms = [(rows, columns.detach()) for rows, columns in terms]
+    arrays = (values.detach(), moments.first, moments.second, moments.step)
+    every = (*arrays, *(tensor for term in terms for tensor in term))
+    if all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in every):
+        native_values, first, second, step = unpacked(*arrays)
+        rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
+        _native.factored_adam_update(native_values, rows, columns, first, second, step, rate)
+        return
+    with torch.no_grad():
+        gradient = sum(rows[:, None, :] * columns[:, None] for rows, columns in terms)
+    assert isinstance(gradient, Tensor)
+    update_reference(Update(values, gradient, moments, rate))

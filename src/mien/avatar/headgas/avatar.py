@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mien.adam import FactoredGradient
+from mien.adam import FactoredGradient, FactoredMoments, Moments
 from mien.avatar.avatar import (
     UNBAKED_REMEDY,
     Avatar,
@@ -48,8 +48,6 @@ from mien.avatar.ops.feature_network import (
     Layers,
     blended_features,
     feature_network,
-    feature_network_reference,
-    network_outputs,
 )
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
@@ -152,8 +150,8 @@ class HeadGas(Avatar):
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
         ]
         if parts.blends:
-            factored = factored_group(self.store, "bases", config.features_rate, self._bases_gradient)
-            groups.append(factored if config.factored_bases else store_group(self.store, "bases", config.features_rate))
+            kind = FactoredMoments if config.factored_bases else Moments
+            groups.append(factored_group(self.store, "bases", config.features_rate, self._bases_gradient, kind))
         network = network_group("network", self.network, config.network_rate)
         return [*groups, replace(network, epsilon=config.network_epsilon)] if parts.layers else groups
 
@@ -254,22 +252,14 @@ class HeadGas(Avatar):
             yield found if isinstance(found, Changes) else self._unpainted(found, progress)
 
     def _blended(self, weights: Float[Tensor, " k"], neutral: Float[Tensor, "n f"]) -> Float[Tensor, "n f"]:
-        bases = self.store["bases"]
-        if self.config.factored_bases:
-            return blended_features(bases, weights, neutral, self._bases_gradient)
-        return neutral + torch.einsum("nkf,k->nf", bases, weights)
+        return blended_features(self.store["bases"], weights, neutral, self._bases_gradient)
 
     def _outputs(
         self, inputs: Float[Tensor, " k"], encoding: Float[Tensor, "n c"], layers: Layers
     ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
-        """The network's outputs at one timestep, with the gradients that the settings ask for."""
+        """The network's outputs at one timestep."""
         bases, neutral = self.store["bases"], self.store["neutral_features"]
-        is_native = self.config.factored_bases and not self.config.encoding_gradient
-        if is_native or not torch.is_grad_enabled():
-            return feature_network(bases, inputs, neutral, encoding.detach(), layers, self._bases_gradient)
-        if self.config.factored_bases:
-            return network_outputs(self._blended(inputs, neutral), encoding, layers)
-        return feature_network_reference(bases, inputs, neutral, encoding, layers)
+        return feature_network(bases, inputs, neutral, encoding, layers, self._bases_gradient)
 
     def _unpainted(self, moved: Float[Tensor, "n 7"], progress: Progress) -> Changes:
         shares = self._color_shares(progress).to(moved)

@@ -49,7 +49,7 @@ def feature_network(
     layers: Layers,
     gradient: FactoredGradient,
 ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
-    """All outputs but the last, and the last. Differentiable in everything but `own`.
+    """All outputs but the last, and the last. Differentiable in everything.
 
     Args:
         bases: Bases of the features. Their gradient goes to `gradient`.
@@ -134,15 +134,17 @@ class _Network(torch.autograd.Function):
         bases, inputs, neutral, own, *layers = ctx.saved_tensors[:8]
         by_features = recycled(*neutral.shape)
         by_inputs = torch.empty(len(inputs) if ctx.needs_input_grad[2] else 0)
+        by_own = torch.empty_like(own) if ctx.needs_input_grad[4] else None
         by_layers = [torch.empty_like(tensor) for tensor in layers]
         _native.feature_network_backward(
             _native.FeatureNetwork(*unpacked(neutral, own, *layers)),
             [_native.FeatureBases(*unpacked(bases, inputs), by_input=False)],
             _native.FeatureKept(*unpacked(*ctx.saved_tensors[8:])),
             _native.FeatureGradients(
-                *unpacked(by_others.contiguous(), by_last.contiguous(), by_features, *by_layers, by_inputs)
+                *unpacked(by_others.contiguous(), by_last.contiguous(), by_features, *by_layers, by_inputs),
+                *unpacked(torch.empty(0, 0) if by_own is None else by_own),
             ),
         )
         if ctx.needs_input_grad[1]:
             ctx.gradient.terms.append((by_features, inputs))
-        return None, None, by_inputs if len(by_inputs) else None, by_features, None, *by_layers
+        return None, None, by_inputs if len(by_inputs) else None, by_features, by_own, *by_layers
