@@ -76,7 +76,7 @@ def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False,
     raise ValueError(_TOO_DEEP)
 
 
-def read_bytes(path: Path, most: int) -> bytes:
+def read_bytes(path: Path | str, most: int) -> bytes:
     """The bytes of an ordinary file, which may be reached through a link.
 
     Raises:
@@ -91,7 +91,7 @@ def read_bytes(path: Path, most: int) -> bytes:
         return file.read(size)
 
 
-def open_ordinary(path: Path) -> IO[bytes]:
+def open_ordinary(path: Path | str) -> IO[bytes]:
     """Open an ordinary file for reading. The path may be a link, since it is the user who names it.
 
     Raises:
@@ -146,7 +146,7 @@ def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> zipfile.Zi
         raise ValueError(f"cannot be unpacked ({str(error)[:_MAX_SHOWN]})") from None
 
 
-def open_handle(path: Path, flags: int, *, follow_link: bool) -> int:
+def open_handle(path: Path | str, flags: int, *, follow_link: bool) -> int:
     """The descriptor of an ordinary file. Opening never waits, not even for a process that writes into a pipe.
 
     Args:
@@ -164,7 +164,7 @@ def open_handle(path: Path, flags: int, *, follow_link: bool) -> int:
         if error.errno in _NOT_ORDINARY or (error.errno == errno.ELOOP and not follow_link):
             raise NotOrdinaryError("it is not an ordinary file") from None
         raise
-    linked = not follow_link and not NO_LINK and path.is_symlink()
+    linked = not follow_link and not NO_LINK and Path(path).is_symlink()
     if linked or not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
         raise NotOrdinaryError("it is not an ordinary file")

@@ -134,7 +134,7 @@ class Batch:
             if entry.name.endswith(".json") and not entry.name.startswith("."):
                 name = entry.name.removesuffix(".json")
                 try:
-                    content = json.loads(read_bytes(Path(entry.path), _MAX_STATE_BYTES))
+                    content = json.loads(read_bytes(entry.path, _MAX_STATE_BYTES))  # a Path takes as long to make
                     content.pop("checksum", None)
                     found[name] = _state_from(content)
                 except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
@@ -183,8 +183,9 @@ def with_fingerprint(row: Row, inputs: Sequence[Path]) -> Row:
 
 
 def _state_from(content: dict[str, Any]) -> State:
-    kept = {name: value for name, value in content.items() if name not in ("format", "version")}
-    state = State(**{**kept, "runs": tuple(kept["runs"])})
+    for name in ("format", "version"):
+        content.pop(name, None)
+    state = State(**{**content, "runs": tuple(content["runs"])})
     if not (state.name + state.error + state.host).isprintable():
         raise ValueError("name, error or host")
     if not all(isinstance(each, int | float) for each in (state.tries, state.began, state.seconds, state.peak_mb)):
