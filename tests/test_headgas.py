@@ -86,7 +86,7 @@ def test_color_and_opacity_are_the_networks_of_features_and_place() -> None:
 
 
 def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None:
-    """The preset has the formulas' gradients: dense ones of all bases, and the encoding's of the centres."""
+    """The preset has the formulas' moments of all bases, and the encoding's gradients of the centres."""
     paper: Any = PRESETS["paper"].config("headgas")
     assert (paper.encoding_gradient, paper.factored_bases, paper.network_epsilon) == (True, False, 1e-8)
     face, by_encoding, by_bases = toy_face(5)[2], {}, {}
@@ -100,7 +100,8 @@ def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None
         (group,) = [group for group in avatar.parameter_groups() if group.name == "bases"]
         before = avatar.store["bases"].detach().clone()
         if not factored_bases:
-            by_bases[encoding_gradient] = avatar.store["bases"].grad
+            ((rows, columns),) = group.factored["bases"].terms
+            by_bases[encoding_gradient] = rows[:, None] * columns[:, None]
         Adam().step([group], Progress(0, 100))
         moved = (avatar.store["bases"].detach() - before).abs()
         assert moved.max() > 0
@@ -112,6 +113,7 @@ def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None
     assert moving is not None
     assert moving.abs().min() > 0
     torch.testing.assert_close(by_encoding[True, False], moving)
+    assert by_bases[True].abs().max() > 0
     torch.testing.assert_close(by_bases[True], by_bases[False])
 
 
