@@ -22,8 +22,8 @@ constexpr float kAdamBeta1 = 0.9f, kAdamBeta2 = 0.999f, kAdamEpsilon = 1e-15f;
 
 void adam_update(const AdamTask* tasks, int count);
 
-// The same for values [n, k, f] whose gradient is a sum of outer products, so that it is never made. Bits are those of
-// `adam_update` with that gradient.
+// The same for values [n, k, f] whose gradient is a sum of outer products, so that it is never made. With one product,
+// bits are those of `adam_update` with that gradient, but for numbers below 1.2e-38, which become 0.
 struct FactoredAdamTask {
   float* values;
   const FactoredTerm* terms;

@@ -187,7 +187,8 @@ def factored_update_reference(update: FactoredUpdate) -> None:
 def factored_adam_update(update: FactoredAdamUpdate) -> None:
     """Apply an update in place: natively, without making the gradient, if tensors are float32, contiguous, on a CPU.
 
-    With one term, it has the bits of `update_all` with the whole gradient. That would be the largest tensor of a step.
+    With one term, it has the bits of `update_all` with the whole gradient, which would be the largest tensor of a step.
+    Only numbers below 1.2e-38 differ: they become 0, because running means that fade would be slow to compute.
     """
     values, terms, moments, rate = update
     terms = [(rows, columns.detach()) for rows, columns in terms]
