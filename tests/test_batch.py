@@ -97,7 +97,7 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
         ("video,steps\nann.mp4,-3", "row 1: "),
         ("video,steps\nann.mp4,many", "row 1: --steps: give a whole number instead of 'many'; see mien create"),
         ("video,preset\nann.mp4,best", "row 1: --preset: give one of 'draft', "),
-        ("video,capture.siz\nann.mp4,9", "did you mean --capture.size"),
+        ("video,capture.sizes\nann.mp4,9", "did you mean --capture.size"),
         ("video,age,age\nann.mp4,3,4", "columns 'age' and 'age' are the same"),
         ("video,hold_out,hold-out\nann.mp4,3,4", "columns 'hold_out' and 'hold-out' are the same"),
         ("video,out\nann.mp4,elsewhere", "column 'out' cannot be set"),
