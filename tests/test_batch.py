@@ -103,7 +103,16 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
         ("video,out\nann.mp4,elsewhere", "column 'out' cannot be set"),
         ("video,name\nann.mp4,x\nbob.mp4,x", "two rows have the name 'x'"),
         ("video,name\nann.mp4,../x", "cannot be the name of a folder"),
-        ("name\nann", "give it a video or a dataset"),
+        ("name\nann", "row 1: has no video and no dataset; its columns are 'name'"),
+        ("movie;steps\nann.mp4;3", "has no video and no dataset"),
+        ("video,methodx\nann.mp4,headgas", "column 'methodx' is no option; did you mean 'method'"),
+        ("video,namex\nann.mp4,x", "did you mean 'name'"),
+        ("video,capture-size\nann.mp4,256", "did you mean 'capture.size'"),
+        ("video,psnr\nann.mp4,256", "column 'psnr' is one of the results"),
+        ("video,\nann.mp4,256", "a column has no name"),
+        ("video,methods\nann.mp4,headgas;headgas", "method 'headgas' is there twice"),
+        ("video\nann.mp4;ann.mp4", "two videos have the name 'ann'"),
+        ("video,calibration\nann.mp4,rig.json", "rig.json: no such file"),
         ("video\nann.mp4,3", "more cells than the heading"),
         ("video,memory_gb\nann.mp4,lots", "gigabytes above 0"),
         ("", "has no rows"),
@@ -119,6 +128,44 @@ def test_mistakes_in_a_table_are_named_before_any_work(table: Path, text: str, w
         read_table(table)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ('[{"video": "ann.mp4", "video": "bob.mp4"}]', "'video' twice"),
+        ('[{"video": "ann.mp4", "capture": {"size": 9}}]', "column 'capture' holds an object"),
+    ],
+)
+def test_mistakes_in_json_are_named_as_well(table: Path, content: str, words: str):
+    path = table.with_name("people.json")
+    path.write_text(content)
+    with pytest.raises(UserError, match=words):
+        read_table(path)
+
+
+def test_a_table_that_is_not_utf_8_is_told_so(table: Path):
+    table.write_bytes("name,video\nJosé,ann.mp4\n".encode("latin-1"))
+    with pytest.raises(UserError, match="save it as UTF-8"):
+        read_table(table)
+
+
+def test_a_process_that_never_claims_its_row_fails_anew_each_time(tmp_path: Path):
+    """The error is that of the last try, and tries are counted."""
+    batch, row = Batch(tmp_path), stub_row("ann")
+    batch.write_plan([row])
+    told = []
+    for program in (("false",), ("sh", "-c", "echo 'mien: no room'; exit 7"), ("true",)):
+        Driver(batch, "local", EngineOptions(tmp_path, 1, 1), 0, "", program).run([row])
+        state = batch.read_state("ann")
+        assert state is not None
+        told.append((state.status, state.tries, state.error))
+        assert state.seconds < 60
+    silent = "its process printed nothing and ended with exit code"
+    assert [one[:2] for one in told] == [("failed", 1), ("failed", 2), ("failed", 3)]
+    assert told[0][2].startswith(f"{silent} 1")
+    assert told[1][2] == "no room"
+    assert told[2][2].startswith(f"{silent} 0")
 
 
 def test_a_row_that_ends_well_is_claimed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

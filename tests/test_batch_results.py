@@ -81,15 +81,21 @@ def test_status_and_table_on_the_command_line(tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["status", "DIR", "--rows", "light"], "--rows is for `mien batch table DIR`"),
-        (["table", "DIR", "--watch"], "--watch is for `mien batch status DIR`"),
-        (["TABLE", "--out", "DIR", "--columns", "ssim"], "--columns is for `mien batch table DIR`"),
+        (["status", "DIR", "--rows", "light"], "--rows: changes nothing for `mien batch status`"),
+        (["table", "DIR", "--watch"], "--watch: changes nothing for `mien batch table`"),
+        (["TABLE", "--out", "DIR", "--columns", "ssim"], "--columns: changes nothing for a batch that runs on local"),
+        (["TABLE", "--out", "DIR", "--gpus", "1"], "--gpus: changes nothing for a batch that runs on local"),
+        (["status", "DIR", "--shard", "1/2"], "--shard: changes nothing for `mien batch status`"),
+        (["TABLE", "--out", "DIR", "--program", "echo 'x"], "--program echo 'x: No closing quotation"),
+        (["TABLE", "--out", "DIR", "--store", "nosuch://x"], "nosuch://x: cannot be reached"),
+        (["status", "TABLE"], "is not the folder of a batch"),
         (["table", "EMPTY"], "no row is done yet"),
         (["status", "OTHER"], "version 99, expected 'mien.batch' version 1"),
     ],
 )
 def test_what_makes_no_sense_is_told(words: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     scored(Batch(tmp_path / "DIR"))
+    (tmp_path / "TABLE").write_text("video\n")
     Batch(tmp_path / "EMPTY").write_plan([Row("ann", (("create",),), fingerprint="a")])
     Batch(tmp_path / "OTHER").write_plan([])
     plan = tmp_path / "OTHER" / "plan.json"
@@ -111,6 +117,36 @@ def test_a_damaged_state_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[
     batch.state_file("ann").write_text("{")
     assert main(["batch", "status", str(tmp_path)]) == 0
     assert "ann: failed, try 1: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"version": 99}, {"status": []}, {"status": "bogus"}, {"runs": [1]}, {"stages": "x"}, {"stages": {"a": "x"}},
+        {"began": float("nan")}, {"tries": None},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_any_damage_of_a_state_is_shown(changed: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    batch = Batch(tmp_path)
+    scored(batch)
+    file = batch.state_file("ann")
+    file.write_text(json.dumps(json.loads(file.read_text()) | changed))
+    assert main(["batch", "status", str(tmp_path)]) == 0
+    assert "ann: failed, try 1: " in capsys.readouterr().out
+    assert main(["batch", "table", str(tmp_path), "--columns", "psnr"]) == 0
+    assert "| a | 1 | 31.00 |" in capsys.readouterr().out
+
+
+def test_rows_of_an_earlier_table_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    scored(Batch(tmp_path / "out"))
+    (tmp_path / "d.mp4").write_bytes(b"a video")
+    (tmp_path / "table.csv").write_text("name,video\nann,d.mp4\n")
+    line = ["batch", str(tmp_path / "table.csv"), "--out", str(tmp_path / "out"), "--program", "false", "--retry", "0"]
+    assert main(line) == 2
+    told = capsys.readouterr().err
+    assert "2 rows of an earlier table will not be listed any more (bob, eve)" in told
+    assert "1 of 1 row failed" in told
 
 
 @pytest.mark.parametrize("count", [1, 3, 40])

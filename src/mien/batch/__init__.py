@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mien.batch.engines import EngineOptions
     from mien.batch.plan import WORKSPACE, Batch, Row, State, with_fingerprint
     from mien.batch.progress import batch_progress, progress_text
-    from mien.batch.results import latex_table, markdown_table, means_by, result_rows, write_results
+    from mien.batch.results import RESULT_COLUMNS, latex_table, markdown_table, means_by, result_rows, write_results
     from mien.batch.row import repeat_command, row_process, run_row
     from mien.batch.steps import do_with
     from mien.batch.store import is_url
@@ -23,7 +23,7 @@ else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
-    "WORKSPACE", "Batch", "Driver", "EngineOptions", "Row", "State", "batch_progress", "do_with", "is_url",
-    "latex_table", "markdown_table", "means_by", "progress_text", "repeat_command", "result_rows", "row_process",
-    "run_row", "shard_of", "with_fingerprint", "write_results", "write_wall",
+    "RESULT_COLUMNS", "WORKSPACE", "Batch", "Driver", "EngineOptions", "Row", "State", "batch_progress", "do_with",
+    "is_url", "latex_table", "markdown_table", "means_by", "progress_text", "repeat_command", "result_rows",
+    "row_process", "run_row", "shard_of", "with_fingerprint", "write_results", "write_wall",
 ]  # fmt: skip

@@ -6,6 +6,7 @@ file writes it. DIR/logs/NAME.log has what the row's commands printed, and DIR/r
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -22,6 +23,7 @@ from mien.locks import BeingWrittenError, hold
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
 WORKSPACE = "{workspace}"
 """Stands for the row's workspace in the words of its steps."""
+_STATUSES = ("running", "done", "failed")
 _MAX_PLAN_BYTES, _MAX_STATE_BYTES = 256 << 20, 1 << 20
 _COMPARED = 50
 """Number of characters by which leftovers are told, before `mien.files` looks at them exactly."""
@@ -97,7 +99,7 @@ class Batch:
         path = self.root / "plan.json"
         try:
             content = parse_json(read_bytes(path, _MAX_PLAN_BYTES).decode())
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             raise UserError(
                 f"{self.root}: is not the folder of a batch (no plan.json); give the one that `mien batch TABLE --out` "
                 "names"
@@ -110,7 +112,10 @@ class Batch:
                     f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {PLAN[0]!r} version "
                     f"{PLAN[1]}; {_AGAIN}"
                 )
-            return [row_from(each) for each in content["rows"]]
+            rows = [row_from(each) for each in content["rows"]]
+            if len({row.name for row in rows}) < len(rows):
+                raise ValueError("two rows have one name")
+            return rows
 
     def write_plan(self, rows: Sequence[Row]) -> None:
         """Write the rows."""
@@ -135,6 +140,8 @@ class Batch:
                 name = entry.name.removesuffix(".json")
                 try:
                     content = json.loads(read_bytes(entry.path, _MAX_STATE_BYTES))  # a Path takes as long to make
+                    if not isinstance(content, dict) or (content["format"], content["version"]) != STATE:
+                        raise ValueError("format or version")
                     content.pop("checksum", None)
                     found[name] = _state_from(content)
                 except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
@@ -186,8 +193,11 @@ def _state_from(content: dict[str, Any]) -> State:
     for name in ("format", "version"):
         content.pop(name, None)
     state = State(**{**content, "runs": tuple(content["runs"])})
-    if not (state.name + state.error + state.host).isprintable():
-        raise ValueError("name, error or host")
-    if not all(isinstance(each, int | float) for each in (state.tries, state.began, state.seconds, state.peak_mb)):
-        raise ValueError("tries or times")
+    if state.status not in _STATUSES or not (state.name + state.error + state.host).isprintable():
+        raise ValueError("status, name, error or host")
+    if not all(isinstance(run, dict) for run in state.runs):
+        raise ValueError("runs")
+    for number in (state.tries, state.began, state.seconds, state.peak_mb, *state.stages.values()):
+        if not (isinstance(number, int | float) and math.isfinite(number)):
+            raise ValueError("tries, times or memory")
     return state

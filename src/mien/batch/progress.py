@@ -7,6 +7,7 @@ from typing import Any
 
 from mien.batch.plan import Batch, Row, State
 from mien.batch.row import repeat_command, tail
+from mien.batch.store import is_url
 from mien.locks import holder_of
 from mien.terminal import counted, printable
 
@@ -41,7 +42,9 @@ def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:
     found = {"name": row.name, "status": state.status, "tries": state.tries, "host": state.host}
     found |= {"began": state.began, "seconds": state.seconds}
     if state.status == "failed":
-        found |= {"error": state.error, "repeat": repeat_command(batch, row)}
+        found["error"] = state.error
+        if not any(is_url(word) for step in row.steps for word in step):  # which only a row fetches
+            found["repeat"] = repeat_command(batch, row)
     if state.status == "running":
         if holder_of(batch.state_file(row.name)) is None:
             found["status"] = "interrupted"

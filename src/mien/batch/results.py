@@ -19,6 +19,12 @@ DIGITS = {name: digits for name, _, digits, _ in COLUMNS}
 ALIASES = {"lpips": "perceptual", "head_lpips": "head_perceptual"}
 """Short names of columns. The figure is ST-LPIPS."""
 
+RESULT_COLUMNS = frozenset(
+    {"name", "status", "run", "method", "tries", "host", "mien", "row_seconds", "peak_mb", "error"}
+    | {*HIGHER, *ALIASES} | {f"head_{name}" for name in HIGHER}
+)  # fmt: skip
+"""Columns of the results that no label may have."""
+
 
 def result_rows(batch: Batch) -> list[dict[str, Any]]:
     """One entry for each run of each row, with labels, figures, versions, machine and seconds of stages."""
@@ -107,8 +113,8 @@ def means_by(rows: Sequence[dict[str, Any]], by: str, columns: Sequence[str]) ->
     if not any(row.get("method") for row in rows):
         raise UserError("no row is done yet, so there is nothing to compare; see `mien batch status DIR`")
     known = dict.fromkeys(itertools.chain.from_iterable(rows))
-    for name in (by, *(ALIASES.get(column, column) for column in columns)):
-        if name not in known:
+    for name in (by, *columns):
+        if ALIASES.get(name, name) not in known:
             raise UserError(f"{name}: the results have no such column; there are: {', '.join(known)}")
     finished = [row for row in rows if row.get("method")]
     table = [[by, "n", *columns]]

@@ -102,7 +102,9 @@ def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int
     log = batch.log_file(row.name)
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = dict(os.environ) | ({"MIEN_THREADS": str(threads)} if threads else {})
+    started = time.time()
     with log.open("ab") as out:
+        printed = out.tell()
         process = subprocess.Popen(
             [*program, str(root)], stdin=subprocess.PIPE, stdout=out, stderr=out, env=environment, close_fds=True
         )
@@ -118,7 +120,7 @@ def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int
         with suppress(OSError):
             process.stdin.close()
         process.wait()
-    return None if stopped or code == EXIT_BUSY else _concluded(batch, row, code)
+    return None if stopped or code == EXIT_BUSY else _concluded(batch, row, code, started, printed)
 
 
 def stop_attempts() -> None:
@@ -130,18 +132,32 @@ def stop_attempts() -> None:
             process.stdin.close()
 
 
-def _concluded(batch: Batch, row: Row, code: int) -> State | None:
-    """The state after the row's process has ended. If it could not write one itself, this writes why."""
+def _concluded(batch: Batch, row: Row, code: int, started: float, printed: int) -> State | None:
+    """The state after the row's process has ended. If it could not write one itself, this writes why.
+
+    Args:
+        batch: The batch.
+        row: The row.
+        code: Exit code of its process.
+        started: When the process was started, in seconds since 1970. A failure from before is of an earlier try.
+        printed: Length of the log at that time.
+    """
+
+    def told(state: State | None) -> bool:
+        if state is None or state.fingerprint != row.fingerprint:
+            return False
+        return state.status == "done" or (state.status == "failed" and state.began >= started)
+
     found = batch.read_state(row.name)
-    if not code and found is not None and found.status != "running" and found.fingerprint == row.fingerprint:
+    if not code and told(found):
         return found  # the row's process wrote it; a lock would double the operations on a shared file system
     try:
         with hold(batch.state_file(row.name)):
             state = batch.read_state(row.name)
-            if state is None or state.status == "running" or (code and state.fingerprint != row.fingerprint):
-                state = state or State(row.name, "failed", row.fingerprint, began=time.time())
+            if not told(state):
+                state = _failed(state, row, started)
                 seconds = round(time.time() - state.began, 2)
-                state = replace(state, status="failed", seconds=seconds, error=_why(batch, row, code))
+                state = replace(state, seconds=seconds, error=_why(batch, row, code, printed))
                 with suppress(CannotWriteError):  # the disk is full; the engine tells of the state all the same
                     batch.write_state(state)
             return state
@@ -149,26 +165,41 @@ def _concluded(batch: Batch, row: Row, code: int) -> State | None:
         return None
 
 
-def _why(batch: Batch, row: Row, code: int) -> str:
+def _failed(before: State | None, row: Row, started: float) -> State:
+    """The state of a try that its process did not conclude. Perhaps the process had not even claimed the row."""
+    if before is None or before.fingerprint != row.fingerprint:
+        return State(row.name, "failed", row.fingerprint, began=started)
+    if before.began >= started:
+        return replace(before, status="failed")
+    return State(row.name, "failed", row.fingerprint, before.tries + 1, began=started)
+
+
+def _why(batch: Batch, row: Row, code: int, printed: int) -> str:
     if code < 0:
         name = signal.Signals(-code).name
         hint = f"; it may have needed more memory than the {row.memory_mb / 1000:.1f} GB that were counted"
         return f"its process was ended by {name}{hint if name == 'SIGKILL' else ''}; run the row again"
-    return last_error(batch.log_file(row.name)) or f"its process ended with exit code {code}; see its log"
+    silent = f"its process printed nothing and ended with exit code {code}; correct --program, or run the row again"
+    return last_error(batch.log_file(row.name), printed) or silent
 
 
-def last_error(log: Path) -> str:
-    """The last line in which mien reports an error, or the last line if there is none. Empty without a log."""
-    lines = [line for line in tail(log).splitlines() if line.strip()]
+def last_error(log: Path, since: int = 0) -> str:
+    """The last line in which mien reports an error, or the last line if there is none. Empty without a log.
+
+    Args:
+        log: The log.
+        since: Number of bytes at its begin that do not count.
+    """
+    lines = [line for line in tail(log, since).splitlines() if line.strip()]
     errors = [line.removeprefix("mien: ") for line in lines if line.startswith("mien: ")]
     return printable((errors or lines or [""])[-1])[:500]
 
 
-def tail(log: Path) -> str:
-    """The end of a log."""
+def tail(log: Path, since: int = 0) -> str:
+    """The end of a log, without its first `since` bytes."""
     try:
         with log.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+            file.seek(max(since, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
             return file.read().decode("utf-8", "replace")
     except OSError:
         return ""

@@ -9,6 +9,7 @@ from typing import Any
 
 from mien.batch.plan import Batch, Row, State
 from mien.batch.row import PROGRAM, attempt
+from mien.errors import UserError
 
 _PART = ".mien-part"
 """Ending of a file that is being copied to a store."""
@@ -22,17 +23,30 @@ def is_url(word: str) -> bool:
     return bool(mark) and scheme.isascii() and scheme.isalnum()
 
 
+def store_of(url: str) -> tuple[Any, str]:
+    """The file system of a URL, and the path in it.
+
+    Raises:
+        UserError: nothing that is installed can read such a URL.
+    """
+    import fsspec  # pyright: ignore[reportMissingImports]
+
+    try:
+        return fsspec.url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        why = " ".join(str(error).split())[:200]
+        raise UserError(f"{url}: cannot be reached ({why}); `make batch-engines` installs s3fs for s3://") from None
+
+
 def fetched(word: str, folder: Path) -> str:
     """The word, or the path of a copy in `folder` if it is a URL. A copy that is there is not fetched again."""
     if not is_url(word):
         return word
-    import fsspec  # pyright: ignore[reportMissingImports]
-
     target = folder / hashlib.sha256(word.encode()).hexdigest()[:16] / word.rstrip("/").rpartition("/")[2]
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         aside = target.with_name(f".{target.name}")
-        fs, path = fsspec.url_to_fs(word)
+        fs, path = store_of(word)
         fs.get(path, str(aside), recursive=True)
         aside.rename(target)
     return str(target)
@@ -56,9 +70,7 @@ def attempt_in_store(store: str, row: Row, program: Sequence[str] = PROGRAM, thr
         program: As for `attempt`.
         threads: As for `attempt`.
     """
-    import fsspec  # pyright: ignore[reportMissingImports]
-
-    fs, base = fsspec.url_to_fs(store)
+    fs, base = store_of(store)
     place = f"{base.rstrip('/')}/{row.name}"
     with tempfile.TemporaryDirectory(prefix="mien-batch-") as scratch:
         batch = Batch(Path(scratch))

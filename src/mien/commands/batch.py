@@ -15,8 +15,14 @@ from mien.errors import UserError
 from mien.terminal import show
 
 _WATCH_SECONDS = 5.0
-_OF_TASKS = {"status": ("watch",), "table": ("rows", "columns")}
-"""Options of one task only."""
+_TASKS = {
+    "status": ("what", "watch", "as_json"),
+    "table": ("what", "rows", "columns", "as_json"),
+    "local": ("out", "shard", "retry", "jobs", "threads", "store", "program"),
+    "slurm": ("out", "on", "shard", "retry", "jobs", "threads", "gpus", "partition", "time", "program"),
+    "ray": ("out", "on", "shard", "retry", "jobs", "threads", "gpus", "ray_address", "store", "program"),
+}
+"""Options that a task has, or a batch that runs on an engine. Elsewhere they would change nothing."""
 _ENGINES = {"slurm": ("submitit",), "ray": ("ray",)}
 """Packages of the engines. One that is missing is told before the rows are read."""
 NEEDS_TORCH = False
@@ -37,11 +43,11 @@ class Command:
     what: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="TABLE | status DIR | table DIR")]
     """A csv or json of captures, or a folder of videos. Or a task, and the folder of a batch."""
     out: Path | None = None
-    """Folder of the batch, new or existing."""
+    """Folder of the batch, new or existing. Needed to run rows."""
     on: Literal["local", "slurm", "ray"] = "local"
     """What runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
     shard: str = ""
-    """Run only rows I, I+N, ...: I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
+    """Run only rows I, I+N, ..., given as I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
     retry: int = 2
     """How often a failed row is tried again."""
     jobs: int = 0
@@ -49,7 +55,7 @@ class Command:
     threads: int = 0
     """Threads of each row. 0 shares the cores out, or asks a cluster for two."""
     gpus: float = 0.0
-    """GPUs of each row, on a cluster."""
+    """GPUs of each row, on Slurm and Ray."""
     partition: str = ""
     """Partition of Slurm."""
     time: int = 0
@@ -59,15 +65,16 @@ class Command:
     store: str = ""
     """URL of a folder for the workspaces, such as s3://bucket/people, if nodes share no folder. Copied in and out."""
     program: str = ""
-    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.batch_row"."""
+    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.batch_row". The folder of the
+    batch follows it."""
     watch: bool = False
-    """Show the status again every five seconds, until all rows have ended."""
+    """For status: show it again every five seconds, until all rows have ended."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the status, or the table, as json on standard output, for programs."""
+    """For status and table: print json on standard output, for programs."""
     rows: str = "method"
-    """Column of the results whose values are the lines of the table."""
+    """For table: column of the results whose values are its lines."""
     columns: str = "psnr,ssim,lpips"
-    """Columns of the results whose means the table shows, separated by commas."""
+    """For table: columns of the results whose means it shows, separated by commas."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -77,14 +84,13 @@ class Command:
         if task is not None:
             if len(self.what) != 2:
                 raise UserError(f"batch {task}: give the folder of one batch, as in `mien batch {task} people`")
-            self._check_given("status" if task == "table" else "table", f"`mien batch {task}`")
+            self._check_given(task)
             return  # the task reads the plan at once
         if len(self.what) != 1:
             raise UserError("give one table of captures, or one folder of videos; see mien batch --help")
         if self.out is None:
             raise UserError("--out is missing; give a folder for the batch")
-        self._check_given("status", "a batch that runs")
-        self._check_given("table", "a batch that runs")
+        self._check_given(self.on)
         for package in _ENGINES.get(self.on, ()):
             if importlib.util.find_spec(package) is None:
                 raise ModuleNotFoundError(f"No module named {package!r}", name=package)
@@ -96,10 +102,13 @@ class Command:
             raise UserError(f"--gpus {self.gpus:g}: give a number from 0 to 64")
         if self.shard:
             shard_of([], self.shard)
-        if self.store and self.on == "slurm":
-            raise UserError("--store: is for local and ray; nodes of Slurm share a folder, so give that with --out")
         if self.store and "://" not in self.store:
             raise UserError(f"--store {self.store}: give a URL, such as s3://bucket/people or file:///mnt/people")
+        if self.store:
+            from mien.batch.store import store_of
+
+            store_of(self.store)
+        self._program()
         if not Path(self.what[0]).exists():
             raise UserError(f"{self.what[0]}: no such file or folder; give a table of captures, or a folder of videos")
 
@@ -113,29 +122,37 @@ class Command:
         else:
             self._run_rows()
 
-    def _check_given(self, task: str, where: str) -> None:
-        """Check that no option of a task is given elsewhere, where it would change nothing."""
-        defaults = {each.name: each.default for each in fields(self)}
-        for name in _OF_TASKS[task]:
-            if getattr(self, name) != defaults[name]:
-                option = name.removeprefix("as_")
-                raise UserError(f"--{option} is for `mien batch {task} DIR`, and not for {where}; leave it out")
+    def _check_given(self, task: str) -> None:
+        """Check that no option is given which the task does not have."""
+        for each in fields(self):
+            value, name = getattr(self, each.name), each.name.removeprefix("as_").replace("_", "-")
+            if each.name != "what" and each.name not in _TASKS[task] and value != each.default:
+                where = f"`mien batch {task}`" if task in ("status", "table") else f"a batch that runs on {task}"
+                raise UserError(f"--{name}: changes nothing for {where}; leave it out")
 
     def _task(self) -> str | None:
         return self.what[0] if self.what and self.what[0] in ("status", "table") else None
+
+    def _program(self) -> tuple[str, ...]:
+        try:
+            return tuple(shlex.split(self.program))
+        except ValueError as error:
+            raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
 
     def _run_rows(self) -> None:
         from mien.batch import Driver, batch_progress, progress_text, write_results, write_wall
         from mien.commands.stages.batch_table import read_table
         from mien.progress import say
+        from mien.terminal import counted
 
         assert self.out is not None
         batch, rows = Batch(self.out), read_table(Path(self.what[0]))
         labels = dict.fromkeys(label for row in rows for label in row.labels)
         if labels:
             say(f"labels, which come back in the results: {', '.join(labels)}")
+        self._tell_dropped(batch, {row.name for row in rows})
         batch.write_plan(rows)
-        program = tuple(shlex.split(self.program))
+        program = self._program()
         options = EngineOptions(
             self.out, self.jobs, self.threads, self.gpus, self.time, self.partition, self.ray_address
         )
@@ -149,8 +166,21 @@ class Command:
         failed = progress["counts"].get("failed", 0)
         if failed:
             raise UserError(
-                f"{failed} of {len(rows)} rows failed; see `mien batch status {shlex.quote(str(self.out))}`"
+                f"{failed} of {counted(len(rows), 'row')} failed; see `mien batch status {shlex.quote(str(self.out))}`"
             )
+
+    def _tell_dropped(self, batch: Batch, names: set[str]) -> None:
+        """Say which rows of an earlier table are no longer in the plan."""
+        from mien.progress import say
+        from mien.terminal import counted
+
+        try:
+            dropped = [row.name for row in batch.read_plan() if row.name not in names]
+        except UserError:  # there is none, or it is damaged and will be replaced
+            return
+        if dropped:
+            shown = ", ".join(dropped[:5]) + (", ..." if len(dropped) > 5 else "")
+            say(f"{counted(len(dropped), 'row')} of an earlier table will not be listed any more ({shown}); files stay")
 
     def _status(self, batch: Batch) -> None:
         from mien.batch import batch_progress, progress_text

@@ -167,7 +167,8 @@ class Command:
             if given and option in kind.refusals:
                 raise UserError(f"{self.out}: {kind.refusals[option]}")
         if self.every < 1 or (self.every > 1 and self.series is None):
-            raise UserError(f"--every {self.every}: give 1 or more, together with --series")
+            remedy = "give 1 or more" if self.every < 1 else "is for a series; give one with --series, or leave it out"
+            raise UserError(f"--every {self.every}: {remedy}")
         if self.neutral is not None and self.series is None:
             raise UserError(f"--neutral {self.neutral}: is for motions; give it together with --series")
         check_neutral(self.neutral)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.avatar import DEFAULT_METHOD
-from mien.batch import WORKSPACE, Row, is_url, with_fingerprint
+from mien.batch import RESULT_COLUMNS, WORKSPACE, Row, is_url, with_fingerprint
 from mien.bounded import parse_json, read_bytes
 from mien.capture import CaptureSettings
 from mien.commands import create
@@ -19,6 +19,8 @@ from mien.commands.complaints import complaint_of
 from mien.commands.options import TrainOptions, check_method, with_settings
 from mien.errors import UserError
 from mien.inside import is_plain_name
+from mien.tracking import ScoringSettings, TrackingSettings
+from mien.training import AlignmentSettings, TrainSettings
 
 _MAX_TABLE_BYTES = 64 << 20
 _VIDEOS = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"})
@@ -36,7 +38,17 @@ _PATHS = frozenset(
 """Options that name a file. It may be given beside the table."""
 _OF_IMPORT, _OF_SCORES = ("face-model", "retrack"), ("protocol",)
 """Options of `mien import` and of `mien evaluate` that the row of a dataset may have."""
-_GROUPS = ("capture", "tracking", "scoring", "training", "method")
+_GROUPS = ("capture", "tracking", "alignment", "scoring", "training", "method")
+_SETTINGS = {
+    group: {each.name for each in fields(settings)}
+    for group, settings in (
+        ("capture", CaptureSettings),
+        ("tracking", TrackingSettings),
+        ("alignment", AlignmentSettings),
+        ("scoring", ScoringSettings),
+        ("training", TrainSettings),
+    )
+}
 _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 """Memory of a row in megabytes: at least, and for each frame. 10 minutes of video take less than 3 GiB."""
 
@@ -68,13 +80,14 @@ def _entries(path: Path) -> Iterator[dict[str, Any]]:
         return
     try:
         text = read_bytes(path, _MAX_TABLE_BYTES).decode("utf-8-sig")
-        content = parse_json(text) if path.suffix.lower() == ".json" else _lines(text, path)
+        content = parse_json(text, unique_names=True) if path.suffix.lower() == ".json" else _lines(text, path)
     except FileNotFoundError:
         raise UserError(
             f"{path}: no such file or folder; give a csv or json of captures, or a folder of videos"
         ) from None
     except (OSError, ValueError, csv.Error) as error:
-        raise UserError(f"{path}: cannot be read as a table ({error}); give a csv or a json list of objects") from None
+        remedy = "save it as UTF-8" if isinstance(error, UnicodeDecodeError) else "correct it"
+        raise UserError(f"{path}: cannot be read as a csv or a json list of objects ({error}); {remedy}") from None
     if isinstance(content, dict):
         content = content.get("rows")
     if not isinstance(content, list) or not all(isinstance(each, dict) for each in content):
@@ -93,20 +106,25 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Ro
     if None in entry:
         raise UserError(f"{where}: has more cells than the heading has columns; put texts with commas in quotes")
     _check_names(map(str, entry), where)
-    cells = {_column(key): _words(value) for key, value in entry.items()}
+    cells = {_column(key): _words(value, key, where) for key, value in entry.items()}
     original = {_column(key): str(key).strip() for key in entry}
     cells = {key: words for key, words in cells.items() if words}
     videos = cells.get("video", []) + cells.get("videos", [])
     dataset = cells.get("dataset", [])
-    if bool(videos) == bool(dataset):
+    if videos and dataset:
         raise UserError(f"{where}: give it a video or a dataset, and not both")
+    if not (videos or dataset):
+        there = ", ".join(map(repr, original.values()))
+        raise UserError(f"{where}: has no video and no dataset; its columns are {there} (commas separate columns)")
     inputs = [_input(folder, word, where) for word in videos or dataset]
+    _check_twice([Path(word).stem for word in inputs], where, "two videos have the name {!r}; rename one of the files")
     name = "".join(cells.get("name", [])) or Path(inputs[0]).stem
     if not is_plain_name(name) or name.startswith((".", "-")):
         raise UserError(f"{where}: {name!r} cannot be the name of a folder; give another name")
     methods = cells.get("method", []) + cells.get("methods", []) or [DEFAULT_METHOD]
     for method in methods:
         check_method(where, method)
+    _check_twice(methods, where, "method {!r} is there twice; name it once")
     known = [*_options(), *({*_OF_IMPORT, *_OF_SCORES} - {"face-model"})]
     options, labels = {}, {}
     for key, words in cells.items():
@@ -114,14 +132,11 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Ro
             continue
         if key in known or key.partition(".")[0] in _GROUPS and "." in key:
             options[key] = [
-                _input(folder, word, where) if key in _PATHS and _is_file(folder, word) else word for word in words
+                _input(folder, word, where) if key in _PATHS and _must_exist(folder, key, word) else word
+                for word in words
             ]
             continue
-        near = difflib.get_close_matches(key, known, 1, 0.8)
-        if near:
-            raise UserError(
-                f"{where}: column {original[key]!r} is no option; did you mean {near[0]!r}? Labels need other names"
-            )
+        _check_label(key, original[key], known, where)
         labels[original[key]] = ";".join(words)
     _check_columns(options, original, bool(dataset), where)
     steps = _steps(inputs, bool(dataset), methods, options)
@@ -144,18 +159,42 @@ def _check_names(names: Iterable[str], where: str) -> None:
         if column in seen:
             raise UserError(f"{where}: columns {seen[column]!r} and {name!r} are the same; keep one of them")
         seen[column] = name
+        if not column:
+            raise UserError(f"{where}: a column has no name; give it one, or remove it")
         if column in _OF_BATCH:
             raise UserError(f"{where}: column {name!r} cannot be set; {_OF_BATCH[column]}")
 
 
-def _words(value: Any) -> list[str]:
+def _words(value: Any, name: object, where: str) -> list[str]:
     """The words of a cell: separated by semicolons in csv, or a list in json."""
+    if isinstance(value, dict):
+        raise UserError(f"{where}: column {name!r} holds an object; write a setting as a column, such as capture.size")
     each = value if isinstance(value, list) else str("" if value is None else value).split(";")
     return [text for one in each if (text := str(one).strip())]
 
 
-def _is_file(folder: Path, word: str) -> bool:
-    return (folder / word).exists()
+def _must_exist(folder: Path, key: str, word: str) -> bool:
+    """Whether a path has to exist. A face model may be a name instead."""
+    return key != "face-model" or (folder / word).exists()
+
+
+def _check_twice(words: Sequence[str], where: str, complaint: str) -> None:
+    twice = next((word for word in words if words.count(word) > 1), None)
+    if twice is not None:
+        raise UserError(f"{where}: {complaint.format(twice)}")
+
+
+def _check_label(column: str, name: str, known: Sequence[str], where: str) -> None:
+    """Check that a label is none: a misspelt option, a setting with a dash for its dot, or a column of the results."""
+    group, _, setting = column.partition("-")
+    if setting.replace("-", "_") in _SETTINGS.get(group, ()):
+        near = [f"{group}.{setting}"]
+    else:
+        near = difflib.get_close_matches(column, known, 1, 0.8) or difflib.get_close_matches(column, _OWN, 1, 0.75)
+    if near:
+        raise UserError(f"{where}: column {name!r} is no option; did you mean {near[0]!r}? Labels need other names")
+    if name in RESULT_COLUMNS:
+        raise UserError(f"{where}: column {name!r} is one of the results; give the label another name")
 
 
 def _input(folder: Path, word: str, where: str) -> str:
