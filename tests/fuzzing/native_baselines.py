@@ -330,7 +330,7 @@ def photometric_loss(native: Any, rng: Rng) -> Arguments:
 def factored_adam_update(native: Any, rng: Rng) -> Arguments:
     values, rows, columns, *_ = factored_update(native, rng)
     first, second = normal(rng, *values.shape), np.abs(normal(rng, *values.shape))
-    return [values, rows, columns, first, second, np.float32(rng.integers(0, 9)).reshape(()), 0.01]
+    return [values, rows, columns, first, second, np.array(rng.integers(0, 9), np.float32), 0.01]
 
 
 def adam_update(native: Any, rng: Rng) -> Arguments:
