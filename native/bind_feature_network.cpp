@@ -7,15 +7,13 @@
 #include <vector>
 
 #include "arrays.h"
+#include "factored_terms.h"
 #include "feature_network.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
-
-constexpr int64_t kMostWidth = 1 << 20;  // so that products of widths fit
-constexpr size_t kMostTerms = 1 << 10;
 
 struct NetworkArrays {
   static constexpr char kName[] = "FeatureNetwork";
@@ -154,19 +152,13 @@ void feature_network_backward(const Group<NetworkArrays>& group, const Bases& ba
 void factored_update(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,
                      const std::vector<In<-1>>& columns, const Out<-1, -1>& second, const Out<-1>& weights,
                      float rate) {
-  const size_t count = values.shape(0), inputs = values.shape(1), width = values.shape(2);
+  const size_t count = values.shape(0), width = values.shape(2);
   require(has_shape(second, count, width) && has_shape(weights, count), "moments must fit the values");
-  require(rows.size() == columns.size() && rows.size() <= kMostTerms, "every term needs rows and columns");
-  std::vector<mien::FactoredTerm> terms;
-  for (size_t i = 0; i < rows.size(); ++i) {
-    require(has_shape(rows[i], count, width) && has_shape(columns[i], inputs), "factors must fit the values");
-    terms.push_back({rows[i].data(), columns[i].data()});
-  }
-  const int columns_count = checked_length(inputs, kMostWidth, "inputs");
-  const int row_width = checked_length(width, kMostWidth, "numbers in a row");
+  const FactoredTerms gradient(values, rows, columns);
   const nb::gil_scoped_release release;
-  mien::factored_update({values.data(), static_cast<int64_t>(count), columns_count, row_width, terms.data(),
-                         static_cast<int>(terms.size()), second.data(), weights.data(), rate});
+  mien::factored_update({values.data(), static_cast<int64_t>(count), gradient.columns_count, gradient.width,
+                         gradient.terms.data(), static_cast<int>(gradient.terms.size()), second.data(), weights.data(),
+                         rate});
 }
 
 }  // namespace

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "arrays.h"
+#include "factored_terms.h"
 #include "surface_limits.h"
 #include "training.h"
 
@@ -23,8 +24,6 @@ namespace {
 using Floats = Array<float, nb::ndim<1>>;
 using Rows3 = Array<const float, nb::shape<-1, 3>>;
 constexpr double kBeta1 = 0.9, kBeta2 = 0.999;  // for bias correction; the same numbers as in Python
-constexpr int64_t kMostWidth = 1 << 20;
-constexpr size_t kMostTerms = 1 << 10;
 using Radii = Array<const int32_t, nb::ndim<1>>;
 
 struct Corrections {
@@ -63,21 +62,13 @@ struct AdamArrays {
 void factored_adam_update(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,
                           const std::vector<In<-1>>& columns, const Out<-1, -1, -1>& first,
                           const Out<-1, -1, -1>& second, const Array<float, nb::shape<>>& steps, double rate) {
-  const size_t count = values.shape(0), inputs = values.shape(1), width = values.shape(2);
   require(same_shape(first, values) && same_shape(second, values), "moments must have the shape of the values");
-  require(rows.size() == columns.size() && rows.size() <= kMostTerms, "every term needs rows and columns");
-  std::vector<mien::FactoredTerm> terms;
-  for (size_t i = 0; i < rows.size(); ++i) {
-    require(has_shape(rows[i], count, width) && has_shape(columns[i], inputs), "factors must fit the values");
-    terms.push_back({rows[i].data(), columns[i].data()});
-  }
-  const int columns_count = checked_length(inputs, kMostWidth, "inputs");
-  const int row_width = checked_length(width, kMostWidth, "numbers in a row");
+  const FactoredTerms gradient(values, rows, columns);
   const Corrections found = next_corrections(steps, rate);
   const nb::gil_scoped_release release;
-  mien::factored_adam_update({values.data(), terms.data(), first.data(), second.data(), static_cast<int64_t>(count),
-                              columns_count, row_width, static_cast<int>(terms.size()), found.step_size,
-                              found.second_unbiased});
+  mien::factored_adam_update({values.data(), gradient.terms.data(), first.data(), second.data(),
+                              static_cast<int64_t>(values.shape(0)), gradient.columns_count, gradient.width,
+                              static_cast<int>(gradient.terms.size()), found.step_size, found.second_unbiased});
 }
 
 void adam_update(const std::vector<Group<AdamArrays>>& groups) {

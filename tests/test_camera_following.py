@@ -295,12 +295,8 @@ def test_a_camera_drives_the_viewer_in_real_time(clip: tuple[Path, np.ndarray], 
 
 
 def _driven_by(clip: tuple[Path, np.ndarray]) -> tuple[dict[str, float], int, float, float]:
-    """Drive the viewer by the clip once.
-
-    Returns:
-        Correlation of what the avatar shows with the truth, for each expression; how many frames were shown; their
-        median delay, and the delay that 95 % of them keep, in seconds.
-    """
+    """Drive the viewer by the clip once. Return the correlation of each expression with the truth, how many frames were
+    shown, their median delay, and the delay that 95 % of them keep, in seconds."""
     avatar = runtime.Avatar(drawn_head(5000))
     session = Session(avatar)
     camera = _Counted(camera_named(f"camera:{clip[0]}", None), again=False)

@@ -1,4 +1,4 @@
-"""What mien says of wrong options: tyro's complaint in one line, in the words of mien's other messages."""
+"""mien tells of wrong options in one line, in the words of its other messages. tyro finds what is wrong."""
 
 import contextlib
 import difflib

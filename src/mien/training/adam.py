@@ -141,10 +141,18 @@ def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None
     if epsilon != EPSILON:  # that of the core
         return None
     arrays = (values, gradient, moments.first, moments.second, moments.step)
-    for tensor in arrays:
-        if not (tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous()):
-            return None
-    return *unpacked(*arrays), rate
+    return (*unpacked(*arrays), rate) if _fit_core(arrays) else None
+
+
+def _fit_core(tensors: Iterable[Tensor]) -> bool:
+    return all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in tensors)
+
+
+def _whole(terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]) -> Float[Tensor, "n k f"]:
+    """The gradient that terms stand for."""
+    gradient = sum(rows[:, None, :] * columns[:, None] for rows, columns in terms)
+    assert isinstance(gradient, Tensor)
+    return gradient
 
 
 def factored_update(update: FactoredUpdate) -> None:
@@ -159,7 +167,7 @@ def factored_update(update: FactoredUpdate) -> None:
     terms = [(rows, columns.detach()) for rows, columns in update.terms]
     arrays = (update.values.detach(), moments.second, moments.weights)
     every = (*arrays, *(tensor for term in terms for tensor in term))
-    if all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in every):
+    if _fit_core(every):
         values, second, weights = unpacked(*arrays)
         rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
         _native.factored_update(values, rows, columns, second, weights, update.rate)
@@ -171,8 +179,7 @@ def factored_update(update: FactoredUpdate) -> None:
 def factored_update_reference(update: FactoredUpdate) -> None:
     """`factored_update` in plain PyTorch, any number of terms, dtype and device."""
     values, terms, moments, rate = update
-    gradient = sum(rows[:, None, :] * columns[:, None] for rows, columns in terms)
-    assert isinstance(gradient, Tensor)
+    gradient = _whole(terms)
     squares = gradient.square().mean(1)
     touched = (gradient != 0).flatten(1).any(1)
     # Selecting the touched rows would wait for a GPU to count them.
@@ -194,12 +201,11 @@ def factored_adam_update(update: FactoredAdamUpdate) -> None:
     terms = [(rows, columns.detach()) for rows, columns in terms]
     arrays = (values.detach(), moments.first, moments.second, moments.step)
     every = (*arrays, *(tensor for term in terms for tensor in term))
-    if all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in every):
+    if _fit_core(every):
         native_values, first, second, step = unpacked(*arrays)
         rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
         _native.factored_adam_update(native_values, rows, columns, first, second, step, rate)
         return
     with torch.no_grad():
-        gradient = sum(rows[:, None, :] * columns[:, None] for rows, columns in terms)
-    assert isinstance(gradient, Tensor)
+        gradient = _whole(terms)
     update_reference(Update(values, gradient, moments, rate))

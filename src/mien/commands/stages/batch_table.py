@@ -49,6 +49,7 @@ _SETTINGS = {
         ("training", TrainSettings),
     )
 }
+"""Group of options -> names of its settings."""
 _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 """Memory of a row in megabytes: at least, and for each frame. 10 minutes of video take less than 3 GiB."""
 

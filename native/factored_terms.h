@@ -1,0 +1,28 @@
+// A gradient that is a sum of outer products, as Python gives it: a list of rows [n, f] and a list of columns [k].
+#pragma once
+
+#include <vector>
+
+#include "arrays.h"
+#include "feature_network.h"
+
+constexpr int64_t kMostWidth = 1 << 20;  // so that products of widths fit
+constexpr size_t kMostTerms = 1 << 10;
+
+struct FactoredTerms {
+  std::vector<mien::FactoredTerm> terms;
+  int columns_count, width;
+
+  // Of values [n, k, f]. The arrays have to live as long as this does.
+  FactoredTerms(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,
+                const std::vector<In<-1>>& columns) {
+    const size_t count = values.shape(0), inputs = values.shape(1), numbers = values.shape(2);
+    require(rows.size() == columns.size() && rows.size() <= kMostTerms, "every term needs rows and columns");
+    for (size_t i = 0; i < rows.size(); ++i) {
+      require(has_shape(rows[i], count, numbers) && has_shape(columns[i], inputs), "factors must fit the values");
+      terms.push_back({rows[i].data(), columns[i].data()});
+    }
+    columns_count = checked_length(inputs, kMostWidth, "inputs");
+    width = checked_length(numbers, kMostWidth, "numbers in a row");
+  }
+};
