@@ -69,9 +69,10 @@ web: web/node_modules/.installed
 demo: setup
 	$(BIN)/mien demo --out out/demo
 
-# One process a core, each with one thread (tests/conftest.py says how many).
+# One process a core, each with one thread (tests/conftest.py says how many). Tests that follow a clock come last, with nothing beside them.
 test: setup web-packages chromium
-	MIEN_THREADS=1 $(BIN)/pytest -n auto
+	MIEN_THREADS=1 $(BIN)/pytest -n auto -m "not alone"
+	MIEN_THREADS=1 $(BIN)/pytest -m alone
 
 # A broad and fast part of the suite on Python 3.12, in an environment of its own. All of it: make test VENV=.venv312 PYTHON=python3.12
 PART := needs places arrays files startup cli rasterize rasterize_contract training_native training_resume runtime export motion

@@ -82,6 +82,7 @@ def test_every_method_gets_the_same_frames_and_steps(
     assert table.strip() in capsys.readouterr().out
 
 
+@pytest.mark.alone
 def test_minutes_become_steps_by_trials_that_are_kept(
     workspace: Path, tmp_path: Path, trained: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

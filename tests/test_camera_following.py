@@ -282,9 +282,10 @@ def test_meters() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_camera_drives_the_viewer_in_real_time(clip: tuple[Path, np.ndarray], record_property: Callable) -> None:
     told = []
-    for _ in range(3):  # a busy machine may drop too many frames in any one try
+    for _ in range(3):  # other programs of the machine may take too many frames from any one try
         agreement, frames, median, late = _driven_by(clip)
         told.append((agreement, frames, median))
         if min(agreement.values()) >= 0.9 and frames > 30 and median < 0.5:
@@ -330,7 +331,7 @@ def _driven_by(clip: tuple[Path, np.ndarray]) -> tuple[dict[str, float], int, fl
     index = np.array([camera.numbers[seconds] for seconds, _ in followed])
     moving = index > FPS * STILL_SECONDS
     agreement = {name: 0.0 for name in FOLLOWED}
-    if moving.sum() > 2:
+    if moving.sum() > 30:  # a few may all lie where nothing moves, and then nothing correlates
         shown, true = np.array([values for _, values in followed])[moving], clip[1][index[moving]]
         agreement = {name: correlation(shown[:, column(name)], true[:, column(name)]) for name in FOLLOWED}
     assert "Following" in lines[0]
@@ -363,6 +364,7 @@ def test_the_corner_shows_what_the_camera_saw() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_the_command_records_a_camera(
     clip: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

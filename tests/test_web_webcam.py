@@ -118,6 +118,7 @@ RECORD = """(async () => {
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_drawn_head_drives_jaw_and_blinks(page: Path, clip: Clip) -> None:
     """Coefficients of the avatar against the true ones of the picture that the detector saw."""
     told = browse(page, [RECORD % (json.dumps(TRUE), CELL // 2)], WINDOW, flags=in_front(clip))
