@@ -12,7 +12,7 @@ const MOST_FACES = 8;
 /** Time in which a face goes two thirds of its way, that of the eyes, and how long the first turn takes, in seconds. */
 const SOFT = 0.07, EYES = 0.12, FIRST = 1.6;
 /** Turn of the camera when the page opens, in radians, to the side of the head that the camera saw, and seconds after which eyes look ahead again. */
-const ASIDE = 0.45, BORED = 4;
+const ASIDE = 0.25, BORED = 4;
 
 export interface Alive {
   /** Goes softly to a face; to the person at rest without a name. */

@@ -95,7 +95,9 @@ def _evaluate(
             write_scored_pictures(run_dir / "pictures" / name, experiment)
     avatars = [experiment.avatar for experiment in experiments.values()]
     covered = read_coverage(run_dir, avatars[0].face_model) if avatars else None
-    alive = living(avatars[0], run_camera(run_dir), run_dir.name) if avatars and settings.video_frames else None
+    alive = None
+    if avatars and settings.video_frames:
+        alive = living(avatars[0], run_camera(run_dir), run_dir.name, covered)
     if alive is not None:
         write_film(run_dir / FILM, alive)
     run = RunRecord(run_dir.name, read_run_config(run_dir), summary, read_curves(run_dir), covered)

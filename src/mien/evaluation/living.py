@@ -1,6 +1,7 @@
 """The avatar alive: a film of five seconds in which it looks around, blinks and smiles, and a strip of its faces."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,19 @@ from mien.camera import Camera
 from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.progress import track_progress
+from mien.runtime.filmed import head_angles
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.training.footage import Coverage, filmed_yaws
 from mien.training.whole_head import with_soft_cut
 
 FILM = "film.mp4"
 """Name of the film in a run's folder."""
 SECONDS, FPS, SIDE = 5.0, 25, 512
 """Length in seconds, frames per second, and sides in pixels of the film."""
-_MOST_YAW, _MOST_PITCH = 0.4, 0.08
-"""Largest turns of the head, in radians. Cameras in front film this much of most heads."""
+_MOST_YAW, _LEAST_YAW, _MOST_PITCH = 0.4, 0.1, 0.08
+"""Largest turns of the head to a side, turns that every head makes, and largest nods, in radians."""
+_MARGIN = 0.06
+"""Width of the free space around the head, as a share of the picture."""
 _FACES = (("smile", 0.9, 1.3, 1.0), ("surprise", 2.6, 0.9, 0.8), ("smile", 3.9, 1.0, 0.6))
 """What the face does: a preset, when it begins and how long it lasts in seconds, and how strong it is."""
 _BLINKS = (0.45, 2.35, 3.75)
@@ -31,31 +36,48 @@ _STRIP = 6
 """Number of faces in the strip."""
 
 
-def living(avatar: Avatar, camera: Camera, name: str) -> runtime.Avatar | None:
-    """Return the avatar as films and strips draw it, with a soft cut at the neck.
+@dataclass(frozen=True)
+class Living:
+    """An avatar as films and strips show it."""
 
-    None if its method has no record without torch.
+    avatar: runtime.Avatar
+    camera: runtime.Camera
+    """The view of the training, square, and as near as the turning head fits."""
+    yaws: tuple[float, float]
+    """How far the head turns from its rest, in radians: to its right (below 0), and to its left (above 0)."""
+
+
+def living(avatar: Avatar, camera: Camera, name: str, coverage: Coverage | None) -> Living | None:
+    """Return the avatar as films and strips show it, with a soft cut at the neck.
+
+    Its head turns to a side as far as `coverage` says that this side was filmed, because the rest is a guess, and
+    always a little. Without a coverage it turns to both sides alike. None if its method has no record without torch.
     """
     try:
-        return runtime.Avatar(with_soft_cut(make_portable(avatar, camera, name, to_share=False), avatar))
+        alive = runtime.Avatar(with_soft_cut(make_portable(avatar, camera, name, to_share=False), avatar))
     except UserError:
         return None
+    neutral, reached = avatar.face_model.head_vertices(avatar.subject)[0], None
+    if coverage is not None:
+        reached = filmed_yaws(avatar.face_model, neutral, coverage) or (0, 0)
+    yaws = _yaws(alive, reached)
+    return Living(alive, _near(alive, yaws), yaws)
 
 
-def write_film(path: Path, avatar: runtime.Avatar) -> None:
+def write_film(path: Path, alive: Living) -> None:
     """Write the film: 512x512, five seconds, over white. Its end leads to its begin.
 
     Raises:
         UserError: the file cannot be written.
     """
-    write_video(path, _pictures(avatar), FPS)
+    write_video(path, _pictures(alive), FPS)
 
 
-def strip(avatar: runtime.Avatar) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
+def strip(alive: Living) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
     """Return a few preset faces with their names. Face models without them have none."""
-    camera = avatar.camera.square(SIDE)
+    avatar = alive.avatar
     names = runtime.presets_for(avatar.expression_names, avatar.joint_names)[:_STRIP]
-    return [(name, to_bytes(avatar.render(avatar.pose({name: 1.0}), camera)[0])) for name in names]
+    return [(name, to_bytes(avatar.render(avatar.pose({name: 1.0}), alive.camera)[0])) for name in names]
 
 
 def to_bytes(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -63,17 +85,55 @@ def to_bytes(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.rint(255 * image.clip(0, 1)).astype(np.uint8)
 
 
-def _pictures(avatar: runtime.Avatar) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    camera, rest = avatar.camera.square(SIDE), matrix_from_axis_angle(avatar.portable.neutral.head_rotation)
+def _pictures(alive: Living) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    avatar, (right, left) = alive.avatar, alive.yaws
     shown = runtime.presets_for(avatar.expression_names, avatar.joint_names)
     count = round(SECONDS * FPS)
     for index in track_progress(range(count), "film", count):
         seconds = index / FPS
         phase = 2 * np.pi * seconds / SECONDS
-        turn = np.array([_MOST_PITCH * np.sin(2 * phase), _MOST_YAW * np.sin(phase), 0.0])
-        rotation = axis_angle_from_matrix(rest @ matrix_from_axis_angle(turn))
+        yaw = 0.5 * (left + right) + 0.5 * (left - right) * np.sin(phase)
         faces = {name: value for name, value in _face(seconds).items() if name in shown}
-        yield to_bytes(avatar.render(avatar.pose(faces, head_rotation=rotation), camera)[0])
+        rotation = _turned(avatar, yaw, _MOST_PITCH * np.sin(2 * phase))
+        yield to_bytes(avatar.render(avatar.pose(faces, head_rotation=rotation), alive.camera)[0])
+
+
+def _turned(avatar: runtime.Avatar, yaw: float, pitch: float) -> Float32[np.ndarray, " 3"]:
+    """The rotation of the head that is turned from its rest, as an axis-angle vector in radians."""
+    rest = matrix_from_axis_angle(avatar.portable.neutral.head_rotation)
+    return axis_angle_from_matrix(rest @ matrix_from_axis_angle(np.array([pitch, yaw, 0.0]))).astype(np.float32)
+
+
+def _yaws(avatar: runtime.Avatar, reached: tuple[int, int] | None) -> tuple[float, float]:
+    """`Living.yaws` of a head that was filmed from so many degrees to its right to so many to its left."""
+    if reached is None:
+        return -_MOST_YAW, _MOST_YAW
+    camera, neutral = avatar.camera, avatar.portable.neutral
+    eye = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+    # A head that turns to its left shows its right.
+    at_rest = float(head_angles(neutral.head_rotation[None], neutral.head_translation[None], eye)[0, 0])
+    right, left = np.radians(reached)
+    to_left, to_right = np.clip([right + at_rest, left - at_rest], _LEAST_YAW, _MOST_YAW)
+    return -float(to_right), float(to_left)
+
+
+def _near(avatar: runtime.Avatar, yaws: tuple[float, float]) -> runtime.Camera:
+    """`Living.camera`. It is never further away than the view of the training."""
+    camera = avatar.camera.square(SIDE)
+    turned = [
+        avatar.pose(head_rotation=_turned(avatar, yaw, pitch))
+        for yaw in (*yaws, 0.0)
+        for pitch in (-_MOST_PITCH, _MOST_PITCH)
+    ]
+    shown = np.any([avatar.render(gaussians, camera)[1] > 0.1 for gaussians in turned], axis=0)
+    rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
+    if not len(rows):
+        return camera
+    ends = np.array([[columns[0], columns[-1] + 1], [rows[0], rows[-1] + 1]])
+    scale = max(1.0, (1 - 2 * _MARGIN) * SIDE / float((ends[:, 1] - ends[:, 0]).max()))
+    K = camera.K * np.array([[scale], [scale], [1.0]], np.float32)
+    K[:2, 2] += SIDE / 2 - scale * ends.mean(1).astype(np.float32)
+    return replace(camera, K=K)
 
 
 def _face(seconds: float) -> dict[str, float]:

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from mien import runtime
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
-from mien.evaluation.living import FILM
+from mien.evaluation.living import FILM, Living
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,
     FITTED_NAME,
@@ -69,7 +68,7 @@ def write_report(
     results: Mapping[str, tuple[Experiment, Evaluation]],
     videos: Mapping[str, ReportVideo] = MappingProxyType({}),
     driven: sections.CrossSection | None = None,
-    alive: runtime.Avatar | None = None,
+    alive: Living | None = None,
 ) -> None:
     """Write the page of a run.
 

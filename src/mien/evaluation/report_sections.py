@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien import runtime
 from mien.avatar import Avatar
 from mien.evaluation.experiment import DARK, Experiment, avatar_image, head_box, target_image
-from mien.evaluation.living import SIDE, strip, to_bytes
+from mien.evaluation.living import SIDE, Living, strip, to_bytes
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import BASELINE_NAMES, OVER_DARK_NAME
 from mien.evaluation.page import Card, Cell, DataTable, Picture, Video, figure_text, picture_of, video_of
@@ -263,10 +262,10 @@ def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder:
     return CrossSection(DataTable([head], rows, _CROSS_NOTE), shown)
 
 
-def hero(alive: runtime.Avatar, film: Path, result: tuple[Experiment, Evaluation]) -> Hero:
+def hero(alive: Living, film: Path, result: tuple[Experiment, Evaluation]) -> Hero:
     """The avatar alive. The filmed frame is the first held-out one."""
     experiment, evaluation = result
-    picture = to_bytes(alive.render(camera=alive.camera.square(SIDE))[0])
+    picture = to_bytes(alive.avatar.render(camera=alive.camera)[0])
     filmed = to_uint8(target_image(experiment, evaluation.frames[0]))
     faces = [
         picture_of(face, f"The avatar: {name}", _OVERLAY_SIZE, name.replace("_", " ").capitalize())

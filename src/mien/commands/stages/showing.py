@@ -12,7 +12,7 @@ from mien.evaluation.living import FILM, living, write_film
 from mien.export import Motion, write_page
 from mien.files import write_atomically
 from mien.progress import say
-from mien.training import read_run_config, run_camera
+from mien.training import read_coverage, read_run_config, run_camera
 from mien.workspace import Workspace
 
 PAGE, MOVIE = "me.html", "me.mp4"
@@ -30,7 +30,9 @@ def show_avatar(workspace: Workspace, run: str) -> None:
     try:
         film = run_dir / FILM
         if not film.is_file():
-            alive = living(load_avatar(run_dir), run_camera(run_dir), root.resolve().name)
+            avatar = load_avatar(run_dir)
+            coverage = read_coverage(run_dir, avatar.face_model)
+            alive = living(avatar, run_camera(run_dir), root.resolve().name, coverage)
             if alive is not None:
                 write_film(film, alive)
         if film.is_file():

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mien.training.footage.filmed import (
         confidence_picture,
         filmed_words,
+        filmed_yaws,
         read_coverage,
         with_shown_angles,
         write_coverage,
@@ -104,6 +105,7 @@ __all__ = [
     "evenly_spread",
     "expression_rarity",
     "filmed_words",
+    "filmed_yaws",
     "foreground_colors",
     "held_out",
     "held_out_of",

@@ -1,0 +1,46 @@
+"""The film of an avatar: its head turns to the sides that were filmed, and fills the picture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mien import runtime
+from mien.evaluation import living
+from mien.evaluation.living import Living
+from web_case import drawn_head
+
+DEGREES = np.degrees(1.0)
+
+
+@pytest.fixture
+def avatar() -> runtime.Avatar:
+    return runtime.Avatar(drawn_head(1500))
+
+
+def aside(avatar: runtime.Avatar, degrees: float) -> runtime.Avatar:
+    """The avatar of a person whose head, at rest, is turned to its left."""
+    portable = avatar.portable
+    turned = living._turned(avatar, degrees / DEGREES, 0.0)
+    return runtime.Avatar(replace(portable, neutral=replace(portable.neutral, head_rotation=turned)))
+
+
+def test_a_head_turns_to_the_sides_that_were_filmed(avatar: runtime.Avatar) -> None:
+    # The head of the drawn person looks 5.1 degrees to its right of the camera.
+    assert np.multiply(living._yaws(aside(avatar, 5.1), (15, 10)), DEGREES) == pytest.approx((-10, 15), abs=0.1)
+    # A camera that sees its right already leaves less on that side.
+    assert np.multiply(living._yaws(aside(avatar, 10.1), (15, 10)), DEGREES) == pytest.approx((-15, 10), abs=0.1)
+    assert living._yaws(avatar, (0, 0)) == (-living._LEAST_YAW, living._LEAST_YAW)
+    assert living._yaws(avatar, (180, 180)) == living._yaws(avatar, None) == (-living._MOST_YAW, living._MOST_YAW)
+
+
+def test_the_head_fills_the_film_and_never_leaves_it(avatar: runtime.Avatar, monkeypatch: pytest.MonkeyPatch) -> None:
+    yaws = (-0.1, 0.4)
+    monkeypatch.setattr(living, "FPS", 4)
+    pictures = np.stack(list(living._pictures(Living(avatar, living._near(avatar, yaws), yaws))))
+    drawn = (pictures < 200).any(-1)
+    assert not drawn[:, [0, -1]].any()
+    assert not drawn[:, :, [0, -1]].any()
+    high, wide = (np.ptp(np.flatnonzero(drawn.any(0).any(axis))) for axis in (1, 0))
+    assert max(high, wide) > 0.8 * living.SIDE
+    assert (pictures[0] != pictures[5]).any(-1).mean() > 0.1, "the head turns"
