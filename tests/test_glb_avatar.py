@@ -100,10 +100,10 @@ def test_the_extension_is_used_but_not_required(glb: Path) -> None:
 
 
 def test_export_reads_a_glb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From a .glb come the .mien and the pose at rest with the bytes that the workspace gives."""
+    """From a .glb, which ends as in training, come the .mien and the pose at rest with the workspace's bytes."""
     write_toy_workspace(tmp_path / "W")
-    for name in ("a.mien", "a.glb", "a.spz"):
-        assert main(["export", str(tmp_path / "W"), "--out", str(tmp_path / name)]) == 0
+    for name, options in (("a.mien", ("--sharp-cut",)), ("a.glb", ()), ("a.spz", ())):
+        assert main(["export", str(tmp_path / "W"), "--out", str(tmp_path / name), *options]) == 0
     for name in ("b.mien", "b.spz", "b.html"):
         assert main(["export", str(tmp_path / "a.glb"), "--out", str(tmp_path / name)]) == 0
     for ending in ("mien", "spz"):

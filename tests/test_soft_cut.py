@@ -99,7 +99,9 @@ def test_what_stands_off_the_skin_goes_just_above_the_cut_alone(model: FaceModel
     assert off_skin[1] == on_skin[1] == 1
 
 
-def test_pages_have_the_soft_cut_unless_it_is_declined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pages_and_files_have_the_soft_cut_unless_it_is_declined(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_toy_workspace(tmp_path / "me")
     content = RunContent(open_workspace(tmp_path / "me"), "toy")
     for name, options, soft in (("soft", (), True), ("sharp", ("--sharp-cut",), False)):
@@ -107,6 +109,14 @@ def test_pages_have_the_soft_cut_unless_it_is_declined(tmp_path: Path, capsys: p
         assert main(["export", str(tmp_path / "me"), "--out", str(out), *options]) == 0
         write_packed(direct, content.portable(confidence=False, soft_cut=soft))
         assert out.read_bytes() == direct.read_bytes()
+        # Whatever is made of a file later ends as the file does.
+        assert main(["export", str(tmp_path / "me"), "--out", str(tmp_path / f"{name}.mien"), *options]) == 0
+        written, expected = (
+            each.baked for each in (runtime.load(tmp_path / f"{name}.mien").portable, content.portable(soft_cut=soft))
+        )
+        assert isinstance(written, MeshBound)
+        assert isinstance(expected, MeshBound)
+        np.testing.assert_array_equal(written.attributes.opacity_logits, expected.attributes.opacity_logits)
     assert (tmp_path / "soft.packed").read_bytes() != (tmp_path / "sharp.packed").read_bytes()
     capsys.readouterr()
     assert main(["export", str(tmp_path / "me"), "--out", str(tmp_path / "a.ply"), "--sharp-cut"]) == 2

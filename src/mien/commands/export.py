@@ -30,7 +30,7 @@ _REFUSED = {
     "microphone": "only an .html page has a microphone; leave --microphone out, or write a .html file",
     "title": "only an .html page has a title; leave --title out",
     "address": "only an .html page has an address; leave --address out",
-    "soft_cut": "only .html and .packed files have a soft cut; leave --sharp-cut out",
+    "soft_cut": "only .html, .mien and .packed files have a soft cut; leave --sharp-cut out",
 }
 """Messages for options that the format does not take."""
 
@@ -122,7 +122,7 @@ class Command:
     """For .html: the address at which you will publish the page, such as https://example.org/me.html. Messengers then
     show a picture of the avatar, which is written beside the page."""
     sharp_cut: bool = False
-    """For .html and .packed: the head ends sharply at the neck, as in training (default: it fades over 3 cm)."""
+    """For .html, .mien and .packed: the head ends sharply at the neck, as in training (default: it fades over 3 cm)."""
     sequence: str | None = None
     """For a capture: the sequence that is written (default: the only one)."""
     split: CaptureSplit | None = None

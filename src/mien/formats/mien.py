@@ -14,7 +14,7 @@ _WHOLE = "a .mien file holds every expression; leave --set and --series out"
 def _write(path: Path, content: Content, options: Options) -> str:
     from mien.runtime import write_portable
 
-    write_portable(path, content.portable())
+    write_portable(path, content.portable(soft_cut=options.soft_cut))
     return f"{content.count:,} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
 
 
@@ -24,4 +24,12 @@ def _read(path: Path) -> "PortableAvatar":
     return read_portable(path)
 
 
-MIEN = Format("mien", "avatar", _write, (".mien",), _read, refusals={"set": _WHOLE, "series": _WHOLE})
+MIEN = Format(
+    "mien",
+    "avatar",
+    _write,
+    (".mien",),
+    _read,
+    options=frozenset({"soft_cut"}),
+    refusals={"set": _WHOLE, "series": _WHOLE},
+)
