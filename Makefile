@@ -11,7 +11,7 @@ UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines lock clean
+.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -162,6 +162,10 @@ lock: $(VENV)/.packages
 # The engines of `mien batch` on clusters, which the base set-up leaves out.
 batch-engines: setup
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install -r requirements/batch.in
+
+# The tests of `mien batch` on Ray and with an object store, which `make test` skips where they are missing.
+test-engines: batch-engines
+	MIEN_THREADS=1 $(BIN)/pytest tests/test_batch_engines.py tests/test_batch.py
 
 # Everything of a release into dist/, with the times of its commit (release/make.py).
 release: setup

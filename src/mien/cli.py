@@ -129,7 +129,7 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     name, rest = arguments[0], arguments[1:]
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, 1)
+        near = difflib.get_close_matches(name, [*COMMANDS, "--help", "--version"], 1)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(COMMANDS)}"
         raise UserError(f"no sub-command {name!r}; {hint}")
     if "" in rest:
@@ -191,7 +191,7 @@ def _run(name: str, rest: list[str]) -> int:
             if more:
                 show(more)
             raise
-        complaint = complaint_of(complaints.getvalue(), options, style)
+        complaint = complaint_of(complaints.getvalue(), rest, options, style)
         # The short help leaves out the options of groups, whose names have a dot.
         every = "-all" if re.search(r"--[a-z-]+\.[a-z]", complaint) else ""
         raise UserError(f"{complaint}; see mien {name} --help{every}") from None

@@ -1,10 +1,12 @@
 """mien tells of wrong options in one line, in the words of its other messages. tyro finds what is wrong."""
 
 import contextlib
-import difflib
 import io
 import re
+from collections.abc import Sequence
 from typing import Any
+
+from mien.commands.settings_options import near_option
 
 _USELESS = ("For full helptext", "Argument helptext")
 _REWORDED = (
@@ -24,15 +26,16 @@ _INDENT_OF_DESCRIPTION = 8
 """Number of spaces before an option's description in tyro's messages. Option names have fewer."""
 
 
-def complaint_of(box: str, options: type, style: Any) -> str:
+def complaint_of(box: str, arguments: Sequence[str], options: type, style: Any) -> str:
     """Return one line that names the option, its value, and what to give.
 
     Args:
         box: What tyro printed.
+        arguments: What was typed after the name of the command.
         options: The options that it was given.
         style: Its configuration.
     """
-    return _with_near_options(_in_one_line(box), options, style)
+    return _unknown_options(arguments, options, style) or _in_one_line(box)
 
 
 def _in_one_line(box: str) -> str:
@@ -54,20 +57,24 @@ def _in_one_line(box: str) -> str:
     return "; ".join(_reworded(part.rstrip(".")) for part in parts if part and not part.startswith(_USELESS))
 
 
-def _with_near_options(complaint: str, options: type, style: Any) -> str:
-    """A complaint of unknown options, with the known ones that look like them."""
-    unknown = re.search(r"unknown: ([^;]*)", complaint)
-    if unknown is None or "did you mean" in complaint:
-        return complaint
+def _unknown_options(arguments: Sequence[str], options: type, style: Any) -> str | None:
+    """One line about the options that do not exist, with the existing ones that look like them; None if all exist.
+
+    tyro takes what follows an unknown option for something else, and complains about that.
+    """
     import tyro
 
     shown = io.StringIO()
     with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
         tyro.cli(options, args=["--help"], config=style)
-    known = re.findall(r"^\W*(--[a-z][\w.-]*)", shown.getvalue(), re.MULTILINE)
-    typed = [word for word in unknown[1].split(", ") if word.startswith("--")]
-    near = [found for word in typed for found in difflib.get_close_matches(word, known, 1)]
-    return f"{complaint}; did you mean {', '.join(dict.fromkeys(near))}?" if near else complaint
+    known = [*re.findall(r"(?<![\w.-])--[a-z][\w.-]*", shown.getvalue()), "--help-all"]
+    names = [argument.partition("=")[0].replace("_", "-") for argument in arguments]
+    unknown = [name for name in dict.fromkeys(names) if re.match("--[a-z]", name) and name not in known]
+    if not unknown:
+        return None
+    near = [found for name in unknown for found in near_option(name, known)]
+    hint = f"; did you mean {', '.join(dict.fromkeys(near))}?" if near else ""
+    return f"unknown: {', '.join(unknown)}{hint}"
 
 
 def _reworded(complaint: str) -> str:

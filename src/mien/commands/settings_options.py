@@ -146,11 +146,11 @@ def check_names(arguments: Sequence[str], prefix: str, listed: Sequence[Leaf], o
         shown = [*dict.fromkeys(_one_level(name, group) for name in inside)]
         if group == option:
             raise UserError(f"{option}: is a group of settings of {owner}; there are: {', '.join(shown)}")
-        raise UserError(no_such_setting(option, owner, _near(option, known), shown))
+        raise UserError(no_such_setting(option, owner, near_option(option, known), shown))
 
 
-def _near(option: str, known: Sequence[str]) -> list[str]:
-    """The option with the most similar last part, if there is one: a name may be right and its group forgotten.
+def near_option(option: str, known: Sequence[str]) -> list[str]:
+    """At most one option: the one with the most similar last part, if there is one: a name may be right and its group forgotten.
 
     If there is none, it is the first one whose last part has the given one as one of its words.
     """
