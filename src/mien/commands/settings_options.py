@@ -150,9 +150,10 @@ def check_names(arguments: Sequence[str], prefix: str, listed: Sequence[Leaf], o
 
 
 def near_option(option: str, known: Sequence[str]) -> list[str]:
-    """At most one option: the one with the most similar last part, if there is one: a name may be right and its group forgotten.
+    """The known option that was probably meant, in a list; an empty list if there is none.
 
-    If there is none, it is the first one whose last part has the given one as one of its words.
+    It is the one with the most similar last part, because a name may be right and its group forgotten. Without such a
+    one, it is the first whose last part has the given one as one of its words.
     """
     names = [*known, *{name.rpartition(".")[0] for name in known}]
     lasts = {name: name.rpartition(".")[2] for name in names}
