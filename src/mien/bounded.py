@@ -83,12 +83,18 @@ def read_bytes(path: Path | str, most: int) -> bytes:
         ValueError: the file has more than `most` bytes, or is not ordinary.
         OSError: the file is missing or cannot be read.
     """
-    with open_ordinary(path) as file:
-        size = os.fstat(file.fileno()).st_size
+    handle = open_handle(path, os.O_RDONLY, follow_link=True)
+    try:
+        size = os.fstat(handle).st_size
         if size > most:
             raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
         # Do not read to the end of the file, because the file may grow meanwhile.
-        return file.read(size)
+        found = os.read(handle, size)
+        while len(found) < size and (more := os.read(handle, size - len(found))):
+            found += more
+        return found
+    finally:
+        os.close(handle)
 
 
 def open_ordinary(path: Path | str) -> IO[bytes]:
