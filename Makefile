@@ -37,11 +37,13 @@ build: setup
 # sends nothing (src/mien/export/webcam.py checks its files by hash). Everything else works without it.
 LANDMARKER := src/mien/export/landmarker
 TASKS_VISION := @mediapipe/tasks-vision@0.10.35
-landmarker: $(LANDMARKER)/vision_wasm_internal.wasm
-$(LANDMARKER)/vision_wasm_internal.wasm:
+landmarker: $(LANDMARKER)/vision_wasm_internal.wasm.xz
+$(LANDMARKER)/vision_wasm_internal.wasm.xz:
 	@if command -v npm >/dev/null; then mkdir -p build/landmarker && npm pack --silent --pack-destination build/landmarker $(TASKS_VISION) >/dev/null \
 	  && tar -xzf build/landmarker/*.tgz -C build/landmarker && mv build/landmarker/package/vision_bundle.cjs \
-	  build/landmarker/package/wasm/vision_wasm_internal.js build/landmarker/package/wasm/vision_wasm_internal.wasm $(LANDMARKER)/ \
+	  build/landmarker/package/wasm/vision_wasm_internal.js $(LANDMARKER)/ && rm -f $(LANDMARKER)/vision_wasm_internal.wasm \
+	  && "$(PYTHON)" -c 'import lzma, sys; sys.stdout.buffer.write(lzma.compress(sys.stdin.buffer.read(), preset=9 | lzma.PRESET_EXTREME))' \
+	  < build/landmarker/package/wasm/vision_wasm_internal.wasm > build/landmarker/wasm.xz && mv build/landmarker/wasm.xz $@ \
 	  && rm -r build/landmarker; else echo "No npm: pages have no webcam (mien export --webcam) until 'make landmarker' runs with it."; fi
 
 # The web runtime's packages, for its build and its tests. Without npm, the tests that need them are skipped; MIEN_STRICT

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import lzma
 import shutil
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import pytest
 
 from mien import runtime
 from mien.cli import main
+from mien.errors import UserError
 from mien.export import find_webcam_files, write_page
-from mien.export.webcam import OWN, POLICY, VERSION
+from mien.export.webcam import OWN, POLICY, VERSION, webcam_part
 from web_case import WEB, drawn_head, tasks_vision
 
 
@@ -102,6 +104,25 @@ def test_a_missing_or_other_package_is_explained(
     assert "needs vision_bundle.cjs" in told
     assert "make landmarker" in told
     assert f"@mediapipe/tasks-vision@{VERSION}" in told
+
+
+def test_a_compressed_file_of_the_package_is_that_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """In mien's own folder, the largest file lies compressed."""
+    folder = tmp_path / "package"
+    shutil.copytree(tasks_vision(), folder)
+    monkeypatch.setenv("MIEN_TASKS_VISION", str(folder))
+    plain = webcam_part(find_webcam_files())
+    (wasm,) = folder.rglob("vision_wasm_internal.wasm")
+    compressed = folder / "vision_wasm_internal.wasm.xz"
+    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
+    wasm.unlink()
+    assert webcam_part(find_webcam_files()) == plain
+    compressed.write_bytes(compressed.read_bytes()[:-100])
+    with pytest.raises(UserError, match="is not that of version"):
+        find_webcam_files()
+    compressed.write_bytes(b"no archive")
+    with pytest.raises(UserError, match="--webcam needs vision_wasm_internal.wasm"):
+        find_webcam_files()
 
 
 def test_options_that_do_not_fit_are_refused(avatar_file: Path, capsys: pytest.CaptureFixture[str]) -> None:

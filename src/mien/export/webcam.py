@@ -9,6 +9,7 @@ import base64
 import gzip
 import hashlib
 import html
+import lzma
 import os
 import zipfile
 from dataclasses import dataclass
@@ -40,6 +41,8 @@ _MEMBERS = {"face_detector.tflite", "face_landmarks_detector.tflite", "face_blen
 """Networks in a model that finds blend shapes."""
 _MOST_BYTES = 64 << 20
 """Largest file that goes into a page."""
+_SHRUNK = ".xz"
+"""Further ending of files that lie compressed in mien's own folder, so that mien is quickly downloaded."""
 
 
 @dataclass(frozen=True)
@@ -83,15 +86,32 @@ def webcam_part(files: WebcamFiles) -> str:
 
 def _packed(path: Path) -> str:
     try:
-        content = read_bytes(path, _MOST_BYTES)
+        content = _content(path)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
     return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
 
 
+def _content(path: Path) -> bytes:
+    """The bytes of a file, which may lie compressed.
+
+    Raises:
+        ValueError: the file is too large or damaged.
+        OSError: the file is missing or cannot be read.
+    """
+    content = read_bytes(path, _MOST_BYTES)
+    if path.suffix != _SHRUNK:
+        return content
+    try:
+        return lzma.LZMADecompressor(memlimit=4 * _MOST_BYTES).decompress(content, _MOST_BYTES)
+    except lzma.LZMAError as error:
+        raise ValueError(str(error)) from None
+
+
 def _place(folder: Path, name: str) -> Path:
-    """A file of the package, in whose own folder some lie in `wasm`."""
-    return next((path for path in (folder / name, folder / "wasm" / name) if path.is_file()), folder / name)
+    """A file of the package, in whose own folder some lie in `wasm`. In mien's folder, some lie compressed."""
+    places = (folder / name, folder / "wasm" / name, folder / f"{name}{_SHRUNK}")
+    return next((path for path in places if path.is_file()), folder / name)
 
 
 def _package() -> Path:
@@ -104,7 +124,7 @@ def _package() -> Path:
     for name, expected in _FILES.values():
         path = _place(folder, name)
         try:
-            content = read_bytes(path, _MOST_BYTES)
+            content = _content(path)
         except (OSError, ValueError):
             raise UserError(f"{folder}: --webcam needs {name} of the npm package {PACKAGE}; {remedy}") from None
         if hashlib.sha256(content).hexdigest() != expected:
