@@ -38,7 +38,7 @@ def test_the_head_fills_the_film_and_never_leaves_it(avatar: runtime.Avatar, mon
     yaws = (-0.1, 0.4)
     monkeypatch.setattr(living, "FPS", 4)
     pictures = np.stack(list(living._pictures(Living(avatar, living._near(avatar, yaws), yaws))))
-    drawn = (pictures < 200).any(-1)
+    drawn = np.asarray(pictures < 200).any(-1)
     assert not drawn[:, [0, -1]].any()
     assert not drawn[:, :, [0, -1]].any()
     high, wide = (np.ptp(np.flatnonzero(drawn.any(0).any(axis))) for axis in (1, 0))

@@ -289,7 +289,7 @@ def _check(steps: list[list[str]], where: str, kinds: set[str]) -> None:
         command.capture.check()
         command.tracking.check()
     except SystemExit:
-        why = complaint_of(told.getvalue(), options, style)
+        why = complaint_of(told.getvalue(), arguments, options, style)
         raise UserError(f"{where}: {why}; see mien create --help-all") from None
     except UserError as error:
         raise UserError(f"{where}: {error}") from None
