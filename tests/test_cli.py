@@ -81,9 +81,9 @@ def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) 
     ("render here --out a.png --sett smile=1", "--set"),
     ("create a.mp4 --calibrations cameras.json --out here", "--calibration"),
     ("export --webcm here --out a.html", "--webcam"),  # tyro takes the folder for its value
-    ("create a.mp4 --hlep", "--help"),
-    ("train here --training.stps 3", "--steps"),
-    ("create --method headgas --stps 3 --out here a.mp4", "--steps"),
+    ("create a.mp4 --helpp", "--help"),
+    ("train here --training.step 3", "--steps"),
+    ("create --method headgas --step 3 --out here a.mp4", "--steps"),
 ])  # fmt: skip
 def test_an_unknown_option_is_told_with_the_one_that_was_meant(
     arguments: str, near: str, capsys: pytest.CaptureFixture[str]

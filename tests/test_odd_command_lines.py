@@ -39,7 +39,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 ODD = [
     ("rendr W --out a.png", "did you mean render?"),
-    ("--hlp", "did you mean --help?"),
+    ("--helpp", "did you mean --help?"),
     ("render W --out ''", "argument 3 after render is empty"),
     ("render W --out a.png --width 0", "--width 0 --height 512: give numbers from 16 to 8192"),
     ("render W --out a.png --width 8193", "--width 8193 --height 512"),
