@@ -40,6 +40,13 @@ def check_view(camera: Camera, rotation: np.ndarray, translation: np.ndarray) ->
     assert np.array_equal(viewmat[3], [0, 0, 0, 1])
 
 
+def filmed_camera(sequence: Any, camera: int = 0) -> Camera:
+    """Return a camera that is given with the pictures."""
+    calibration = sequence.capture.calibration
+    assert calibration is not None
+    return calibration[camera]
+
+
 def seen_by(sequence: TrackedSequence, timestep: int, camera: int = 0) -> np.ndarray:
     """Return the imported mesh [v, 3] in the axes of the imported camera, in float64."""
     viewmat = sequence.tracking.cameras[camera].viewmat.double().numpy()
@@ -73,7 +80,7 @@ def check_projection(
     """
     K, rotation, translation = view
     found = sequence.tracking.cameras[camera]
-    stored = (sequence.capture.calibration or ())[camera]
+    stored = filmed_camera(sequence, camera)
     assert torch.equal(stored.K, found.K)
     assert torch.equal(stored.viewmat, found.viewmat)
     check_intrinsics(found, K)

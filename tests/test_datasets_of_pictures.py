@@ -18,6 +18,7 @@ from dataset_checks import (
     check_silhouette,
     check_view,
     decoded,
+    filmed_camera,
 )
 from dataset_scene import Scene, draw, head_view, make_scene, projected
 from dataset_writers import (
@@ -84,7 +85,7 @@ def check_pose(
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1, abs=1e-5)
     vertices = scene.vertices(timestep, root=False)
     placed = (vertices * scale) @ matrix[:3, :3].T + matrix[:3, 3]
-    camera = (sequence.capture.calibration or ())[0]
+    camera = filmed_camera(sequence)
     check_intrinsics(camera, UNEQUAL)
     check_view(camera, np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     K, still = camera.K.double().numpy(), (np.eye(3), np.zeros(3))
@@ -211,8 +212,8 @@ def test_benchmark_of_novel_views(scene: Scene, tmp_path: Path) -> None:
     truth = np.load(folder / "truth.npz")
     for camera, serial in enumerate(sequence.capture.camera_ids):
         view = head_view(2 + camera, 1.0)
-        check_intrinsics(sequence.capture.calibration[camera], UNEQUAL)
-        check_view(sequence.capture.calibration[camera], *view)
+        check_intrinsics(filmed_camera(sequence, camera), UNEQUAL)
+        check_view(filmed_camera(sequence, camera), *view)
         place = folder / "sequences/EXP-2-eyes"
         assert np.array_equal(sequence.capture.images[:, camera], decoded(place / f"images/cam_{serial}.mp4"))
         mattes = decoded(place / f"alpha_maps/cam_{serial}.mp4")[..., 0]

@@ -17,6 +17,7 @@ from dataset_checks import (
     check_projection,
     check_silhouette,
     check_view,
+    filmed_camera,
 )
 from dataset_scene import SIDE, Scene, draw, head_view, make_scene
 from dataset_variants import (
@@ -119,7 +120,7 @@ def check_tracked(sequence: TrackedSequence, scene: Scene) -> None:
 def check_retracked(path: Path, scene: Scene) -> None:
     """Check what is tracked again: the tracker's camera, pictures and mattes."""
     sequence = read_pictures(path)
-    camera = (sequence.capture.calibration or ())[0]
+    camera = filmed_camera(sequence)
     check_intrinsics(camera, OFF_CENTRE)
     check_view(camera, MIRROR, np.zeros(3))
     for timestep in range(len(scene)):
@@ -194,7 +195,7 @@ def test_larger_pictures_have_a_larger_camera(scene: Scene, tmp_path: Path, fact
         check_projection(sequence, timestep, vertices, (enlarged(OFF_CENTRE, factor), *head_view(timestep)))
         check_pictures(sequence, timestep, draw_larger(scene, timestep, factor))
     check_silhouette(sequence)
-    check_intrinsics((read_pictures(folder).capture.calibration or ())[0], enlarged(OFF_CENTRE, factor))
+    check_intrinsics(filmed_camera(read_pictures(folder)), enlarged(OFF_CENTRE, factor))
 
 
 def test_the_larger_pictures_beside_images_are_told(scene: Scene, tmp_path: Path) -> None:
@@ -207,7 +208,7 @@ def test_the_larger_pictures_beside_images_are_told(scene: Scene, tmp_path: Path
     for file in sorted((folder / "images.HQ").iterdir()):
         file.replace(folder / "images" / file.name)
     for sequence in (read(folder, scene)[0], read_pictures(folder)):
-        check_intrinsics((sequence.capture.calibration or ())[0], enlarged(OFF_CENTRE, 2))
+        check_intrinsics(filmed_camera(sequence), enlarged(OFF_CENTRE, 2))
 
 
 def test_pictures_of_another_size_are_refused(scene: Scene, tmp_path: Path) -> None:
@@ -312,6 +313,7 @@ def test_vhap_with_teeth(scene: Scene, tmp_path: Path, monkeypatch: pytest.Monke
         read(folder, scene, "vhap")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "last"), [("gaussian-blendshapes", 350), ("flash-avatar", 500), ("masked", 500)])
 def test_the_last_frames_are_held_out(tmp_path: Path, kind: str, last: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A subject of 502 frames has the split of its authors; one as long as the split has none."""
