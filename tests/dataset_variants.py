@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import torch
 
-from dataset_scene import SIDE, Scene, draw, head_view
-from dataset_writers import OFF_CENTRE, npz, write_imavatar, write_insta, write_picture, write_vhap
+import dataset_writers
+from dataset_scene import Scene, draw, head_view
+from dataset_writers import npz, write_imavatar, write_insta, write_picture, write_vhap
 
 
 def write_gaussian_blendshapes(folder: Path, scene: Scene) -> Path:
@@ -43,7 +44,7 @@ def write_masked(folder: Path, scene: Scene, channels: int = 1) -> Path:
     write_gaussian_blendshapes(folder, scene)
     for name, matte in _split_opacity(folder / "images").items():
         write_picture(folder / f"image_mask/mask_{name}", np.repeat(matte[..., None], channels, -1))
-    assert cv2.imwrite(str(folder / "bc.jpg"), np.full((SIDE, SIDE, 3), 255, np.uint8))
+    assert cv2.imwrite(str(folder / "bc.jpg"), np.full((dataset_writers.SIDE, dataset_writers.SIDE, 3), 255, np.uint8))
     return folder
 
 
@@ -54,8 +55,8 @@ def enlarged(K: np.ndarray, factor: int) -> np.ndarray:
 
 def draw_larger(scene: Scene, timestep: int, factor: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture and its matte with `factor` times as many pixels on each side as the tracker saw."""
-    vertices = scene.vertices(timestep, root=False, neck=False)
-    return draw(scene, vertices, enlarged(OFF_CENTRE, factor), *head_view(timestep), (factor * SIDE, factor * SIDE))
+    vertices, side = scene.vertices(timestep, root=False, neck=False), factor * dataset_writers.SIDE
+    return draw(scene, vertices, enlarged(dataset_writers.OFF_CENTRE, factor), *head_view(timestep), (side, side))
 
 
 def write_larger(folder: Path, scene: Scene, factor: int = 2) -> Path:

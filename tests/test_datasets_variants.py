@@ -318,10 +318,9 @@ def test_vhap_with_teeth(scene: Scene, tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_last_frames_are_held_out(tmp_path: Path, kind: str, last: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A subject of 502 frames has the split of its authors; one as long as the split has none."""
     import dataset_scene
-    import dataset_variants
     import dataset_writers
 
-    for module in (dataset_scene, dataset_writers, dataset_variants):
+    for module in (dataset_scene, dataset_writers):
         monkeypatch.setattr(module, "SIDE", 16)
     K = np.array([[20.0, 0, 8.3], [0, 20.0, 7.8], [0, 0, 1]])
     monkeypatch.setattr(dataset_writers, "OFF_CENTRE", K)
