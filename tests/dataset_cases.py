@@ -18,6 +18,7 @@ import dataset_scene
 import dataset_writers
 from capture_helpers import tree_bytes
 from dataset_scene import Scene, scene_of
+from dataset_variants import write_larger, write_masked, write_tracker_output
 from dataset_writers import (
     FRONTAL,
     write_benchmark,
@@ -79,6 +80,9 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     "insta": lambda folder, scene: write_insta(folder, scene, held_out=2),
     "insta, without checkpoints": lambda folder, scene: write_insta(folder, scene, checkpoints=False),
     "flash-avatar": write_flash_avatar,
+    "metrical-tracker": write_tracker_output,
+    "insta, image_mask": write_masked,
+    "insta, images.HQ": write_larger,
     "imavatar": write_imavatar,
     "vhap": lambda folder, scene: write_vhap(folder, scene, size=(SIDE, SIDE + 8)),
     "nerface": write_nerface,
@@ -193,9 +197,8 @@ class Campaign:
         whole = folder / "whole"
         self.use(self.material, "tiny", whole, retrack=False)
         self.check_written(whole)
-        if layout != "flash-avatar":  # its camera is in the tracking
-            self.use(self.material, "tiny", folder / "pictures", retrack=True)
-            self.check_written(folder / "pictures")
+        self.use(self.material, "tiny", folder / "pictures", retrack=True)
+        self.check_written(folder / "pictures")
 
     def run(self, number: int) -> Outcome:
         """Make one fault in a copy of the dataset, and import it."""

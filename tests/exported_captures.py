@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dataset_checks import CAMERA, check_intrinsics, filmed_camera, motion_between
 from dataset_scene import SIDE, Scene, draw, head_view, projected
 from dataset_writers import UNEQUAL
 from mien.camera import Camera
@@ -22,7 +23,7 @@ TRAINED = tuple(t for t in range(TIMESTEPS) if t not in HELD_OUT)
 TOLERANCE = 1e-3
 """Largest error of a projected vertex, in pixels: less than 1e-5 m, as the head is 1 m away and a metre has 150."""
 EXACT = 1e-5
-"""Largest error of what is read back: of vertices seen by their camera, in metres, and of cameras."""
+"""Largest error of vertices seen by their camera, in metres."""
 CAMERAS = ("222200037", "222200036")
 
 
@@ -105,12 +106,11 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def check_frames(sequence: Any, single: Sequence, timesteps: tuple[int, ...], mattes: bool = True) -> None:
-    """Check pictures, mattes and the camera against what was exported."""
+    """Check pictures, mattes and the intrinsics against what was exported."""
     assert np.array_equal(sequence.capture.images[:, 0], single.capture.images[list(timesteps), 0])
     if mattes:
         assert np.array_equal(sequence.capture.mattes[:, 0], single.scoring[list(timesteps), 0])
-    K = sequence.capture.calibration[0].K.numpy()
-    assert np.abs(K - UNEQUAL).max() < EXACT
+    check_intrinsics(filmed_camera(sequence), UNEQUAL)
 
 
 def check_face(
@@ -124,6 +124,9 @@ def check_face(
         found = vertices.double().numpy() @ viewmat[:3, :3].T + viewmat[:3, 3]
         expected = scene.vertices(timestep) @ rotation.T + translation
         assert np.abs(found - expected)[which].max() < EXACT
+        turn, shift = motion_between(scene.vertices(timestep)[which], found[which])
+        assert np.abs(turn - rotation).max() < CAMERA
+        assert np.abs(shift - translation).max() < CAMERA
         pixels = sequence.tracking.cameras[0].project(vertices)[0].numpy()
         assert np.abs(pixels - truth(scene, timestep))[which].max() < TOLERANCE
     coefficients = torch.from_numpy(scene.expr[list(timesteps)]).float()

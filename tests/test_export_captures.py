@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from dataset_checks import CAMERA, check_intrinsics, filmed_camera
 from dataset_scene import SIDE, Scene, make_scene, projected
 from dataset_writers import UNEQUAL, rotation_of
 from exported_captures import (
     CAMERAS,
-    EXACT,
     HELD_OUT,
     TIMESTEPS,
     TOLERANCE,
@@ -133,6 +133,21 @@ def test_imavatar_by_its_own_conventions(single: Sequence, scene: Scene, tmp_pat
         assert np.abs(pixels - truth(scene, timestep)).max() < TOLERANCE
 
 
+def unit_of(folder: Path) -> float:
+    """Return the unit of NeRFace's world in metres, which README.txt names."""
+    line = next(each for each in (folder / "README.txt").read_text().splitlines() if "unit is" in each)
+    return float(line.split("unit is ")[1].split(" m.")[0])
+
+
+def check_pose(matrix: np.ndarray, single: Sequence, timestep: int, folder: Path) -> None:
+    """Check a pose of the head that was read back, in the unit that README.txt names."""
+    face, (rotation, translation) = single.tracking.face[timestep], view(0)
+    turn = rotation @ rotation_of(face.head_rotation[0].double().numpy())
+    shift = rotation @ face.head_translation[0].double().numpy() + translation
+    assert np.abs(matrix[:3, :3] - turn).max() < CAMERA
+    assert np.abs(matrix[:3, 3] * unit_of(folder) - shift).max() < CAMERA
+
+
 @pytest.mark.usefixtures("undetected")
 def test_nerface_is_read_back(single: Sequence, scene: Scene, tmp_path: Path) -> None:
     content = filmed(single, scene)
@@ -142,8 +157,9 @@ def test_nerface_is_read_back(single: Sequence, scene: Scene, tmp_path: Path) ->
         over_white = np.stack([content.over_white(timestep) for timestep in timesteps])
         assert np.array_equal(sequence.capture.images[:, 0], over_white)
         assert (over_white[:, :5] == 255).all(), "no filmed background is left"
-        K = sequence.capture.calibration[0].K.numpy()
-        assert np.abs(K - UNEQUAL).max() < EXACT
+        check_intrinsics(filmed_camera(sequence), UNEQUAL)
+        for row, timestep in enumerate(timesteps):
+            check_pose(sequence.foreign["head_to_camera"][row], single, timestep, folder)
         foreign = sequence.foreign["expression"]
         expressions = single.tracking.face.expression.shape[1]
         assert np.allclose(foreign[:, :expressions], scene.expr[list(timesteps), :expressions], atol=1e-6)
@@ -160,8 +176,7 @@ def test_nerface_by_its_own_conventions(single: Sequence, scene: Scene, tmp_path
     fx, fy, cx, cy = content["intrinsics"]
     assert fx < 0 < fy
     points = np.array([[0.0, 0, 0], [0.05, 0, 0.06], [0, 0.06, 0.05], [-0.04, -0.05, 0.08]])  # in the head frame
-    unit = float(next(line for line in (folder / "README.txt").read_text().splitlines() if "unit is" in line)
-                 .split("unit is ")[1].split(" m.")[0])  # fmt: skip
+    unit = unit_of(folder)
     for frame, timestep in zip(content["frames"], HELD_OUT, strict=True):
         pose = np.array(frame["transform_matrix"])
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)

@@ -1,5 +1,6 @@
 """One suite over face models of all schemas: mesh, regions, joints, landmarks, gradients, tracking, avatar, driving."""
 
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from torch import Tensor
 
 import train_toy
 from face_models import NAMES, face_model_named
+from mien.avatar import load_avatar
 from mien.camera import Camera
 from mien.capture import Capture, read_capture_hash, write_capture
 from mien.cli import main
@@ -20,11 +22,11 @@ from mien.face import FaceModel, FaceParams, add_face_model, load_face_model
 from mien.face.cache import cache_folder
 from mien.face.chart import find_outside
 from mien.face.checks import check_face_model
-from mien.render import render_mesh
+from mien.render import rasterize, render_mesh
 from mien.tracking import Scoring, Tracking, TrackingSettings, track, write_scoring, write_tracking
 from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS, read_response
 from mien.tracking.settings import PhotometricSettings
-from mien.training import read_sequence, train
+from mien.training import read_face_track, read_sequence, train
 
 UPPER_LIP, LOWER_LIP, CHIN, NOSE, CORNER_LEFT, CORNER_RIGHT = 13, 14, 152, 4, 291, 61
 LIDS = {"Left": (386, 374), "Right": (159, 145)}
@@ -185,10 +187,22 @@ def test_a_small_capture_is_tracked(model: FaceModel) -> None:
     assert float((opened[0] - opened[1]).abs().mean()) < 0.003
 
 
+def _score(run: Path, camera: Camera, images: np.ndarray) -> float:
+    """Return the PSNR of a run's avatar over all pictures [t, h, w, 3], whose background is white."""
+    avatar, errors = load_avatar(run), []
+    track = read_face_track(run, avatar.face_model)
+    with torch.no_grad():
+        for timestep, image in enumerate(images):
+            gaussians = avatar.pose(track[timestep]).gaussians.timestep(0)
+            drawn = rasterize(gaussians, camera, torch.ones(3)).image.clamp(0, 1)
+            errors.append(float((drawn - torch.from_numpy(image) / 255).square().mean()))
+    return -10 * math.log10(sum(errors) / len(errors))
+
+
 def test_an_avatar_is_trained_and_driven_by_a_recording(
     model: FaceModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Eight steps improve it, and a recording with ARKit's names drives it, whatever its face model."""
+    """A hundred steps gain 5 to 6 dB, and a recording with ARKit's names drives it, whatever its face model."""
     if model.name != "anny":
         # The map begins at anny, whose baking takes half a minute.
         shutil.copytree(cache_folder() / "face_models", tmp_path / "cache" / "face_models")
@@ -217,8 +231,11 @@ def test_an_avatar_is_trained_and_driven_by_a_recording(
     write_tracking(folder / "tracking", tracking)
     crops = np.tile(np.array([4, 4, 40, 40], np.int64), (4, 1, 1))
     write_scoring(folder / "scoring", Scoring(mattes, crops), read_capture_hash(folder / "capture"))
-    settings = replace(train_toy.SETTINGS, steps=8, split="tail")
+    settings = replace(train_toy.SETTINGS, steps=100, split="tail")
+    train([read_sequence(folder)], model, train_toy.CONFIG, replace(settings, steps=1), tmp_path / "first")
     train([read_sequence(folder)], model, train_toy.CONFIG, settings, tmp_path / "runs" / "toy")
+    before, after = (_score(run, camera, images[:, 0]) for run in (tmp_path / "first", tmp_path / "runs" / "toy"))
+    assert after > before + 3
     recording = tmp_path / "talk.json"
     recording.write_text('[{"time": 0, "blendshapes": {"jawOpen": 0}}, {"time": 0.04, "blendshapes": {"jawOpen": 1}}]')
     out = tmp_path / "talk_%06d.png"
@@ -258,15 +275,38 @@ def test_names_of_arkit_drive_it(model: FaceModel) -> None:
     assert moved["browInnerUp"][CHIN].norm() < 0.0005
 
 
-def test_there_and_back(model: FaceModel, anny: FaceModel) -> None:
-    """A face of anny comes back from the model as the same face, to two millimetres on average."""
-    face = _moving(anny, 6)
-    there, back = fit_expression_map(anny, model), fit_expression_map(model, anny)
+RETURNED = {"anny": 1e-5, "flame": 1.4e-4, "gnm": 7.2e-5, "ict": 1e-5}
+"""Largest mean distance of a landmark in metres, after a face of anny went to a model and back.
+
+It is 1.5 times what was measured; anny and ICT have all of ARKit's names, so that nothing is lost there.
+"""
+RETURNED_TO_FLAME = {"gnm": 8e-5, "ict": 7.1e-4}
+"""The same of a face of the model in FLAME's schema."""
+
+
+def _returned(source: FaceModel, model: FaceModel) -> float:
+    """Return the mean distance of a landmark from its place, after a face of `source` went to a model and back."""
+    face = _moving(source, 6)
+    there, back = fit_expression_map(source, model), fit_expression_map(model, source)
     returned = back(there(face))
     plain = replace(face, identity=torch.zeros_like(face.identity))
-    wanted, found = _marks(anny, plain), _marks(anny, returned)
-    motion = float((wanted - _marks(anny, anny.neutral())).norm(dim=-1).amax())
-    assert motion > 0.008
-    assert float((wanted - found).norm(dim=-1).mean()) < 0.002
+    wanted, found = _marks(source, plain), _marks(source, returned)
+    moved = (wanted - _marks(source, source.neutral())).norm(dim=-1)
+    assert float(moved.amax()) > 0.015
+    assert float(moved.mean()) > 0.0015
     assert torch.equal(returned.head_rotation, face.head_rotation)
     assert torch.equal(returned.head_translation, face.head_translation)
+    return float((wanted - found).norm(dim=-1).mean())
+
+
+def test_there_and_back(model: FaceModel, anny: FaceModel) -> None:
+    """A face of anny, which moves by two millimetres on average, comes back from the model as the same face."""
+    assert _returned(anny, model) < RETURNED[model.name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RETURNED_TO_FLAME)
+def test_a_face_in_flame_s_schema_comes_back(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    data = request.getfixturevalue("test_data") if name == "ict" else None
+    flame, model = (face_model_named(each, tmp_path, data) for each in ("flame", name))
+    assert _returned(flame, model) < RETURNED_TO_FLAME[name]

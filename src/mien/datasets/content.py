@@ -143,6 +143,14 @@ def is_file_inside(root: Path, place: Path) -> bool:
         return False
 
 
+def png_has_opacity(path: Path) -> bool:
+    """Whether a file is a PNG with opacities, by its beginning."""
+    head = sniff(path)
+    if head[:8] != b"\x89PNG\r\n\x1a\n":
+        return False
+    return head[25:26] in (b"\x04", b"\x06") or b"tRNS" in head.partition(b"IDAT")[0]
+
+
 def check_file_inside(root: Path, place: Path) -> None:
     """Check that a file is there.
 
@@ -153,14 +161,17 @@ def check_file_inside(root: Path, place: Path) -> None:
         raise UserError(f"{place}: is missing, or no file; {REMEDY}")
 
 
-def numbered_files(folder: Path, ending: str) -> dict[int, Path]:
-    """Return the files of a folder whose names are whole numbers, by their numbers, in increasing order."""
+def numbered_files(folder: Path, ending: str, beginning: str = "") -> dict[int, Path]:
+    """Return the files of a folder whose names are whole numbers after `beginning`, by these, in increasing order."""
     if not folder.is_dir():
         return {}
     found = {}
     for place in folder.iterdir():
-        if place.suffix.lower() == ending and place.stem.isascii() and place.stem.isdigit() and len(place.stem) < 10:
-            found[int(place.stem)] = place
+        if place.suffix.lower() != ending or not place.stem.startswith(beginning):
+            continue
+        number = place.stem.removeprefix(beginning)
+        if number.isascii() and number.isdigit() and len(number) < 10:
+            found[int(number)] = place
     return dict(sorted(found.items()))
 
 

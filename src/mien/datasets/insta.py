@@ -1,7 +1,10 @@
 """INSTA's data set and the folders of programs that lay its data out in other ways.
 
-- INSTA: transforms.json, images (RGBA), and in some copies checkpoint; metrical-tracker's output: input, checkpoint.
+- INSTA: transforms.json, images (RGBA), and in some copies checkpoint.
 - GaussianBlendshapes, RGBAvatar: images (RGBA), checkpoint. Pictures and checkpoints are paired by their numbers.
+- images.HQ in place of images: the pictures are larger than those that were tracked, by a whole factor.
+- GaussianBlendshapes' copies of NeRFBlendShape: images (RGB), image_mask/mask_NUMBER.png, checkpoint.
+- metrical-tracker's output: input (RGB, without mattes), checkpoint. mien makes the mattes.
 - FlashAvatar: imgs, alpha, and metrical-tracker/output/NAME/checkpoint, whose numbers are smaller by one.
 
 Without checkpoints, only pictures and the camera are read: the release lacks jaw, eyes and identity.
@@ -13,11 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mien.datasets.content import (
+    REMEDY,
     check_file_inside,
     frames_of,
     inner,
     numbered_files,
     numbers,
+    png_has_opacity,
     read_object,
     rotation_part,
     sniff,
@@ -32,11 +37,13 @@ if TYPE_CHECKING:
     from mien.face import FaceModel
 
 _FPS = 25.0
-_TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500}
+_TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
 """Number of frames at the end that the authors hold out."""
 _TEST = "transforms_test.json"
-_FOLDERS = ("images", "input", "matted")
+_LARGER = "images.HQ"
+_FOLDERS = ("images", _LARGER, "matted", "input")
 """Folders with pictures, of which the first one is used."""
+_MASKS = "image_mask"
 
 
 @dataclass(frozen=True)
@@ -61,6 +68,11 @@ class _Layout:
     """The source of the split, in words."""
     unpaired: int
     """Number of pictures without a checkpoint, which are left out."""
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether there are neither mattes nor opacities, so that mien makes the mattes."""
+        return self.kind == "INSTA" and not png_has_opacity(self.frames[0].picture)
 
 
 def _recognises(path: Path) -> str | None:
@@ -102,7 +114,8 @@ def _layout(path: Path) -> _Layout:
         }
         return _with_test(path / _TEST, _paired("INSTA", path, path, pictures, {}, saved))
     folder = next((path / name for name in _FOLDERS if (path / name).is_dir()), path / _FOLDERS[0])
-    return _paired("INSTA", path, path, numbered_files(folder, ".png"), {}, saved)
+    pictures, masks = numbered_files(folder, ".png"), numbered_files(path / _MASKS, ".png", "mask_")
+    return _paired("NeRFBlendShape" if masks else "INSTA", path, path, pictures, masks, saved)
 
 
 def _with_test(file: Path, layout: _Layout) -> _Layout:
@@ -136,6 +149,10 @@ def _survey(path: Path) -> Findings:
     missing = [] if tracked else ["checkpoint (*.frame), so jaw, eyes and identity are not known: use `mien track`"]
     if tracked:
         missing += ["the lids of the tracker, which FLAME has no place for"]
+    if layout.is_bare:
+        missing.append("mattes: they are made by mien")
+    if (path / _LARGER).is_dir() and layout.frames[0].picture.parent.name != _LARGER:
+        missing.append(f"the larger pictures of {_LARGER}, which are not used beside {_FOLDERS[0]}")
     if layout.unpaired:
         missing.append(f"checkpoints of {counted(layout.unpaired, 'picture')}, which are left out")
     split = layout.split if layout.test else None
@@ -145,24 +162,63 @@ def _survey(path: Path) -> Findings:
     return Findings(clips, "FLAME 2020" if tracked else None, split, tuple(missing))
 
 
-def _pictures(layout: _Layout) -> "tuple[np.ndarray, np.ndarray]":
+def scaled_to_pictures(
+    path: Path, K: "np.ndarray", tracked: tuple[int, int] | None, size: tuple[int, int]
+) -> "np.ndarray":
+    """Return intrinsics for pictures that are larger than those that were tracked, by a whole factor.
+
+    Args:
+        path: The dataset, for messages.
+        K: Intrinsics for the pictures that were tracked.
+        tracked: Width and height of these pictures. None stands for `size`.
+        size: Width and height of the pictures.
+
+    Raises:
+        UserError: the factor is no whole number, or not that of the other side.
+    """
     import numpy as np
 
-    from mien.datasets.pictures import collect, read_matte, read_picture
+    width, height = size if tracked is None else tracked
+    factor = max(size[0] // max(width, 1), 1)
+    if (width * factor, height * factor) != size:
+        raise UserError(
+            f"{path}: its pictures have {size[0]}x{size[1]} pixels, which is no whole multiple of the {width}x{height} "
+            "that were tracked; copy the pictures that belong to the tracking"
+        )
+    return np.diag([factor, factor, 1.0]) @ K
+
+
+def _size(layout: _Layout) -> tuple[int, int]:
+    """Width and height of the pictures."""
+    from mien.datasets.pictures import read_picture
 
     first = read_picture(layout.frames[0].picture)[0]
-    size = first.shape[1], first.shape[0]
+    return first.shape[1], first.shape[0]
+
+
+def _pictures(layout: _Layout, size: tuple[int, int]) -> "tuple[np.ndarray, np.ndarray]":
+    import numpy as np
+
+    from mien.datasets.matting import fill_mattes
+    from mien.datasets.pictures import collect, read_matte, read_picture
+
+    bare = layout.is_bare
 
     def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
         frame = layout.frames[timestep]
         colors, matte = read_picture(frame.picture, size)
         if frame.matte is not None:
             matte = read_matte(frame.matte, size)
+        if bare:
+            matte = np.zeros((size[1], size[0]), np.uint8)
         if matte is None:
             raise UserError(f"{frame.picture}: has no opacity and no matte; copy the folder with the mattes as well")
         return colors, matte
 
-    return collect(len(layout.frames), 1, size, read, f"read {layout.name}")
+    images, mattes = collect(len(layout.frames), 1, size, read, f"read {layout.name}")
+    if bare:
+        fill_mattes(images, mattes)
+    return images, mattes
 
 
 def _with_split(sequence: ReadSequence, layout: _Layout) -> ReadSequence:
@@ -179,7 +235,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     from mien.progress import say
 
     layout = _layout(path)
-    checkpoints = [frame.checkpoint for frame in layout.frames if frame.checkpoint is not None]
+    checkpoints = _checkpoints(layout)
     if not checkpoints:
         yield from _read_pictures(path)
         return
@@ -187,32 +243,52 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     found = read_tracker_frames(checkpoints, model)
     if found.blinks:
         say(f"{layout.name}: lids are closed in {found.blinks:.0%} of the frames, which FLAME's parameters do not show")
-    images, mattes = _pictures(layout)
-    camera = camera_of(found.K, FRONT, (images.shape[3], images.shape[2]))
+    size = _size(layout)
+    camera = camera_of(scaled_to_pictures(path, found.camera.K, found.camera.size, size), FRONT, size)
+    images, mattes = _pictures(layout, size)
     sequence = tracked_sequence(path, layout.name, images, mattes, {"0": camera}, model, found.face, _FPS)
     yield _with_split(check_overlay(path, sequence, VERSION), layout)
 
 
-def _read_pictures(path: Path) -> Iterator[ReadSequence]:
-    """Pictures with the camera of transforms.json, or else without checkpoints with that of the first one."""
-    import numpy as np
+def _checkpoints(layout: _Layout) -> list[Path]:
+    return [frame.checkpoint for frame in layout.frames if frame.checkpoint is not None]
 
-    from mien.datasets.flame_poses import FRONT, camera_of, pinhole
+
+def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+    """Pictures with the camera of transforms.json, or without that file with the camera of the checkpoints."""
+    from mien.datasets.flame_poses import FRONT, camera_of
+    from mien.datasets.metrical_tracker import read_tracker_camera
     from mien.datasets.sequences import filmed_sequence
 
     layout, file = _layout(path), path / "transforms.json"
-    if not file.exists():
-        raise UserError(f"{file}: is missing, so the camera is not known; import the tracking with --face-model")
+    size, poses = _size(layout), {}
+    if file.exists():
+        K, tracked, poses = _transforms(file)
+    elif _checkpoints(layout):
+        found = read_tracker_camera(_checkpoints(layout))
+        K, tracked = found.K, found.size
+    else:
+        raise UserError(f"{file}: is missing, and there are no checkpoints, so the camera is not known; {REMEDY}")
+    camera = camera_of(scaled_to_pictures(path, K, tracked, size), FRONT, size)
+    images, mattes = _pictures(layout, size)
+    sequence = filmed_sequence(path, layout.name, images, mattes, {"0": camera}, _FPS)
+    yield _with_split(replace(sequence, foreign=poses), layout)
+
+
+def _transforms(file: Path) -> "tuple[np.ndarray, tuple[int, int] | None, dict[str, np.ndarray]]":
+    """Intrinsics, width and height that they are for, and poses of transforms.json."""
+    import numpy as np
+
+    from mien.datasets.flame_poses import pinhole
+
     content = read_object(file)
     K = pinhole(*(float(numbers(file, content, name, ())) for name in ("fl_x", "fl_y", "cx", "cy")))
+    width, height = (int(numbers(file, content, name, ())) if name in content else 0 for name in ("w", "h"))
     foreign = [numbers(file, frame, "transform_matrix", (4, 4)) for frame in frames_of(file, content)]
     for matrix in foreign:
         rotation_part(file, "transform_matrix", matrix)
-    images, mattes = _pictures(layout)
-    camera = camera_of(K, FRONT, (images.shape[3], images.shape[2]))
-    sequence = filmed_sequence(path, layout.name, images, mattes, {"0": camera}, _FPS)
     poses = {"camera_to_head": np.stack(foreign).astype(np.float32)}
-    yield _with_split(replace(sequence, foreign=poses), layout)
+    return K, (width, height) if width > 0 and height > 0 else None, poses
 
 
 INSTA = Dataset(

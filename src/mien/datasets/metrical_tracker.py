@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mien.bounded import open_archive, open_member, open_ordinary
+from mien.bounded import MAX_SIDE, open_archive, open_member, open_ordinary
 from mien.datasets.content import REMEDY, rotation_part
 from mien.datasets.flame_poses import axis_angles, face_of_flame, in_front, matrices_from_rows_6d
 from mien.errors import UserError
@@ -29,10 +29,21 @@ _SHAPES = {
     "opencv.t": (1, 3), "opencv.K": (1, 3, 3),
 }  # fmt: skip
 _EYELIDS = "flame.eyelids"
+_SIZE = "img_size"
 _CLOSED = 0.3
 """Number of an eyelid above which a blink counts."""
 _MAX_CHANGE = 0.005
 """Largest relative change of a focal length in a sequence. The tracker keeps it constant."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerCamera:
+    """The one camera of a sequence."""
+
+    K: Float[np.ndarray, "3 3"]
+    """The median intrinsics, in pixels."""
+    size: tuple[int, int] | None
+    """Width and height of the pictures that were tracked. None if the checkpoints do not tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,33 +52,29 @@ class TrackerFrames:
 
     face: FaceParams
     """The faces, seen by a camera with the matrix `flame_poses.FRONT`."""
-    K: Float[np.ndarray, "3 3"]
-    """The median intrinsics, in pixels."""
+    camera: TrackerCamera
+    """The camera."""
     blinks: float
     """Share of frames in which a lid is closed, which the face does not show."""
+
+
+def read_tracker_camera(paths: Sequence[Path]) -> TrackerCamera:
+    """Read the camera of a sequence's checkpoints.
+
+    Raises:
+        UserError: as for `read_tracker_frames`.
+    """
+    return _camera(paths[0].parent, _read_arrays(paths))
 
 
 def read_tracker_frames(paths: Sequence[Path], face_model: FaceModel) -> TrackerFrames:
     """Read the checkpoints of a sequence, in order.
 
     Raises:
-        UserError: one is damaged or has impossible numbers, or the focal length changes.
+        UserError: one is damaged or has impossible numbers, or the focal length or the size of the pictures changes.
     """
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in (*_SHAPES, _EYELIDS)}
-    with progress_bar("read checkpoints", len(paths)) as advance:
-        for path in paths:
-            for name, array in _read_frame(path).items():
-                rows[name].append(array)
-            advance()
-    arrays = {name: np.stack(each) for name, each in rows.items() if each}
-    place = paths[0].parent
-    K = np.median(arrays["opencv.K"][:, 0], axis=0)
-    focal = arrays["opencv.K"][:, 0, 0, 0]
-    if not np.abs(focal - K[0, 0]).max() <= _MAX_CHANGE * abs(K[0, 0]):
-        raise UserError(
-            f"{place}: the focal length changes from {focal.min():.1f} to {focal.max():.1f} pixels, and a sequence has "
-            "one camera; track the pictures again (--retrack)"
-        )
+    place, arrays = paths[0].parent, _read_arrays(paths)
+    camera = _camera(place, arrays)
     eyes = matrices_from_rows_6d(arrays["flame.eyes"][:, 0].reshape(-1, 2, 6))
     face = face_of_flame(
         place,
@@ -83,7 +90,34 @@ def read_tracker_frames(paths: Sequence[Path], face_model: FaceModel) -> Tracker
     viewmats[:, :3, :3], viewmats[:, :3, 3] = arrays["opencv.R"][:, 0], arrays["opencv.t"][:, 0]
     lids = arrays.get(_EYELIDS)
     blinks = 0.0 if lids is None or len(lids) < len(paths) else float((lids > _CLOSED).any((1, 2)).mean())
-    return TrackerFrames(in_front(face, viewmats), K, blinks)
+    return TrackerFrames(in_front(face, viewmats), camera, blinks)
+
+
+def _read_arrays(paths: Sequence[Path]) -> dict[str, np.ndarray]:
+    """The arrays of all checkpoints, in order. Those that a checkpoint may lack can have fewer rows."""
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in (*_SHAPES, _EYELIDS, _SIZE)}
+    with progress_bar("read checkpoints", len(paths)) as advance:
+        for path in paths:
+            for name, array in _read_frame(path).items():
+                rows[name].append(array)
+            advance()
+    return {name: np.stack(each) for name, each in rows.items() if each}
+
+
+def _camera(place: Path, arrays: dict[str, np.ndarray]) -> TrackerCamera:
+    K = np.median(arrays["opencv.K"][:, 0], axis=0)
+    focal = arrays["opencv.K"][:, 0, 0, 0]
+    if not np.abs(focal - K[0, 0]).max() <= _MAX_CHANGE * abs(K[0, 0]):
+        raise UserError(
+            f"{place}: the focal length changes from {focal.min():.1f} to {focal.max():.1f} pixels, and a sequence has "
+            "one camera; track the pictures again (--retrack)"
+        )
+    sizes = arrays.get(_SIZE)
+    if sizes is None:
+        return TrackerCamera(K, None)
+    if (sizes != sizes[0]).any():
+        raise UserError(f"{place}: {_SIZE!r} is not the same in all checkpoints; {REMEDY}")
+    return TrackerCamera(K, (int(sizes[0, 1]), int(sizes[0, 0])))
 
 
 def _read_frame(path: Path) -> dict[str, np.ndarray]:
@@ -122,4 +156,9 @@ def _read_frame(path: Path) -> dict[str, np.ndarray]:
     lids = found.get(_EYELIDS)
     if isinstance(lids, np.ndarray) and lids.shape == (1, 2) and np.isfinite(lids).all():
         arrays[_EYELIDS] = lids.astype(np.float64)
+    size = found.get(_SIZE)
+    if isinstance(size, np.ndarray):
+        if size.shape != (2,) or not ((size >= 1) & (size <= MAX_SIDE)).all():
+            raise UserError(f"{path}: {_SIZE!r} is not the height and width of a picture; {REMEDY}")
+        arrays[_SIZE] = size
     return arrays

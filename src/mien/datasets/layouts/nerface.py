@@ -46,7 +46,7 @@ def write(folder: Path, filmed: Filmed) -> Written:
     names = {(timestep, 0): f"f_{number:04d}" for number, timestep in enumerate(filmed.held_out)}
     told = (
         "Pictures are over white by their mattes, and bg is white, so nothing of the filmed background is left.",
-        f"The world has the head at rest; its unit is {1 / scale:.6g} m. train and test are in the order of time.",
+        f"The world has the head at rest; its unit is {1 / scale:.9g} m. train and test are in the order of time.",
         f"val holds {len(spread)} training pictures once more, so that nothing held out is looked at.",
         *told,
     )

@@ -1,0 +1,143 @@
+"""Checks of imported datasets: cameras, vertices and silhouettes against the writer's own, and independent decoders."""
+
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import torch
+from av.video.reformatter import Interpolation
+
+from dataset_scene import projected
+from mien.camera import Camera
+from mien.datasets import TrackedSequence
+from mien.render import rasterize_mesh
+
+PIXELS = 1e-3
+"""Largest error of a projected vertex, in pixels."""
+METRES = 1e-5
+"""Largest error of a vertex seen by its camera, in metres."""
+CAMERA = 1e-6
+"""Largest error of a camera: of rotations, of places in metres, and of intrinsics as a part of each.
+
+Captures hold float32, whose neighbours at 150 pixels are 1.5e-5 apart, so no absolute bound of 1e-6 can hold there.
+"""
+_SURE = 99
+"""Per cent of an outline that have to be exact. A vertex between two pixels may fall to either on other processors."""
+
+
+def check_intrinsics(camera: Camera, K: np.ndarray) -> None:
+    """Check intrinsics in pixels. Entries that are 0 have to be 0."""
+    np.testing.assert_allclose(camera.K.double().numpy(), K, rtol=CAMERA, atol=0)
+
+
+def check_view(camera: Camera, rotation: np.ndarray, translation: np.ndarray) -> None:
+    """Check where a camera stands in the world."""
+    viewmat = camera.viewmat.double().numpy()
+    assert np.abs(viewmat[:3, :3] - rotation).max() < CAMERA
+    assert np.abs(viewmat[:3, 3] - translation).max() < CAMERA
+    assert np.array_equal(viewmat[3], [0, 0, 0, 1])
+
+
+def filmed_camera(sequence: Any, camera: int = 0) -> Camera:
+    """Return a camera that is given with the pictures."""
+    calibration = sequence.capture.calibration
+    assert calibration is not None
+    return calibration[camera]
+
+
+def seen_by(sequence: TrackedSequence, timestep: int, camera: int = 0) -> np.ndarray:
+    """Return the imported mesh [v, 3] in the axes of the imported camera, in float64."""
+    viewmat = sequence.tracking.cameras[camera].viewmat.double().numpy()
+    mesh = sequence.face_model(sequence.tracking.face[timestep])[0].double().numpy()
+    return mesh @ viewmat[:3, :3].T + viewmat[:3, 3]
+
+
+def motion_between(points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotation and translation that carry points onto others best (Kabsch 1976)."""
+    middle, middle_moved = points.mean(0), moved.mean(0)
+    u, _, vt = np.linalg.svd((points - middle).T @ (moved - middle_moved))
+    rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
+    return rotation, middle_moved - rotation @ middle
+
+
+def check_projection(
+    sequence: TrackedSequence, timestep: int, vertices: np.ndarray, view: tuple[np.ndarray, np.ndarray, np.ndarray],
+    camera: int = 0, scale: float = 1.0,
+) -> None:  # fmt: skip
+    """Check the imported face and camera against the writer's vertices and camera.
+
+    Where a moving camera became a moving head, what is compared is the motion from the writer's world to the camera.
+
+    Args:
+        sequence: The import.
+        timestep: Its timestep.
+        vertices: The writer's vertices in the writer's world.
+        view: The writer's intrinsics, rotation and translation.
+        camera: Index of the camera.
+        scale: Size of the writer's world in metres' units.
+    """
+    K, rotation, translation = view
+    found = sequence.tracking.cameras[camera]
+    stored = filmed_camera(sequence, camera)
+    assert torch.equal(stored.K, found.K)
+    assert torch.equal(stored.viewmat, found.viewmat)
+    check_intrinsics(found, K)
+    seen = seen_by(sequence, timestep, camera) * scale
+    assert np.abs(seen - (vertices @ rotation.T + translation)).max() < METRES
+    found_rotation, found_translation = motion_between(vertices, seen)
+    assert np.abs(found_rotation - rotation).max() < CAMERA
+    assert np.abs(found_translation - translation).max() < CAMERA
+    pixels = found.project(sequence.face_model(sequence.tracking.face[timestep])[0])[0].double().numpy()
+    assert np.abs(pixels - projected(vertices, K, rotation, translation)).max() < PIXELS
+
+
+def edges_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the distance in pixels from each pixel of the outline of one silhouette to that of the other, both ways.
+
+    Args:
+        one: A silhouette [h, w] of booleans.
+        other: Another one.
+    """
+    lines = [_outline(each) for each in (one, other)]
+    assert all(line.any() for line in lines)
+    far = [cv2.distanceTransform((~line).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for line in lines]
+    return np.concatenate([far[1][lines[0]], far[0][lines[1]]])
+
+
+def _outline(silhouette: np.ndarray) -> np.ndarray:
+    """The pixels of a silhouette that touch its outside."""
+    solid = silhouette.astype(np.uint8)
+    return (solid > 0) & (cv2.erode(solid, np.ones((3, 3), np.uint8)) == 0)
+
+
+def check_edges(one: np.ndarray, other: np.ndarray) -> None:
+    """Check that two outlines are less than a pixel apart."""
+    apart = edges_apart(one, other)
+    assert np.percentile(apart, _SURE) < 1
+    assert apart.max() < 2
+
+
+def check_silhouette(sequence: TrackedSequence) -> None:
+    """Check the drawn mesh against the imported mattes: the pictures themselves, which no writer's formula explains."""
+    for camera, view in enumerate(sequence.tracking.cameras):
+        for timestep in range(sequence.capture.timesteps):
+            mesh = sequence.face_model(sequence.tracking.face[timestep])[0]
+            drawn = (rasterize_mesh(mesh, sequence.face_model.faces, view).face_index >= 0).numpy()
+            check_edges(drawn, np.asarray(sequence.capture.mattes[timestep, camera]) > 127)
+
+
+def check_pictures(sequence: Any, timestep: int, drawn: tuple[np.ndarray, np.ndarray], camera: int = 0) -> None:
+    """Check that a picture and its matte are the drawn ones, exactly."""
+    image, matte = drawn
+    assert np.array_equal(sequence.capture.images[timestep, camera], image)
+    assert np.array_equal(sequence.capture.mattes[timestep, camera], matte)
+
+
+def decoded(video: Path) -> np.ndarray:
+    """Return the RGB pictures [t, h, w, 3] of a video, read by PyAV alone."""
+    exact = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
+    with av.open(str(video)) as container:
+        frames = [frame.reformat(format="rgb24", interpolation=exact) for frame in container.decode(video=0)]
+        return np.stack([frame.to_ndarray() for frame in frames])
