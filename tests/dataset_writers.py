@@ -4,7 +4,7 @@ import io
 import json
 import pickle
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -316,14 +316,21 @@ def _nothing(path: Path, serial: str = "") -> None:
 
 
 def write_nersemble(
-    folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL), film: Callable[[Path, str], None] = _nothing
-) -> Path:
-    """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera, instead of empty files."""
+    folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL), film: Callable[[Path, str], None] = _nothing,
+    colors: Mapping[str, np.ndarray] | None = None,
+) -> Path:  # fmt: skip
+    """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera, instead of empty files.
+
+    `colors` has the correction [3, n] of each camera's colours.
+    """
     poses = {serial: np.eye(4).tolist() for serial in serials}
     (folder / "calibration").mkdir(parents=True)
     K = [[8000.0, 0, 1100], [0, 8000, 1604], [0, 0, 1]]
     content = {"world_2_cam": poses, "intrinsics": K}
     (folder / "calibration/camera_params.json").write_text(json.dumps(content))
+    if colors is not None:
+        content = {serial: matrix.tolist() for serial, matrix in colors.items()}
+        (folder / "calibration/color_calibration.json").write_text(json.dumps(content))
     for serial in serials:
         for name in (f"EMO-1-shout+laugh/images/cam_{serial}.mp4", f"BACKGROUND/image_{serial}.jpg"):
             place = folder / "sequences" / name

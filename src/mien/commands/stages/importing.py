@@ -3,6 +3,7 @@
 import math
 import shlex
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -32,7 +33,7 @@ _MARGIN = 1.15
 
 def run_import_stage(
     dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None, retrack: bool = False,
-    resume: bool = False,
+    resume: bool = False, corrects_colors: bool = True,
 ) -> None:  # fmt: skip
     """Read a dataset, and write its avatar as a run, or its sequences.
 
@@ -44,6 +45,7 @@ def run_import_stage(
         face_model: Name or file of the face model that the files belong to, if the user gives one.
         retrack: Whether to leave out the tracking of the authors, and to track the pictures with mien.
         resume: Whether sequences that are there already stay as they are. If not, they are an error.
+        corrects_colors: Whether the colours of videos are corrected, if the dataset has such a correction.
 
     Raises:
         UserError: the files or the face model cannot be read, or the run or a sequence is there already or cannot be
@@ -61,11 +63,17 @@ def run_import_stage(
     if isinstance(content, TrainedAvatar):
         _write_run(content, run_dir, path)
     else:
+        if not corrects_colors:
+            content = map(_as_filmed, content)
         untracked = _write_sequences(content, workspace, dataset, path, resume)
         if retrack:
             run_tracking_stage(workspace, "anny", TrackingSettings())
         elif untracked:
             say(f"{', '.join(untracked)}: without a tracking; run `mien track {shlex.quote(str(workspace.root))}`")
+
+
+def _as_filmed(sequence: ReadSequence) -> ReadSequence:
+    return replace(sequence, color_corrections=None) if isinstance(sequence, Footage) else sequence
 
 
 def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
