@@ -4,7 +4,9 @@ import contextlib
 import difflib
 import io
 import re
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import is_dataclass
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 _USELESS = ("For full helptext", "Argument helptext")
 _REWORDED = (
@@ -32,7 +34,7 @@ def complaint_of(box: str, options: type, style: Any) -> str:
         options: The options that it was given.
         style: Its configuration.
     """
-    return _with_near_options(_in_one_line(box), options, style)
+    return _with_near_options(_with_choices_in_order(_in_one_line(box), options), options, style)
 
 
 def _in_one_line(box: str) -> str:
@@ -52,6 +54,39 @@ def _in_one_line(box: str) -> str:
             comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
             parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
     return "; ".join(_reworded(part.rstrip(".")) for part in parts if part and not part.startswith(_USELESS))
+
+
+def _with_choices_in_order(complaint: str, options: type) -> str:
+    """A complaint of a wrong choice, with the choices as they are declared.
+
+    tyro keeps the choices of an option that may be left out in a set, together with None, which nobody can type.
+    """
+
+    def ordered(listed: re.Match[str]) -> str:
+        found = [choice for choice in re.findall(r"'([^']*)'", listed[1]) if choice != "None"]
+        declared = next((each for each in _choices(options, set()) if sorted(each) == sorted(found)), found)
+        return f"give one of {', '.join(map(repr, declared))} instead of"
+
+    complaint = re.sub(
+        r"give \{([\w,. -]+)\} instead of",
+        lambda listed: f"give one of {', '.join(map(repr, re.findall(r'[^, ]+', listed[1])))} instead of",
+        complaint,
+    )
+    return re.sub(r"give one of ('.*') instead of", ordered, complaint)
+
+
+def _choices(hint: Any, seen: set[Any]) -> Iterator[list[str]]:
+    """Yield the choices of each option of a type, in the order of their declaration."""
+    if get_origin(hint) is Literal:
+        yield [str(choice) for choice in get_args(hint)]
+    elif isinstance(hint, type) and is_dataclass(hint):
+        if hint not in seen:
+            seen.add(hint)
+            for one in get_type_hints(hint).values():
+                yield from _choices(one, seen)
+    else:
+        for one in get_args(hint):
+            yield from _choices(one, seen)
 
 
 def _with_near_options(complaint: str, options: type, style: Any) -> str:
