@@ -15,6 +15,7 @@ from mien.commands.stages.import_footage import write_footage
 from mien.commands.stages.names import check_new_run, check_new_sequence
 from mien.commands.stages.tracking import run_tracking_stage
 from mien.datasets import Dataset, Footage, ReadSequence, TrackedSequence, TrainedAvatar, write_sequence
+from mien.datasets.writing import OVERLAY
 from mien.inside import remove_tree
 from mien.locks import check_free, hold
 from mien.progress import say
@@ -93,7 +94,7 @@ def _write_sequences(
     sequences: Iterable[ReadSequence], workspace: Workspace, dataset: Dataset, source: Path, resume: bool
 ) -> list[str]:
     """Write the sequences, and return the names of those without a tracking."""
-    untracked = []
+    untracked, overlays = [], []
     for sequence in sequences:
         if isinstance(sequence, Footage):
             folder = workspace.sequence_dir(sequence.name)
@@ -113,8 +114,13 @@ def _write_sequences(
         cameras = counted(len(capture.camera_ids), "camera")
         tracked = f", tracked on {sequence.face_model.name}" if isinstance(sequence, TrackedSequence) else ""
         say(f"{folder}: {counted(capture.timesteps, 'timestep')}, {cameras}{tracked}")
-        if not tracked:
+        if tracked:
+            overlays.append(folder / OVERLAY)
+        else:
             untracked.append(capture.name)
+    if overlays:
+        more = f", and {len(overlays) - 1} more" * (len(overlays) > 1)
+        say(f"the imported mesh over some pictures: {overlays[0]}{more}; look at it before you train")
     return untracked
 
 
