@@ -188,8 +188,18 @@ def write_vhap(
     return folder
 
 
-def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
+def nerface_landmarks(scene: Scene, images: np.ndarray) -> np.ndarray:
+    """Return the landmarks of the pictures of a clip of `write_nerface` with `detected`, in place of a detector's."""
+    timesteps = range(4) if len(images) == 4 else [5]
+    marks = [projected(scene.marks(scene.vertices(timestep, root=False, neck=False)), UNEQUAL, *head_view(timestep))
+             for timestep in timesteps]  # fmt: skip
+    return np.stack(marks)[:, None].astype(np.float32)
+
+
+def write_nerface(folder: Path, scene: Scene, scale: float = 0.6, detected: bool = False) -> Path:
     """Write a person of NeRFace: training pictures in a shuffled order, a mirrored world, fx below 0.
+
+    The neck is at rest if landmarks are those of the drawn head (`detected`), as that of a rigid pose.
 
     A ray of the file through the whole pixel (u, v) has the direction R ((u - cx) / fx, -(v - cy) / fy, -1).
     """
@@ -203,7 +213,7 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
         frames = []
         for number, timestep in enumerate(timesteps):
             rotation, translation = head_view(timestep)
-            vertices = scene.vertices(timestep, root=False)
+            vertices = scene.vertices(timestep, root=False, neck=not detected)
             write_picture(
                 folder / f"{part}/f_{number:04d}.png", draw(scene, vertices, UNEQUAL, rotation, translation)[0]
             )
