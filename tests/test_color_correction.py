@@ -112,7 +112,8 @@ def test_the_option_leaves_colors_as_filmed(
     corrections = {serial: color_charts.correction(index) for index, serial in enumerate(SERIALS)}
     person = write_nersemble(tmp_path / "017", SERIALS, colors=corrections)
     assert main(["import", str(person), "--out", str(tmp_path / "a")]) == 0
-    assert "  colour correction: by calibration/color_calibration.json; --no-color-correc" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "  colour correction: by calibration/color_calibration.json; --no-color-correction leaves it out" in told
     (found,) = asked
     assert {serial: each.matrix.tolist() for serial, each in found.items()} == {
         serial: matrix.tolist() for serial, matrix in corrections.items()
@@ -123,13 +124,13 @@ def test_the_option_leaves_colors_as_filmed(
     assert asked[1] == dict.fromkeys(SERIALS)
     # A file that cannot be used is in the way of those alone who want it.
     file = person / "calibration/color_calibration.json"
-    for content, told in (
+    for content, reason in (
         ({FRONTAL: corrections[FRONTAL].tolist()}, "has no correction of the camera 222200036; copy the files"),
         ({serial: np.zeros((3, 6)).tolist() for serial in SERIALS}, "'222200036': has 6 terms for each channel"),
     ):
         file.write_text(json.dumps(content))
         assert main(["import", str(person), "--out", str(tmp_path / "c")]) == 2
-        assert f"mien: {file}: {told}" in capsys.readouterr().err
+        assert f"mien: {file}: {reason}" in capsys.readouterr().err
         assert not list(tmp_path.glob("c/sequences/*/*"))
     assert main([*without, "--out", str(tmp_path / "c")]) == 0
 
