@@ -63,6 +63,9 @@ _LARGEST = 1e3
 COEFFICIENTS = "nerf-blendshape, on its coefficients"
 
 
+_COLORS = {serial: np.eye(3, 11) for serial in ("222200036", FRONTAL)}
+
+
 def _film(path: Path, _: str = "") -> None:
     """Write three small pictures as a video."""
     write_video(path, iter(np.full((3, SIDE, SIDE, 3), 90, np.uint8)), 25.0)
@@ -90,7 +93,7 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     COEFFICIENTS: lambda folder, scene: write_nerf_blendshape(folder, scene, 7.0, True),
     "nersemble-benchmark": lambda folder, scene: write_benchmark(folder, scene, (FRONTAL,)),
     "nersemble-benchmark, novel views": lambda folder, scene: write_benchmark(folder, scene, ("7", FRONTAL), False),
-    "nersemble": lambda folder, scene: write_nersemble(folder, film=_film),
+    "nersemble": lambda folder, scene: write_nersemble(folder, film=_film, colors=_COLORS),
     "live-link-face": lambda folder, scene: write_take(folder, film=_film),
     "gaussian-avatars": _write_avatar,
 }

@@ -63,9 +63,9 @@ def make_scene(anny: FaceModel, folder: Path, timesteps: int = 6) -> Scene:
     return scene_of(arrays, replace(model, landmarks=exact_landmarks(anny)), timesteps)
 
 
-def scene_of(arrays: dict[str, np.ndarray], model: FaceModel, timesteps: int) -> Scene:
-    """Return random poses of a face model, whose arrays are in FLAME's schema."""
-    random = np.random.default_rng(3)
+def scene_of(arrays: dict[str, np.ndarray], model: FaceModel, timesteps: int, seed: int = 3) -> Scene:
+    """Return random poses of a random person of a face model, whose arrays are in FLAME's schema."""
+    random = np.random.default_rng(seed)
     shape, expr = np.zeros(300), np.zeros((timesteps, 100))
     identities = int(arrays["identities"])
     expressions = arrays["shapedirs"].shape[2] - identities

@@ -4,7 +4,7 @@ import io
 import json
 import pickle
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -188,8 +188,18 @@ def write_vhap(
     return folder
 
 
-def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
+def nerface_landmarks(scene: Scene, images: np.ndarray) -> np.ndarray:
+    """Return the landmarks of the pictures of a clip of `write_nerface` with `detected`, in place of a detector's."""
+    timesteps = range(4) if len(images) == 4 else [5]
+    marks = [projected(scene.marks(scene.vertices(timestep, root=False, neck=False)), UNEQUAL, *head_view(timestep))
+             for timestep in timesteps]  # fmt: skip
+    return np.stack(marks)[:, None].astype(np.float32)
+
+
+def write_nerface(folder: Path, scene: Scene, scale: float = 0.6, detected: bool = False) -> Path:
     """Write a person of NeRFace: training pictures in a shuffled order, a mirrored world, fx below 0.
+
+    The neck is at rest if landmarks are those of the drawn head (`detected`), as that of a rigid pose.
 
     A ray of the file through the whole pixel (u, v) has the direction R ((u - cx) / fx, -(v - cy) / fy, -1).
     """
@@ -203,7 +213,7 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6) -> Path:
         frames = []
         for number, timestep in enumerate(timesteps):
             rotation, translation = head_view(timestep)
-            vertices = scene.vertices(timestep, root=False)
+            vertices = scene.vertices(timestep, root=False, neck=not detected)
             write_picture(
                 folder / f"{part}/f_{number:04d}.png", draw(scene, vertices, UNEQUAL, rotation, translation)[0]
             )
@@ -316,14 +326,21 @@ def _nothing(path: Path, serial: str = "") -> None:
 
 
 def write_nersemble(
-    folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL), film: Callable[[Path, str], None] = _nothing
-) -> Path:
-    """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera, instead of empty files."""
+    folder: Path, serials: tuple[str, ...] = ("222200036", FRONTAL), film: Callable[[Path, str], None] = _nothing,
+    colors: Mapping[str, np.ndarray] | None = None,
+) -> Path:  # fmt: skip
+    """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera, instead of empty files.
+
+    `colors` has the correction [3, n] of each camera's colours.
+    """
     poses = {serial: np.eye(4).tolist() for serial in serials}
     (folder / "calibration").mkdir(parents=True)
     K = [[8000.0, 0, 1100], [0, 8000, 1604], [0, 0, 1]]
     content = {"world_2_cam": poses, "intrinsics": K}
     (folder / "calibration/camera_params.json").write_text(json.dumps(content))
+    if colors is not None:
+        content = {serial: matrix.tolist() for serial, matrix in colors.items()}
+        (folder / "calibration/color_calibration.json").write_text(json.dumps(content))
     for serial in serials:
         for name in (f"EMO-1-shout+laugh/images/cam_{serial}.mp4", f"BACKGROUND/image_{serial}.jpg"):
             place = folder / "sequences" / name

@@ -1,6 +1,7 @@
 """The command line has help, exit codes and one-line messages. A real run is in test_end_to_end.py."""
 
 import importlib
+import os
 import re
 import subprocess
 import sys
@@ -210,6 +211,32 @@ def test_options_are_checked_before_any_work(tmp_path: Path, capsys: pytest.Capt
     arguments = ["create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out")]
     assert "instead of 'nerf'" in complaint(capsys, *arguments, "--method", "nerf")
     assert "--steps -3" in complaint(capsys, *arguments, "--steps", "-3")
+
+
+PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'nerface', 'nerf-blendshape'"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ("evaluate x --protocol nope", f"mien: --protocol: give one of {PROTOCOLS} instead of 'nope'; see mien"),
+        ("evaluate x --protocol None", f"mien: --protocol: give one of {PROTOCOLS} instead of 'None'; see mien"),
+        ("export x --out y --mattes hair", "mien: --mattes: give one of 'head', 'person' instead of 'hair'; see mien"),
+        ("export x --out y --sh 7", "mien: --sh: give one of '0', '1', '2', '3' instead of '7'; see mien"),
+        ("evaluate x --edges no", "mien: --edges: give one of 'cleaned', 'filmed' instead of 'no'; see mien"),
+        ("capture x --out y --capture.turn 45", "--capture.turn: give one of '0', '90', '180', '270' instead of '45'"),
+    ],
+)
+def test_choices_are_told_in_their_order(capsys: pytest.CaptureFixture[str], arguments: str, told: str) -> None:
+    """Without None, which cannot be typed, and in the order of their declaration, whatever hashes say."""
+    assert told in complaint(capsys, *arguments.split())
+
+
+def test_choices_do_not_depend_on_hashes() -> None:
+    for seed in "123":
+        command = [sys.executable, "-m", "mien.cli", "evaluate", "x", "--protocol", "nope"]
+        shown = subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True)
+        assert f"give one of {PROTOCOLS} instead of" in shown.stderr
 
 
 def test_a_bug_keeps_its_traceback_in_a_log(

@@ -21,9 +21,12 @@ from dataset_writers import (
     write_insta,
     write_vhap,
 )
+from mien.commands.stages import importing
 from mien.datasets import Dataset, Findings, TrackedSequence, find_dataset, recognised
+from mien.datasets.pictures import read_picture
 from mien.errors import UserError
 from mien.training.footage import clothes_mask
+from mien.workspace import Workspace
 
 MIRROR = np.diag([1.0, -1.0, -1.0])
 
@@ -154,3 +157,26 @@ def test_a_tracking_that_does_not_fit_its_pictures_is_refused(scene: Scene, tmp_
         write_frame(folder / f"checkpoint/{number:05d}.frame", frame)
     with pytest.raises(UserError, match="of the tracked head lies on the person in me"):
         list(find_dataset("insta").read(folder, scene.model))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("layout", ["insta", "vhap"])
+def test_the_imported_mesh_is_drawn_over_some_pictures(
+    layout: str, scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The drawn mesh covers the person, and nothing else. The last line names the picture."""
+    folder = write_insta(tmp_path / "me", scene) if layout == "insta" else write_vhap(tmp_path / "me", scene)
+    found = read(folder, scene, layout)
+    importing._write_sequences(found, Workspace(tmp_path / "W"), find_dataset(layout), folder, False)
+    first = tmp_path / "W/sequences" / found[0].capture.name / "tracking/overlay.png"
+    assert f"the imported mesh over some pictures: {first}" in capsys.readouterr().err.splitlines()[-1]
+    for sequence in found:
+        place = tmp_path / "W/sequences" / sequence.capture.name / "tracking/overlay.png"
+        pixels = read_picture(place)[0].astype(int)
+        count = min(6, max(sequence.capture.timesteps, len(sequence.tracking.cameras)))
+        assert pixels.shape == (480, 240 * count, 3)
+        above, below = pixels[20:240], pixels[260:]  # without the line that names the frame
+        person, drawn = (above < 250).any(-1), np.abs(above - below).max(-1) > 3
+        assert (person & drawn).sum() > 0.95 * (person | drawn).sum()
+        assert 0.2 < person.mean() < 0.9
+        seen = [pixels[:240, at : at + 240] for at in range(0, 240 * count, 240)]
+        assert all(np.abs(one - other).max() > 50 for one, other in zip(seen, seen[1:], strict=False))

@@ -15,12 +15,18 @@ from mien.evaluation import scoring
 from mien.perceptual import lpips
 from mien.storage import read_json
 
-CHANNELS = (64, 192, 384, 256, 256)
+CHANNELS = {"lpips-alex": (64, 192, 384, 256, 256), "lpips-vgg": (64, 128, 256, 512, 512)}
+COMPARED = {"lpips-alex": (1, 4, 7, 9, 11), "lpips-vgg": (3, 8, 15, 22, 29)}
+"""The layers of torchvision's networks whose maps LPIPS compares. Of VGG16 they are relu1_2, relu2_2, relu3_3, relu4_3
+and relu5_3."""
+TRUNKS = {trunk.backbone: trunk for trunk in lpips._TRUNKS}
 
 
-def _trunk() -> nn.Sequential:
-    """Return AlexNet's convolutions in torchvision's order, with random weights."""
+def _trunk(backbone: str) -> nn.Sequential:
+    """Return the convolutions of AlexNet or VGG16 in torchvision's order, with random weights."""
     torch.manual_seed(3)
+    if backbone == "lpips-vgg":
+        return _vgg16()
     return nn.Sequential(
         nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(),
         nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(), nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(),
@@ -28,39 +34,59 @@ def _trunk() -> nn.Sequential:
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Return files of a trunk and of factors, as they are published. AlexNet's second convolution has padding 2."""
-    folder = tmp_path_factory.mktemp("lpips")
-    torch.save({f"features.{name}": value for name, value in _trunk().state_dict().items()}, folder / "trunk.pth")
+def _vgg16() -> nn.Sequential:
+    """Return VGG16's layers: convolutions 3x3 in five groups, each followed by a pooling that halves."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(depth):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+        layers.append(nn.MaxPool2d(2))
+    return nn.Sequential(*layers)
+
+
+def _write(folder: Path, backbone: str) -> tuple[Path, Path]:
+    """Write files of a trunk and of factors, as they are published."""
+    weights = {f"features.{name}": value for name, value in _trunk(backbone).state_dict().items()}
+    torch.save(weights, folder / "trunk.pth")
     torch.manual_seed(4)
-    torch.save({f"lin{k}.model.1.weight": torch.rand(1, c, 1, 1) for k, c in enumerate(CHANNELS)}, folder / "heads.pth")
+    heads = {f"lin{k}.model.1.weight": torch.rand(1, c, 1, 1) for k, c in enumerate(CHANNELS[backbone])}
+    torch.save(heads, folder / "heads.pth")
     return folder / "trunk.pth", folder / "heads.pth"
 
 
-def _by_formula(first: Tensor, second: Tensor, heads: dict[str, Tensor]) -> float:
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return files of AlexNet, whose second convolution has padding 2."""
+    return _write(tmp_path_factory.mktemp("lpips"), "lpips-alex")
+
+
+def _by_formula(backbone: str, first: Tensor, second: Tensor, heads: dict[str, Tensor]) -> float:
     """Return LPIPS as the paper and its package define it."""
-    trunk, total = _trunk(), 0.0
+    trunk, total = _trunk(backbone), 0.0
     shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
     values = [((2 * image - 1 - shift) / scale).permute(2, 0, 1)[None] for image in (first, second)]
     tap = 0
     with torch.no_grad():
-        for layer in trunk:
+        for index, layer in enumerate(trunk):
             values = [layer(value) for value in values]
-            if isinstance(layer, nn.ReLU):
+            if index in COMPARED[backbone]:
                 unit = [value / (value.square().sum(1, keepdim=True).sqrt() + 1e-10) for value in values]
                 weighted = (unit[0] - unit[1]).square() * heads[f"lin{tap}.model.1.weight"]
                 total += float(weighted.sum(1).mean())
                 tap += 1
-    assert tap == len(CHANNELS)
+    assert tap == 5
     return total
 
 
-def test_it_is_the_published_formula(files: tuple[Path, Path]) -> None:
-    metric = lpips.build_lpips(lpips._TRUNKS[0], *files)
+@pytest.mark.parametrize("backbone", TRUNKS)
+def test_it_is_the_published_formula(backbone: str, tmp_path: Path) -> None:
+    trunk, heads = _write(tmp_path, backbone)
+    metric = lpips.build_lpips(TRUNKS[backbone], trunk, heads)
     first, second = torch.rand(2, 70, 90, 3, generator=torch.Generator().manual_seed(1))
     found = metric.between(metric.features(first), metric.features(second))
-    assert found == pytest.approx(_by_formula(first, second, torch.load(files[1])), rel=1e-5)
+    assert found == pytest.approx(_by_formula(backbone, first, second, torch.load(heads)), rel=1e-5)
     assert metric.between(metric.features(first), metric.features(first)) == 0
 
 

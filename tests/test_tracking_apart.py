@@ -197,7 +197,11 @@ QUICKLY = ("--overlay", "none", "--tracking.schedule", "landmarks")
 
 @pytest.mark.slow
 def test_the_command_tracks_apart(case, shaping, apart, workspace, capsys):
+    overlay = workspace / "sequences/apart/tracking/overlay.png"
+    overlay.parent.mkdir()
+    overlay.touch()
     assert main(["track", str(workspace), "--hold-out", "apart", *QUICKLY]) == 0
+    assert not overlay.exists(), "an import's, which shows another tracking"
     assert "apart: tracked apart; the person's shape, texture and light come from shaping" in capsys.readouterr().err
     expected = track_subject([shaping], case.model, LANDMARKS, held_out=[apart.capture])
     for capture, tracking in zip((shaping, apart.capture), expected, strict=True):

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+import color_charts
 from dataset_writers import FRONTAL, write_nersemble, write_picture, write_take
 from mien.camera import Camera
-from mien.capture import read_capture
+from mien.capture import Capture, read_capture
 from mien.capture.video import write_video
 from mien.cli import main
 from mien.datasets.pictures import read_picture
@@ -27,6 +28,8 @@ PERSON = replace(
 SERIALS = (FRONTAL, "222200036", "222200046")
 """The cameras in the order of the drawn ring, whose first one is in front."""
 STRIDE = 3
+COLORS = {serial: color_charts.correction(seed) for seed, serial in enumerate(SERIALS)}
+"""The correction of each camera's colours."""
 FULL = 4
 """NeRSemble's pictures have so many times the side of those that are drawn here."""
 LANDMARKS = ("--tracking.schedule", "landmarks", "--overlay", "none")
@@ -47,7 +50,10 @@ def film(path: Path, pictures: list[np.ndarray], repeats: int = 1, fps: float = 
 
 
 def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
-    """Write a person of NeRSemble's raw recordings, with one timestep in three pictures. Return the frontal mattes."""
+    """Write a person of NeRSemble's raw recordings, with one timestep in three pictures. Return the frontal mattes.
+
+    The colours that the cameras film are others than those that were drawn, until they are corrected.
+    """
     pictures: dict[str, list[np.ndarray]] = {serial: [] for serial in SERIALS}
     assert rig.background is not None
     mattes = []
@@ -56,9 +62,14 @@ def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
             pictures[SERIALS[camera]].append(frame.image)
             if SERIALS[camera] == FRONTAL:
                 mattes.append(frame.matte)
-    write_nersemble(folder, SERIALS, lambda path, serial: film(path, pictures[serial], STRIDE))
-    for serial in SERIALS:
-        write_picture(folder / f"sequences/BACKGROUND/image_{serial}.jpg", (255 * rig.background).astype(np.uint8))
+
+    def video(path: Path, serial: str) -> None:
+        film(path, [color_charts.filmed(picture, COLORS[serial]) for picture in pictures[serial]], STRIDE)
+
+    write_nersemble(folder, SERIALS, video, COLORS)
+    empty = (255 * rig.background).astype(np.uint8)
+    for serial, matrix in COLORS.items():
+        write_picture(folder / f"sequences/BACKGROUND/image_{serial}.jpg", color_charts.filmed(empty, matrix))
     poses, intrinsics = {}, {}
     for serial, camera in zip(SERIALS, rig.cameras, strict=True):
         poses[serial] = camera.viewmat.double().tolist()
@@ -93,11 +104,36 @@ def test_raw_recordings_of_nersemble_become_an_avatar(
     capture, tracking = read_capture(folder / "capture"), read_sequence(folder).tracking
     assert (capture.timesteps, capture.camera_ids) == (rig.timesteps, tuple(sorted(SERIALS)))
     check_cameras(rig, capture, tracking.cameras, mattes)
+    check_colors(rig, capture)
     # The head is where it was drawn, in the dataset's world.
     off = tracking.face.head_translation - rig.tracking().face.head_translation
     assert float(off.norm(dim=1).median()) < 0.02
     better = trained_and_scored(root)
     assert min(better.values()) > 1, better
+
+
+def cropped(capture: Capture, serial: str, drawn: np.ndarray) -> np.ndarray:
+    """Return the part of a drawn picture that a camera's captured pictures show."""
+    crop = capture.source["cameras"][serial]["crop"]
+    step = crop["width"] / capture.width
+    to_drawn = np.array([[step, 0, crop["left"] + step / 2 - 0.5], [0, step, crop["top"] + step / 2 - 0.5]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(drawn, to_drawn, (capture.width, capture.height), flags=flags)
+
+
+def check_colors(rig: SyntheticScene, capture: Capture) -> None:
+    """Check that captured pictures have the drawn colours, and that terms in another order would not give them."""
+    for index, serial in enumerate(capture.camera_ids):
+        drawn = rig.timestep_frames(0)[SERIALS.index(serial)].image
+        found = capture.images[0, index].astype(float)
+        off = np.abs(found - cropped(capture, serial, drawn)).mean((0, 1))
+        assert off.max() < 1, (serial, off)  # the video is lossy
+        light = color_charts.to_light(color_charts.filmed(drawn, COLORS[serial]).reshape(-1, 3) / 255)
+        *terms, constant = color_charts.ORDERS[20].split()
+        order = " ".join((constant, *terms))  # tests/test_color_correction.py exchanges any two terms
+        others = color_charts.to_srgb(color_charts.polynomial(light, COLORS[serial], order))
+        other = (255 * others).round().astype(np.uint8).reshape(drawn.shape)
+        assert np.abs(found - cropped(capture, serial, other)).mean((0, 1)).max() > 10, serial
 
 
 def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mattes: list[np.ndarray]) -> None:
@@ -107,13 +143,11 @@ def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mat
         assert float((cameras[places[serial]].viewmat - drawn.viewmat).abs().max()) < 1e-5
     crop = capture.source["cameras"][FRONTAL]["crop"]
     step = crop["width"] / capture.width
-    to_drawn = np.array([[step, 0, crop["left"] + step / 2 - 0.5], [0, step, crop["top"] + step / 2 - 0.5]])
     K, front = cameras[places[FRONTAL]].K.double().numpy(), rig.cameras[0].K.double().numpy()
     moved = np.array([[1, 0, crop["left"]], [0, 1, crop["top"]], [0, 0, 1]]) @ np.diag([step, step, 1.0]) @ K
     assert np.abs(moved - front).max() < 0.01
     for matte, found in zip(mattes, capture.mattes[:, places[FRONTAL]], strict=True):
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        expected = cv2.warpAffine(matte, to_drawn, (capture.width, capture.height), flags=flags)
+        expected = cropped(capture, FRONTAL, matte)
         both, either = ((found > 127) & (expected > 127)).sum(), ((found > 127) | (expected > 127)).sum()
         assert both > 0.85 * either  # the network's mattes fade at the shirt
 

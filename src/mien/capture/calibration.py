@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.camera import Camera
+from mien.capture.color_correction import ColorCorrection, correction_of_entry
 from mien.capture.lens import Lens, lens_of_entry
 from mien.capture.store import is_file_name
 from mien.errors import UserError
@@ -28,6 +29,8 @@ class CalibratedCamera:
     """Frames to leave out at the beginning of its video, so that frame n of all cameras is the same moment."""
     lens: Lens | None = None
     """Its lens, for pictures of the camera's size. None if it does not distort."""
+    colors: ColorCorrection | None = None
+    """Correction of its pictures' colours, or None."""
 
     def for_pictures(self, width: int, height: int) -> Camera:
         """Return the camera for pictures of another size but the same shape.
@@ -54,7 +57,8 @@ def read_calibration(path: Path) -> list[CalibratedCamera]:
 
     It is the format of a camera path with an `id` for every camera and, if cameras did not start together, an
     `offset` in frames. Intrinsics are in pixels of the uncut video. World-to-camera matrices have OpenCV axes and
-    metres (docs/conventions.md). `distortion` is a list of OpenCV's coefficients, k1 k2 p1 p2 k3 ...
+    metres (docs/conventions.md). `distortion` is a list of OpenCV's coefficients, k1 k2 p1 p2 k3 ..., and
+    `color_correction` has a row of coefficients for each channel (`mien.capture.color_correction`).
 
     Raises:
         UserError: the file is missing or damaged, a camera is incomplete or impossible, or two have the same id.
@@ -123,4 +127,5 @@ def _calibrated_camera(entry: Any, where: str) -> CalibratedCamera:
         raise UserError(f"{where} ({camera_id}): offset {offset!r} is not a number of frames; give 0 or more")
     where = f"{where} ({camera_id})"
     camera = camera_of_entry(entry, where)
-    return CalibratedCamera(camera_id, camera, offset, lens_of_entry(entry, camera, where))
+    lens, colors = lens_of_entry(entry, camera, where), correction_of_entry(entry, where)
+    return CalibratedCamera(camera_id, camera, offset, lens, colors)

@@ -122,7 +122,7 @@ def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, r
     }
     job = open_job(source, replace(settings, **own), camera.camera_id, replace_others)
     selection = replace(job.frames.selection, offset=camera.offset)
-    return replace(job, frames=replace(job.frames, selection=selection, lens=camera.lens))
+    return replace(job, frames=replace(job.frames, selection=selection, lens=camera.lens, colors=camera.colors))
 
 
 def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:

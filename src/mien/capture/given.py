@@ -85,7 +85,8 @@ class GivenInputs:
 def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
     """Read and check what the user gave besides the source, before anything that takes long.
 
-    It belongs to the pictures as they were filmed, so it is straightened like them.
+    It belongs to the pictures as they were filmed, so it is straightened like them, and the clean plate's colours are
+    corrected like theirs.
     """
     if settings.clean_plate is None and settings.mattes is None and settings.landmarks is None:
         return GivenInputs()
@@ -99,7 +100,7 @@ def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
                 f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, but the video's "
                 f"pictures are {width}x{height}; give a picture from the same camera in the same mode"
             )
-        plate = plate if frames.lens is None else frames.lens.straighten(plate)
+        plate = frames.calibrated(plate)
     if settings.mattes is not None:
         check_mattes(settings.mattes, frames)
         GivenMattes(settings.mattes, (width, height)).check(first.number)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.capture.color_correction import ColorCorrection
 from mien.capture.deinterlacing import Deinterlace
 from mien.capture.lens import Lens
 from mien.capture.picture import decode_picture
@@ -76,6 +77,8 @@ class FrameSource:
     """Whether the pictures are single fields of interlaced video, of half the height (HEVC)."""
     lens: Lens | None = None
     """Lens whose distortion is taken out of the turned pictures. None for pictures as they are."""
+    colors: ColorCorrection | None = None
+    """Correction of the pictures' colours. None for colours as filmed."""
 
     def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
         """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0.
@@ -102,8 +105,8 @@ class FrameSource:
                 continue
             first = seconds if taken == 0 else first
             turned = partial(_turned, picture, self.quarter_turns) if self.quarter_turns else picture
-            straight = partial(_straight, turned, self.lens) if self.lens else turned
-            yield SourceFrame(number, seconds - first, straight, is_deinterlaced, combs)
+            given = partial(self._as_calibrated, turned) if self.lens or self.colors else turned
+            yield SourceFrame(number, seconds - first, given, is_deinterlaced, combs)
             taken += 1
             if taken == self.selection.max_frames:
                 break
@@ -111,6 +114,14 @@ class FrameSource:
             raise UserError(
                 f"{self.path}: has no frame after {self.selection.start:g} s; choose an earlier --capture.start"
             )
+
+    def calibrated(self, picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """Return a turned picture of this camera with corrected colours, as an ideal lens shows it."""
+        picture = picture if self.colors is None else self.colors.apply(picture)
+        return picture if self.lens is None else self.lens.straighten(picture)
+
+    def _as_calibrated(self, picture: Callable[[], np.ndarray]) -> np.ndarray:
+        return self.calibrated(picture())
 
     def count(self) -> int:
         """Count the frames in the source, with those that the selection leaves out.
@@ -166,10 +177,6 @@ def open_source(
 
 def _turned(picture: Callable[[], np.ndarray], quarter_turns: int) -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(np.rot90(picture(), -quarter_turns))
-
-
-def _straight(picture: Callable[[], np.ndarray], lens: Lens) -> UInt8[np.ndarray, "h w 3"]:
-    return lens.straighten(picture())
 
 
 def list_images(folder: Path) -> list[Path]:

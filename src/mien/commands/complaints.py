@@ -3,8 +3,9 @@
 import contextlib
 import io
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from mien.commands.settings_options import near_option
 
@@ -35,7 +36,7 @@ def complaint_of(box: str, arguments: Sequence[str], options: type, style: Any) 
         options: The options that it was given.
         style: Its configuration.
     """
-    return _unknown_options(arguments, options, style) or _in_one_line(box)
+    return _unknown_options(arguments, options, style) or _with_choices_in_order(_in_one_line(box), options)
 
 
 def _in_one_line(box: str) -> str:
@@ -55,6 +56,39 @@ def _in_one_line(box: str) -> str:
             comma = inner.startswith(" ") and parts[-1] and not parts[-1].endswith(":")
             parts[-1] = f"{parts[-1]}{',' if comma else ''} {text}".strip()
     return "; ".join(_reworded(part.rstrip(".")) for part in parts if part and not part.startswith(_USELESS))
+
+
+def _with_choices_in_order(complaint: str, options: type) -> str:
+    """A complaint of a wrong choice, with the choices as they are declared.
+
+    tyro keeps the choices of an option that may be left out in a set, together with None, which nobody can type.
+    """
+
+    def ordered(listed: re.Match[str]) -> str:
+        found = [choice for choice in re.findall(r"'([^']*)'", listed[1]) if choice != "None"]
+        declared = next((each for each in _choices(options, set()) if sorted(each) == sorted(found)), found)
+        return f"give one of {', '.join(map(repr, declared))} instead of"
+
+    complaint = re.sub(
+        r"give \{([\w,. -]+)\} instead of",
+        lambda listed: f"give one of {', '.join(map(repr, re.findall(r'[^, ]+', listed[1])))} instead of",
+        complaint,
+    )
+    return re.sub(r"give one of ('.*') instead of", ordered, complaint)
+
+
+def _choices(hint: Any, seen: set[Any]) -> Iterator[list[str]]:
+    """Yield the choices of each option of a type, in the order of their declaration."""
+    if get_origin(hint) is Literal:
+        yield [str(choice) for choice in get_args(hint)]
+    elif isinstance(hint, type) and is_dataclass(hint):
+        if hint not in seen:
+            seen.add(hint)
+            for one in get_type_hints(hint).values():
+                yield from _choices(one, seen)
+    else:
+        for one in get_args(hint):
+            yield from _choices(one, seen)
 
 
 def _unknown_options(arguments: Sequence[str], options: type, style: Any) -> str | None:

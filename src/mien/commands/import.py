@@ -35,6 +35,9 @@ class Command:
     """Only say what was found: sequences, frames, cameras, face model, split, and what is missing."""
     retrack: bool = False
     """Leave out the tracking of the dataset's authors, and track the pictures with mien's own model instead."""
+    color_correction: bool = True
+    """By default, the colours of cameras are corrected if the dataset says how. --no-color-correction leaves them as
+    filmed."""
 
     resume: bool = False
     """Leave sequences that are there already as they are, and read the others, as after a stop."""
@@ -67,7 +70,8 @@ class Command:
             say(f"{self.path}: {told}")  # before they are read, which takes long
         if dataset.survey is not None:
             findings = dataset.survey(self.path)
-            for line in findings_lines(findings, self.face_model is not None or not self.dry_run):
+            given = self.face_model is not None or not self.dry_run
+            for line in findings_lines(findings, given, self.color_correction):
                 say(line)
             if not self.dry_run and self._is_there(findings):
                 say(f"{self.out}: all sequences are there already")
@@ -76,7 +80,9 @@ class Command:
             from mien.commands.stages.importing import run_import_stage
 
             workspace, run = Workspace(self.out), self._run(dataset)
-            run_import_stage(dataset, self.path, workspace, run, self.face_model, self.retrack, self.resume)
+            run_import_stage(
+                dataset, self.path, workspace, run, self.face_model, self.retrack, self.resume, self.color_correction
+            )
 
     def _is_there(self, findings: Findings) -> bool:
         """Whether there is nothing to do. Without --resume, no sequence may be there, which is checked first."""

@@ -56,6 +56,9 @@ class Footage:
     """Each camera by its id, for uncut pictures. None if the video is not calibrated."""
     clean_plates: Mapping[str, Path] | None = None
     """A picture of the empty scene for each camera, by the camera's id."""
+    color_corrections: "Callable[[], Mapping[str, numpy.ndarray]] | None" = None
+    """Reads the coefficients [3, n] that correct each camera's colours (`mien.capture.color_correction`), by its id.
+    It raises UserError if they are damaged. None if there are none."""
     stride: int = 1
     """Take every n-th frame."""
     own_split: "mien.training.OwnSplit | None" = None
@@ -96,6 +99,8 @@ class Findings:
     """The split of its authors, in words."""
     missing: tuple[str, ...] = ()
     """Parts that are missing or not used, each in words."""
+    color_correction: str | None = None
+    """The correction of its cameras' colours, in words. None if the layout has none; a missing one is in `missing`."""
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,14 @@
 
 They have no mattes and no tracking, so `mien capture` processes the videos. The picture of the empty scene, in the
 sequence BACKGROUND, serves as its clean plate. Every third frame of 73 a second is taken, as in other work (24.3).
+
+The colours of videos and clean plates are corrected by the polynomials of `calibration/color_calibration.json`, in
+which the authors measured each camera: {serial: 3 x n matrix}.
 """
 
 import os
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +38,10 @@ _EMPTY = "BACKGROUND"
 
 def _calibration(path: Path) -> Path:
     return path / "calibration" / "camera_params.json"
+
+
+def _color_calibration(path: Path) -> Path:
+    return path / "calibration" / "color_calibration.json"
 
 
 def _recognises(path: Path) -> str | None:
@@ -118,15 +126,19 @@ def _survey(path: Path) -> Findings:
     missing = [
         "two of three frames",
         "mattes and tracking: `mien capture` and `mien track` make them",
-        "colour calibration, which is not used",
     ]
+    colors = _color_calibration(path)
+    if not colors.is_file():
+        missing.append(f"colour correction (calibration/{colors.name}): cameras differ in their colours without it")
     if not any((path / "sequences" / _EMPTY).glob("image_*.jpg")):
         missing.append(f"pictures of the empty scene (sequences/{_EMPTY}): mattes are less exact without them")
-    return Findings(tuple(clips), None, None, tuple(missing))
+    found = f"by calibration/{colors.name}; --no-color-correction leaves it out" if colors.is_file() else None
+    return Findings(tuple(clips), None, None, tuple(missing), found)
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     cameras = read_cameras(_calibration(path), SIZE)
+    colors = _color_calibration(path)
     for name in _names(path):
         videos = {}
         for video in sorted((path / "sequences" / name / "images").glob("cam_*.mp4")):
@@ -140,8 +152,27 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
             tuple(videos.values()),
             {serial: cameras[serial] for serial in videos},
             clean_plates=_plates(path, videos),
+            color_corrections=partial(_corrections, path, tuple(videos)) if is_file_inside(path, colors) else None,
             stride=_STRIDE,
         )
+
+
+def _corrections(path: Path, serials: tuple[str, ...]) -> "dict[str, np.ndarray]":
+    """Return the corrections of these cameras.
+
+    Raises:
+        UserError: one is missing, or is no matrix of a polynomial that mien knows.
+    """
+    from mien.capture.color_correction import color_correction
+
+    file = _color_calibration(path)
+    content, found = read_object(file), {}
+    for serial in serials:
+        if serial not in content:
+            raise UserError(f"{file}: has no correction of the camera {serial}; {REMEDY}, or add --no-color-correction")
+        found[serial] = numbers(file, content, serial, (3, None))
+        color_correction(found[serial], f"{file}: {serial!r}")
+    return found
 
 
 def _plates(path: Path, videos: dict[str, Path]) -> "dict[str, Path] | None":

@@ -12,15 +12,19 @@ from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.inside import remove_tree
 from mien.storage import replace_folder, write_arrays
-from mien.tracking import make_scoring, write_scoring, write_tracking
+from mien.tracking import make_scoring, write_overlay_sheet, write_scoring, write_tracking
 from mien.training import read_sequence, write_own_split
 from mien.training.footage import FOREIGN
+
+OVERLAY = "tracking/overlay.png"
+"""File in a sequence's folder: the imported mesh over some of its pictures."""
 
 
 def write_sequence(folder: Path, sequence: TrackedSequence | FilmedSequence, dataset: Dataset, source: Path) -> None:
     """Write a sequence as `mien capture` leaves one, and if it is tracked, as `mien track` leaves one.
 
-    Beside them are dataset.json, with the split of the authors, and foreign.safetensors, if there is anything for it.
+    Beside them are dataset.json, with the split of the authors, and foreign.safetensors, if there is anything for it. A
+    tracked sequence has a picture of its mesh (`OVERLAY`).
 
     The folder appears as a whole, after its files were read back.
 
@@ -70,4 +74,5 @@ def _write_tracking_into(folder: Path, sequence: TrackedSequence, imported: dict
     fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]
     settings = {**tracking.settings, "imported": imported, "fingerprint": fingerprint}
     write_tracking(folder / "tracking", replace(tracking, settings=settings))
+    write_overlay_sheet(folder / OVERLAY, capture, tracking, face_model)
     write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model, scratch=folder), capture_hash)

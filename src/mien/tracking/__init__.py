@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         overlay_stride,
         residual_report,
         write_overlay,
+        write_overlay_sheet,
         write_residual_report,
     )
     from mien.tracking.scoring import Scoring, head_crop, head_cutter, make_scoring
@@ -65,6 +66,7 @@ __all__ = [
     "track",
     "track_subject",
     "write_overlay",
+    "write_overlay_sheet",
     "write_residual_report",
     "write_scoring",
     "write_tracking",

@@ -4,9 +4,11 @@ import json
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from mien.camera import Camera
 from mien.capture import CaptureSettings, capture_cameras, capture_video
+from mien.capture.color_correction import NAME as COLOR_CORRECTION
 from mien.datasets import Dataset, Footage
 from mien.errors import UserError
 from mien.inside import inside, remove_tree
@@ -46,6 +48,7 @@ def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera], sou
 
     Complaints about a link or the calibration name what the user knows instead.
     """
+    corrections = None if footage.color_corrections is None else footage.color_corrections()
     with tempfile.TemporaryDirectory(prefix="mien-import-") as name:
         place = Path(name)
         videos, known = [], {}
@@ -62,11 +65,14 @@ def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera], sou
                 link.symlink_to(plate.resolve())
                 known[f"--capture.clean-plate {link}"] = known[str(link)] = str(plate)
         calibration = place / "cameras.json"
-        entries = [
+        entries: list[dict[str, Any]] = [
             {"id": camera_id, "K": camera.K.double().tolist(), "viewmat": camera.viewmat.double().tolist(),
              "width": camera.width, "height": camera.height}
             for camera_id, camera in cameras.items()
         ]  # fmt: skip
+        for entry, (camera_id, matrix) in zip(entries, corrections.items(), strict=True) if corrections else ():
+            assert entry["id"] == camera_id
+            entry[COLOR_CORRECTION] = matrix.tolist()
         calibration.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": entries}))
         settings = CaptureSettings(stride=footage.stride, clean_plate=plates)
         try:

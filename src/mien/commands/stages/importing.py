@@ -3,6 +3,7 @@
 import math
 import shlex
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,6 +15,7 @@ from mien.commands.stages.import_footage import write_footage
 from mien.commands.stages.names import check_new_run, check_new_sequence
 from mien.commands.stages.tracking import run_tracking_stage
 from mien.datasets import Dataset, Footage, ReadSequence, TrackedSequence, TrainedAvatar, write_sequence
+from mien.datasets.writing import OVERLAY
 from mien.inside import remove_tree
 from mien.locks import check_free, hold
 from mien.progress import say
@@ -32,7 +34,7 @@ _MARGIN = 1.15
 
 def run_import_stage(
     dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None, retrack: bool = False,
-    resume: bool = False,
+    resume: bool = False, corrects_colors: bool = True,
 ) -> None:  # fmt: skip
     """Read a dataset, and write its avatar as a run, or its sequences.
 
@@ -44,6 +46,7 @@ def run_import_stage(
         face_model: Name or file of the face model that the files belong to, if the user gives one.
         retrack: Whether to leave out the tracking of the authors, and to track the pictures with mien.
         resume: Whether sequences that are there already stay as they are. If not, they are an error.
+        corrects_colors: Whether the colours of videos are corrected, if the dataset has such a correction.
 
     Raises:
         UserError: the files or the face model cannot be read, or the run or a sequence is there already or cannot be
@@ -61,11 +64,17 @@ def run_import_stage(
     if isinstance(content, TrainedAvatar):
         _write_run(content, run_dir, path)
     else:
+        if not corrects_colors:
+            content = map(_as_filmed, content)
         untracked = _write_sequences(content, workspace, dataset, path, resume)
         if retrack:
             run_tracking_stage(workspace, "anny", TrackingSettings())
         elif untracked:
             say(f"{', '.join(untracked)}: without a tracking; run `mien track {shlex.quote(str(workspace.root))}`")
+
+
+def _as_filmed(sequence: ReadSequence) -> ReadSequence:
+    return replace(sequence, color_corrections=None) if isinstance(sequence, Footage) else sequence
 
 
 def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
@@ -85,7 +94,7 @@ def _write_sequences(
     sequences: Iterable[ReadSequence], workspace: Workspace, dataset: Dataset, source: Path, resume: bool
 ) -> list[str]:
     """Write the sequences, and return the names of those without a tracking."""
-    untracked = []
+    untracked, overlays = [], []
     for sequence in sequences:
         if isinstance(sequence, Footage):
             folder = workspace.sequence_dir(sequence.name)
@@ -105,8 +114,13 @@ def _write_sequences(
         cameras = counted(len(capture.camera_ids), "camera")
         tracked = f", tracked on {sequence.face_model.name}" if isinstance(sequence, TrackedSequence) else ""
         say(f"{folder}: {counted(capture.timesteps, 'timestep')}, {cameras}{tracked}")
-        if not tracked:
+        if tracked:
+            overlays.append(folder / OVERLAY)
+        else:
             untracked.append(capture.name)
+    if overlays:
+        more = f", and {len(overlays) - 1} more" * (len(overlays) > 1)
+        say(f"the imported mesh over some pictures: {overlays[0]}{more}; look at it before you train")
     return untracked
 
 

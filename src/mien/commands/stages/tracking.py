@@ -11,6 +11,7 @@ from typing import Literal
 from mien.capture import Capture, read_capture, read_capture_hash
 from mien.capture.video import count_frames
 from mien.commands.stages.face_models import face_model_of
+from mien.datasets.writing import OVERLAY
 from mien.errors import UserError
 from mien.face import FaceModel, load_face_model
 from mien.face.checks import check_face_params
@@ -262,7 +263,9 @@ def _track(
         made_from: dict[str, object] = {"fingerprint": fingerprint, "tracked_together": list(usable)}
         made_from |= {"held_out": list(apart)} if apart else {}
         trackings[name] = replace(tracking, settings={**tracking.settings, **made_from})
-        write_tracking(workspace.sequence_dir(name) / "tracking", trackings[name])
+        folder = workspace.sequence_dir(name)
+        write_tracking(folder / "tracking", trackings[name])
+        (folder / OVERLAY).unlink(missing_ok=True)  # an import's, which shows another tracking
         say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
     _tell_outdated_runs(workspace, trackings)
     return trackings

@@ -1,7 +1,8 @@
-"""Contact sheet of a tracking: evenly spread frames and frames that stand out, each with all its panels."""
+"""Contact sheets of a tracking: of its report, with frames that stand out, and of few frames, after an import."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,12 +11,15 @@ from jaxtyping import Float, UInt8
 
 from mien.capture.capture import Capture
 from mien.face import FaceModel
+from mien.picture_files import write_png
 from mien.tracking.report.heat import draw_legend, write_text
 from mien.tracking.report.overlay import OverlayPainter, frontal_camera
 from mien.tracking.tracking import Tracking
 
 _EVEN, _MAX_FLAGGED, _MAX_ALONE = 8, 8, 4
 """Largest numbers of evenly spread frames, of flagged frames, and of frames tracked from landmarks alone."""
+_FEW = 6
+"""Largest number of pictures of an overlay sheet."""
 _TILE = 240
 """Side of each tile, in pixels."""
 
@@ -75,6 +79,24 @@ def sheet_rows(
     """The pictures of each frame: all panels, cut to the head."""
     painter = OverlayPainter(capture, tracking, face_model)
     return [SheetRow(_name(capture, frame), bool(frame.why), _tiles(painter, capture, frame)) for frame in frames]
+
+
+def write_overlay_sheet(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
+    """Write at most six pictures in a row, cut to the head, with the mesh over the same pictures below them.
+
+    Timesteps are evenly spread, and so are cameras, beginning with the frontal one. It takes less than a second, so an
+    import writes it for every sequence.
+    """
+    painter, cameras = OverlayPainter(capture, tracking, face_model), len(tracking.cameras)
+    valid, frontal = tracking.valid.nonzero()[:, 0], frontal_camera(tracking)
+    count = min(_FEW, max(len(valid), cameras))
+    columns = []
+    for index, place in enumerate(torch.linspace(0, len(valid) - 1, count).round().long()):
+        frame = SheetFrame(int(valid[place]), (frontal + index * cameras // count) % cameras)
+        tiles = _tiles(painter, capture, frame)[:2]
+        write_text(tiles[0], _name(capture, frame), (6, 16), 0.45)
+        columns.append(np.concatenate(tiles, axis=0))
+    write_png(path, np.concatenate(columns, axis=1))
 
 
 def _name(capture: Capture, frame: SheetFrame) -> str:
