@@ -16,7 +16,7 @@ from dataset_scene import Scene, make_scene
 from dataset_writers import write_benchmark, write_flash_avatar, write_imavatar, write_insta, write_vhap
 from flame_like import write_npz
 from mien.datasets import TrackedSequence, overlay, recognised
-from mien.datasets.overlay import check_version
+from mien.datasets.overlay import check_overlay, check_version
 from mien.datasets.steadiness import Steadiness, measure_steadiness
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
@@ -149,10 +149,16 @@ def test_a_tracking_that_is_off_by_some_pixels_is_not_refused(scene: Scene, tmp_
 
 
 def test_pictures_of_another_size_are_told(scene: Scene, tmp_path: Path) -> None:
-    folder = write_insta(tmp_path / "me", scene)
-    for file in (folder / "images").iterdir():
-        pixels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        assert pixels is not None
-        assert cv2.imwrite(str(file), cv2.resize(pixels, (400, 400)))
-    with pytest.raises(UserError, match="these have 400x400 pixels, and the tracking was made on about 265x248, so"):
-        read(folder, scene.model)
+    (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
+    capture, (view,) = sequence.capture, sequence.tracking.cameras
+    images = np.stack([cv2.resize(image, (400, 384)) for image in capture.images[:, 0]])[:, None]
+    mattes = np.stack([cv2.resize(matte, (400, 384)) for matte in capture.mattes[:, 0]])[:, None]
+    views = (replace(view, width=400, height=384),)
+    larger = replace(
+        sequence,
+        capture=replace(capture, images=images, mattes=mattes, calibration=views),
+        tracking=replace(sequence.tracking, cameras=views),
+    )
+    with pytest.raises(UserError, match="these have 400x384 pixels, and the tracking was made on about 265x248, so"):
+        check_overlay(tmp_path, larger, "FLAME")
+    check_overlay(tmp_path, sequence, "FLAME")

@@ -34,9 +34,9 @@ _SHIFTS = (-0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03)
 _ROUNDS = 3
 _FACING = 0.3
 """Least cosine between the normal at a point and the direction to the camera."""
-_MIN_MOTIONS = (0.005, 0.012)
-"""Least motion by identity and by expressions that is compared: root mean square of points, over that distance. The
-noise of a tracking moves a face that is still by up to 0.009."""
+_MIN_MOTIONS = (0.006, 0.014)
+"""Least motion by identity and by expressions that is compared: root mean square of points, over that distance. In
+drawings, the noise of a tracking moves a face that is still by up to 0.012."""
 
 
 @dataclass(frozen=True)
