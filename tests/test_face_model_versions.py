@@ -138,14 +138,15 @@ def test_what_cannot_be_compared_is_left_out(scene: Scene, tmp_path: Path) -> No
 
 
 def test_a_tracking_that_is_off_by_some_pixels_is_not_refused(scene: Scene, tmp_path: Path) -> None:
+    """Each frame is moved to where it fits best. Without that, the shares are 0.73 and 0.81."""
     (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
-    off = torch.tensor(np.random.default_rng(2).uniform(-0.002, 0.002, (TIMESTEPS, 3)) * (1, 1, 0)).float()
+    off = torch.tensor(np.random.default_rng(2).uniform(-0.0025, 0.0025, (TIMESTEPS, 3)) * (1, 1, 0)).float()
     face = replace(sequence.tracking.face, head_translation=sequence.tracking.face.head_translation + off)
     found = measure_steadiness(replace(sequence, tracking=replace(sequence.tracking, face=face)))
     assert found.identity is not None
-    assert found.identity < 0.9
+    assert found.identity < 0.66
     assert found.expression is not None
-    assert found.expression < 0.9
+    assert found.expression < 0.75
 
 
 def test_pictures_of_another_size_are_told(scene: Scene, tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ _BLUR = 0.025
 _SHIFTS = (-0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03)
 """Shifts of a whole face along each axis of the picture, over that distance, that a tracking may be off in a frame."""
 _ROUNDS = 3
+"""Number of times that the median colours and the shift of each frame are found by turns."""
 _FACING = 0.3
 """Least cosine between the normal at a point and the direction to the camera."""
 _MIN_MOTIONS = (0.006, 0.014)
@@ -109,7 +110,11 @@ def _deviations(images: list[UInt8[np.ndarray, "h w 3"]], own: _Seen, others: li
     facing = own.facing & (own.facing.sum(0) >= max(_MIN_FRAMES, len(images)) // 2)
     eyes = float(np.linalg.norm(own.pixels[:, _CORNERS[0]] - own.pixels[:, _CORNERS[1]], axis=-1).mean())
     pixels = [each.pixels for each in (own, *others)]
-    if not eyes >= _MIN_EYES or not facing.any() or not all(np.isfinite(each).all() for each in pixels):
+    if (
+        not _MIN_EYES <= eyes <= max(images[0].shape)
+        or not facing.any()
+        or not all(np.isfinite(each).all() for each in pixels)
+    ):
         return None
     spreads = [_spread(each, facing) for each in _colours(images, pixels, eyes)]
     shifts = [each - pixels[0] for each in pixels[1:]]
@@ -119,13 +124,12 @@ def _deviations(images: list[UInt8[np.ndarray, "h w 3"]], own: _Seen, others: li
 
 def _spread(colours: Float[np.ndarray, "t s l 3"], facing: Bool[np.ndarray, "t l"]) -> Float[np.ndarray, " p"]:
     """Return distances from the median colour over the frames, each frame at the shift at which it fits best."""
-    frames = np.arange(len(colours))
-    chosen = np.full(len(colours), colours.shape[1] // 2)
+    best = colours[:, colours.shape[1] // 2]
     for _ in range(_ROUNDS):
-        middle = _over_frames(np.nanmedian, colours[frames, chosen], facing)
-        apart = np.linalg.norm(colours - middle, axis=-1)
+        apart = np.linalg.norm(colours - _over_frames(np.nanmedian, best, facing), axis=-1)
         chosen = np.where(facing[:, None], apart**2, 0).sum(2).argmin(1)
-    return apart[frames, chosen][facing]
+        best = colours[np.arange(len(colours)), chosen]
+    return np.linalg.norm(best - _over_frames(np.nanmedian, best, facing), axis=-1)[facing]
 
 
 def _over_frames(
@@ -145,12 +149,15 @@ def _colours(
     offsets = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=-1).reshape(-1, 1, 2) * eyes
     found: list[list[np.ndarray]] = [[] for _ in pixels]
     for timestep, image in enumerate(images):
-        small = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if shrink < 1 else image
-        ratio = small.shape[1] / image.shape[1], small.shape[0] / image.shape[0]
+        height, width = image.shape[:2]
+        size = max(1, round(width * shrink)), max(1, round(height * shrink))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if shrink < 1 else image
         blurred = cv2.GaussianBlur(small.astype(np.float32), (0, 0), _BLUR * eyes * shrink)
         for each, points in zip(found, pixels, strict=True):
-            places = ((points[timestep] + offsets) * ratio - 0.5).astype(np.float32)
-            each.append(cv2.remap(blurred, places, None, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE))
+            places = (points[timestep] + offsets) * np.divide(size, (width, height)) - 0.5
+            places = places.clip(-1, size).astype(np.float32)
+            x, y = places[..., 0], places[..., 1]
+            each.append(cv2.remap(blurred, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE))
     return [np.stack(each).astype(np.float64) for each in found]
 
 
