@@ -103,6 +103,8 @@ def test_mistakes_leave_nothing(
     frame.unlink()
     frame.symlink_to("/etc/hostname")
     refused(["import", str(other), *out, "--face-model", "flame"], "leads out of the dataset", capsys)
+    wrong = ["import", str(other), *out, "--dataset", "vhap"]
+    refused(wrong, f"{other}: looks like insta, and cannot be read as vhap; leave --dataset out (", capsys)
     assert not list((tmp_path / "out").glob("sequences/*"))
 
 

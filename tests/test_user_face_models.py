@@ -98,6 +98,15 @@ def test_choices_that_lead_nowhere(added, tmp_path, capsys):
         stage.add_face_model_file(path, "../up")
     assert main(["face-models", "--name", "x"]) != 0
     assert "--add FILE" in capsys.readouterr().err
+    assert main(["face-models", "--add", str(tmp_path)]) == 2
+    assert f"{tmp_path}: is a folder, and not ICT-FaceKit's FaceXModel; give a file in it: " in capsys.readouterr().err
+
+
+def test_models_that_are_not_there_are_told_with_their_commands(added, capsys):
+    assert main(["face-models"]) == 0
+    told = capsys.readouterr().out
+    for command in ("generic_model\n", "flame2023 --teeth\n", "flame2023_open --shareable\n", "ict\n"):
+        assert f"add it with mien face-models --add FILE --name {command}" in told
 
 
 # Tracking -------------------------------------------------------------------------------------------------------------

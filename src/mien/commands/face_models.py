@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from mien.commands.stages.names import no_model_file
 from mien.errors import UserError
 from mien.terminal import show
 
@@ -41,9 +42,7 @@ class Command:
                 "--name, --shareable and --teeth belong to a model that is added: give its file with --add FILE"
             )
         if self.add is not None and not self.add.is_file() and not (self.add / _ICT_MEAN).is_file():
-            raise UserError(
-                f"{self.add}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz"
-            )
+            raise UserError(no_model_file(self.add))
 
     def run(self) -> None:
         """Add or bake a model if asked for, then print the table."""
@@ -71,4 +70,4 @@ class Command:
         for model in OBTAINABLE:
             if all(row["name"] != model.name for row in rows):
                 show(f"not installed: {model.file}, for {model.use}; licence: {model.licence}; from {model.where}; "
-                     f"add it with mien face-models --add FILE --name {model.name}")  # fmt: skip
+                     f"add it with mien face-models --add FILE --name {model.name}{model.options}")  # fmt: skip

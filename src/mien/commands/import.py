@@ -62,10 +62,21 @@ class Command:
 
     def run(self) -> None:
         """Read the files and write what they hold."""
+        dataset, told = self._found()
+        try:
+            self._read(dataset, told)
+        except UserError as error:
+            other = self._looks_like() if type(error) is UserError else None
+            if other is None:
+                raise
+            raise UserError(
+                f"{self.path}: looks like {other}, and cannot be read as {dataset.name}; leave --dataset out ({error})"
+            ) from None
+
+    def _read(self, dataset: Dataset, told: str | None) -> None:
         from mien.commands.stages.findings import findings_lines
         from mien.progress import say
 
-        dataset, told = self._found()
         if told is not None and (self.dry_run or dataset.holds == "sequences"):
             say(f"{self.path}: {told}")  # before they are read, which takes long
         if dataset.survey is not None:
@@ -95,6 +106,15 @@ class Command:
     def _found(self) -> tuple[Dataset, str | None]:
         """The dataset, and what it found; None if the user names the dataset."""
         return recognised(self.path) if self.dataset is None else (find_dataset(self.dataset), None)
+
+    def _looks_like(self) -> str | None:
+        """Return the name of the dataset that the files are, if the user named another one."""
+        if self.dataset is None or find_dataset(self.dataset).recognises(self.path) is not None:
+            return None
+        try:
+            return recognised(self.path)[0].name
+        except UserError:
+            return None
 
     def _run(self, dataset: Dataset) -> str:
         return dataset.name.replace("-", "_") if self.name is None else self.name

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from mien.commands.stages.names import no_model_file
 from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
 from mien.face.ict import NEUTRAL, is_ict_folder
@@ -49,7 +50,7 @@ def add_face_model_file(path: Path, name: str | None = None, shareable: bool = F
     if not name.replace("-", "").replace("_", "").isalnum():
         raise UserError(f"{name!r}: give the face model a name of letters, digits, '-' and '_' with --name")
     if not path.is_file() and not is_ict_folder(path):
-        raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
+        raise UserError(no_model_file(path))
     with hold(cache_folder() / "face_models" / "added" / name):
         return _add(path, name, shareable, teeth)
 

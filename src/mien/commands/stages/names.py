@@ -136,3 +136,11 @@ def _same_content(first: Path, second: Path) -> bool:
     if not (first.is_file() and second.is_file()) or first.stat().st_size != second.stat().st_size:
         return False
     return file_digest(first) == file_digest(second)
+
+
+def no_model_file(path: Path) -> str:
+    """Return the message on a path that is neither a file nor ICT-FaceKit's folder."""
+    files = "FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz"
+    if path.is_dir():
+        return f"{path}: is a folder, and not ICT-FaceKit's FaceXModel; give a file in it: gnm_head.npz, {files}"
+    return f"{path}: no such file; give {files}"

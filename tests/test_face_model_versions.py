@@ -1,0 +1,165 @@
+"""A tracking on another version of its face model is refused, by the colours of the skin in its pictures."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import dataset_scene
+import dataset_writers
+from dataset_cases import NoDetector
+from dataset_scene import Scene, make_scene
+from dataset_writers import write_benchmark, write_flash_avatar, write_imavatar, write_insta, write_vhap
+from flame_like import write_npz
+from mien.datasets import TrackedSequence, overlay, recognised
+from mien.datasets.overlay import check_overlay, check_version
+from mien.datasets.steadiness import Steadiness, measure_steadiness
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams
+from mien.face.flame import flame_face_model, read_flame
+from mien.tracking.landmarks import with_regions_by_landmarks
+
+SIDE, TIMESTEPS = 256, 10
+PAINTS = {
+    "lips": (0.7, 0.25, 0.25), "brows": (0.2, 0.12, 0.08), "irises": (0.1, 0.1, 0.15), "scalp": (0.2, 0.15, 0.1),
+    "eyes": (0.95, 0.95, 0.95),
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def larger_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw pictures of twice the size, and leave out the detector, which takes seconds."""
+    monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
+    for module in (dataset_scene, dataset_writers):
+        monkeypatch.setattr(module, "SIDE", SIDE)
+    for name in ("OFF_CENTRE", "UNEQUAL"):
+        monkeypatch.setattr(dataset_writers, name, getattr(dataset_writers, name) * [[2.0], [2.0], [1.0]])
+
+
+@pytest.fixture(scope="module")
+def scene(anny, tmp_path_factory) -> Scene:
+    """Return a head with lips, brows and eyes that moves, with an identity as large as a person's."""
+    made = make_scene(anny, tmp_path_factory.mktemp("flame"), TIMESTEPS)
+    painted = with_regions_by_landmarks(made.model)
+    colors = torch.tensor([0.85, 0.65, 0.55]).repeat(len(made.model.template), 1)
+    for region, color in PAINTS.items():
+        colors[painted.faces[painted.region_mask(region)].unique()] = torch.tensor(color)
+    return replace(made, colors=colors)
+
+
+def mixed(scene: Scene, folder: Path, of: str) -> FaceModel:
+    """Return another version: the mean head is the same, and its identities or expressions are in another order."""
+    random, count = np.random.default_rng(0), int(scene.arrays["identities"])
+    basis = scene.arrays["shapedirs"].copy()
+    if of in ("identity", "both"):
+        basis[..., :count] = basis[..., random.permutation(count)]
+    if of in ("expressions", "both"):
+        basis[..., count:] = basis[..., count + random.permutation(basis.shape[2] - count)]
+    path = write_npz(folder / f"{of}.npz", {**scene.arrays, "shapedirs": basis})
+    return replace(flame_face_model(read_flame(path), f"other_{of}"), landmarks=scene.model.landmarks)
+
+
+def read(path: Path, model: FaceModel) -> list[TrackedSequence]:
+    found = list(recognised(path)[0].read(path, model))  # type: ignore[arg-type]
+    assert all(isinstance(each, TrackedSequence) for each in found)
+    return found  # type: ignore[return-value]
+
+
+@pytest.fixture(scope="module")
+def others(scene: Scene, tmp_path_factory) -> dict[str, FaceModel]:
+    folder = tmp_path_factory.mktemp("other")
+    return {of: mixed(scene, folder, of) for of in ("identity", "expressions", "both")}
+
+
+def test_other_versions_are_refused(scene: Scene, others: dict[str, FaceModel], tmp_path: Path) -> None:
+    folder = write_insta(tmp_path / "me", scene)
+    (sequence,) = read(folder, scene.model)
+    found = measure_steadiness(sequence)
+    assert found.identity is not None
+    assert found.identity < 0.9
+    assert found.expression is not None
+    assert found.expression < 0.9
+    for of, told in (("identity", "identity"), ("expressions", "expressions"), ("both", "identity")):
+        with pytest.raises(UserError, match="another version of the model; it needs FLAME 2020") as refused:
+            read(folder, others[of])
+        message = str(refused.value)
+        assert f"% more with the tracking's {told} on 'other_{of}' than without" in message
+        assert message.startswith(f"{folder}: in me, ")
+        assert "\n" not in message
+        for remedy in ("FLAME 2023 Open", "--face-model", "--retrack"):
+            assert remedy in message
+
+
+WRITERS: dict[str, Callable[[Path, Scene], Path]] = {
+    "flash-avatar": write_flash_avatar,
+    "imavatar": lambda folder, scene: write_imavatar(folder, scene, ("MVI_1810",)),
+    "vhap": lambda folder, scene: write_vhap(folder, scene, size=(SIDE, SIDE + 16)),
+    "nersemble-benchmark": write_benchmark,
+}
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_other_versions_are_found_in_every_layout(
+    scene: Scene, others: dict[str, FaceModel], tmp_path: Path, layout: str
+) -> None:
+    folder = WRITERS[layout](tmp_path / "me", scene)
+    (sequence,) = read(folder, scene.model)
+    check_version(folder, sequence, "FLAME")
+    with pytest.raises(UserError, match="on 'other_expressions' than without, so this is another version"):
+        check_version(folder, replace(sequence, face_model=others["expressions"]), "FLAME")
+
+
+def test_what_cannot_be_compared_is_left_out(scene: Scene, tmp_path: Path) -> None:
+    """Few frames, a small face, a face without expressions, and a head without motion say nothing of a version."""
+    (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
+    face, capture = sequence.tracking.face, sequence.capture
+
+    def measured(face: FaceParams, images: np.ndarray = capture.images) -> Steadiness:
+        tracking = replace(sequence.tracking, face=face)
+        few = replace(
+            capture, images=images, timestamps=capture.timestamps[: len(face)], mattes=capture.mattes[: len(face)],
+            landmarks=capture.landmarks[: len(face)], valid=capture.valid[: len(face)],
+        )  # fmt: skip
+        return measure_steadiness(replace(sequence, capture=few, tracking=tracking))
+
+    assert measured(face[:7], capture.images[:7]) == Steadiness(None, None)
+    assert measured(replace(face, head_translation=3 * face.head_translation)) == Steadiness(None, None)
+    assert measured(replace(face, expression=0.1 * face.expression)).expression is None
+    still = replace(
+        face,
+        head_rotation=face.head_rotation[:1].expand(len(face), 3),
+        head_translation=face.head_translation[:1].expand(len(face), 3),
+    )
+    assert measured(still).identity is None
+
+
+def test_a_tracking_that_is_off_by_some_pixels_is_not_refused(scene: Scene, tmp_path: Path) -> None:
+    """Each frame is moved to where it fits best. Without that, the shares are 0.73 and 0.81."""
+    (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
+    off = torch.tensor(np.random.default_rng(2).uniform(-0.0025, 0.0025, (TIMESTEPS, 3)) * (1, 1, 0)).float()
+    face = replace(sequence.tracking.face, head_translation=sequence.tracking.face.head_translation + off)
+    found = measure_steadiness(replace(sequence, tracking=replace(sequence.tracking, face=face)))
+    assert found.identity is not None
+    assert found.identity < 0.66
+    assert found.expression is not None
+    assert found.expression < 0.75
+
+
+def test_pictures_of_another_size_are_told(scene: Scene, tmp_path: Path) -> None:
+    (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
+    capture, (view,) = sequence.capture, sequence.tracking.cameras
+    images = np.stack([cv2.resize(image, (400, 384)) for image in capture.images[:, 0]])[:, None]
+    mattes = np.stack([cv2.resize(matte, (400, 384)) for matte in capture.mattes[:, 0]])[:, None]
+    views = (replace(view, width=400, height=384),)
+    larger = replace(
+        sequence,
+        capture=replace(capture, images=images, mattes=mattes, calibration=views),
+        tracking=replace(sequence.tracking, cameras=views),
+    )
+    with pytest.raises(UserError, match="these have 400x384 pixels, and the tracking was made on about 265x248, so"):
+        check_overlay(tmp_path, larger, "FLAME")
+    check_overlay(tmp_path, sequence, "FLAME")
