@@ -49,7 +49,7 @@ def filmed(picture: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     colors, places = np.unique(packed, return_inverse=True)
     aims = to_light((colors[:, None] >> np.array([16, 8, 0], np.uint32) & 255) / 255)
     back, light = np.linalg.inv(matrix[:, :3]).T, aims.copy()
-    for _ in range(40):
+    for _ in range(15):
         light += (aims - polynomial(light, matrix)) @ back
     seen = np.rint(255 * to_srgb(light)).astype(np.uint8)
     return seen[places.reshape(picture.shape[:2])]
