@@ -77,7 +77,7 @@ def make(out: Path, parts: Sequence[str], pythons: Sequence[str], dirty: bool) -
 def make_sdist(out: Path) -> None:
     """The source distribution, without tests, history and pictures, and without MediaPipe's code for pages.
 
-    That code, 12 MB, lies in the checkout for the wheels (`make landmarker`). So the sdist is built elsewhere.
+    That code, 2.7 MB, lies in the checkout for the wheels (`make landmarker`). So the sdist is built elsewhere.
     """
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "source"
