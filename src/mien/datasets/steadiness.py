@@ -116,7 +116,7 @@ def _deviations(images: list[UInt8[np.ndarray, "h w 3"]], own: _Seen, others: li
         or not all(np.isfinite(each).all() for each in pixels)
     ):
         return None
-    spreads = [_spread(each, facing) for each in _colours(images, pixels, eyes)]
+    spreads = [_spread(each, facing) for each in _colors(images, pixels, eyes)]
     shifts = [each - pixels[0] for each in pixels[1:]]
     motions = [np.linalg.norm(each - _over_frames(np.nanmean, each, facing), axis=-1)[facing] / eyes for each in shifts]
     return _Deviation(spreads[0], np.stack(spreads[1:]), np.stack(motions))
@@ -141,7 +141,7 @@ def _over_frames(
     return result
 
 
-def _colours(
+def _colors(
     images: list[UInt8[np.ndarray, "h w 3"]], pixels: list[Float[np.ndarray, "t l 2"]], eyes: float
 ) -> list[Float[np.ndarray, "t s l 3"]]:
     """Return the blurred colours of pictures at each set of points, for each shift of `_SHIFTS`."""
