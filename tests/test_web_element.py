@@ -246,6 +246,25 @@ def scene_camera(turn: float, side: int) -> runtime.Camera:
     return runtime.Camera(K.astype(np.float32), viewmat.astype(np.float32), side, side)
 
 
+@pytest.mark.parametrize("is_built", [True, False])
+def test_packing_leaves_what_was_there(is_built: bool, tmp_path: Path) -> None:
+    """`npm pack` builds the package, and removes the build if there was none before."""
+    node()
+    scripts = json.loads((WEB / "package.json").read_text())["scripts"] | {
+        "build": "mkdir -p dist && touch dist/mien.js"
+    }
+    (tmp_path / "package.json").write_text(
+        json.dumps({"name": "a", "version": "1.0.0", "files": ["dist"], "scripts": scripts})
+    )
+    if is_built:
+        (tmp_path / "dist").mkdir()
+    done = subprocess.run(["npm", "pack", "--json"], cwd=tmp_path, check=True, capture_output=True)
+    assert (tmp_path / "dist").exists() == is_built
+    assert not (tmp_path / ".dist_stays").exists()
+    (packed,) = json.loads(done.stdout)
+    assert {entry["path"] for entry in packed["files"]} == {"package.json", "dist/mien.js"}
+
+
 def test_the_package_has_what_it_promises() -> None:
     """Every file that package.json names is built, with types, and nothing else goes to a registry."""
     node()
