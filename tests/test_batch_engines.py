@@ -36,7 +36,9 @@ def ray_cluster() -> Iterator[Any]:
             cluster.add_node(**node)
             cluster.add_node(**node)
             break
-        except Exception:  # A node waits 30 s for its agent, which is too short where other programs take the processor.
+        except (
+            Exception
+        ):  # A node waits 30 s for its agent, which is too short where other programs take the processor.
             cluster.shutdown()
             if not tries_left:
                 raise

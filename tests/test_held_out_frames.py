@@ -67,3 +67,22 @@ def test_held_out_frames_change_no_byte_of_an_avatar(method: str, plain: bool, t
     assert avatars[1].filmed is not None
     for one, other in zip(vars(avatars[0].filmed).values(), vars(avatars[1].filmed).values(), strict=True):
         assert torch.equal(torch.as_tensor(one), torch.as_tensor(other))
+
+
+@pytest.mark.parametrize("method", ["gaussian_avatars", "headgas", "mono_gaussian_avatar"])
+def test_timesteps_that_are_left_out_change_no_byte_of_an_avatar(method: str, tmp_path: Path) -> None:
+    """`mien analyze --parts diversity` trains on a part of the timesteps, and calls the others not valid."""
+
+    def part(sequence: Sequence) -> Sequence:
+        valid = sequence.tracking.valid.clone()
+        valid[SHOWN:] = False
+        return replace(sequence, tracking=replace(sequence.tracking, valid=valid))
+
+    face_model, sequence = toy_sequence(TIMESTEPS, 32)
+    settings = replace(SETTINGS, split="none")
+    first, second = (
+        train([part(one)], face_model, replace(plain_config(method), **SMALL[method]), settings, tmp_path / str(index))
+        for index, one in enumerate((sequence, absurd(sequence)))
+    )
+    for name, tensor in first.state_dict().items():
+        assert torch.equal(tensor, second.state_dict()[name]), name
