@@ -85,6 +85,7 @@ def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) 
     ("create a.mp4 --helpp", "--help"),
     ("train here --training.step 3", "--steps"),
     ("create --method headgas --step 3 --out here a.mp4", "--steps"),
+    ("bench quality --captures beard --oput here", "--out"),
 ])  # fmt: skip
 def test_an_unknown_option_is_told_with_the_one_that_was_meant(
     arguments: str, near: str, capsys: pytest.CaptureFixture[str]

@@ -98,9 +98,13 @@ def _unknown_options(arguments: Sequence[str], options: type, style: Any) -> str
     """
     import tyro
 
-    shown = io.StringIO()
-    with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
-        tyro.cli(options, args=["--help"], config=style)
+    shown, told = io.StringIO(), io.StringIO()
+    # A sub-command has options of its own.
+    first = [argument for argument in arguments[:1] if not argument.startswith("-")]
+    with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(told), contextlib.suppress(SystemExit):
+        tyro.cli(options, args=[*first, "--help"], config=style)
+    if not shown.getvalue():
+        return None  # there is no such sub-command
     known = [*re.findall(r"(?<![\w.-])--[a-z][\w.-]*", shown.getvalue()), "--help-all"]
     names = [argument.partition("=")[0].replace("_", "-") for argument in arguments]
     unknown = [name for name in dict.fromkeys(names) if re.match("--[a-z]", name) and name not in known]

@@ -45,7 +45,8 @@ class Steadiness:
     """Spread of the skin's colours over the frames, as a share of the spread without some coefficients.
 
     A right model has less than 1, because its coefficients make the mesh follow the face. None stands for a comparison
-    that says nothing: there are few frames, or the face is small, or the coefficients hardly move it.
+    that says nothing: there are few frames, or the face is small, or the coefficients hardly move it, or the model
+    has no such points.
     """
 
     identity: float | None
@@ -65,7 +66,7 @@ def measure_steadiness(sequence: TrackedSequence) -> Steadiness:
     """Compare the spread of the skin's colours with that of the mean head, and of the face without expressions."""
     capture, face = sequence.capture, sequence.tracking.face
     timesteps = _spread_out(capture.timesteps, _FRAMES)
-    if len(timesteps) < _MIN_FRAMES:
+    if len(timesteps) < _MIN_FRAMES or _LANDMARKS not in sequence.face_model.landmarks:
         return Steadiness(None, None)
     some = face[timesteps]
     rests = (

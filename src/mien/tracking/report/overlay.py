@@ -105,10 +105,12 @@ class OverlayPainter:
         self, image: UInt8[np.ndarray, "h w 3"], vertices: Float[torch.Tensor, "v 3"], timestep: int, camera_index: int
     ) -> UInt8[np.ndarray, "h w 3"]:
         tracking, camera = self._tracking, self._tracking.cameras[camera_index]
-        marks = camera.project(self._face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
+        marks = np.empty((0, 2))
+        if "mediapipe" in self._face_model.landmarks:
+            marks = camera.project(self._face_model.landmark_positions(vertices, "mediapipe"))[0].numpy()
         picture = image.copy()  # A capture read from disk is read-only.
         detected = np.asarray(self._capture.landmarks[timestep, camera_index])
-        if len(tracking.cameras) > 1:
+        if len(tracking.cameras) > 1 and len(marks):
             # Landmarks on the far side of the head are guesses, which look like failures.
             seen = visible_landmarks(self._face_model, vertices, camera).numpy()
             detected, marks = detected[seen], marks[seen]
