@@ -84,7 +84,7 @@ def sheet_rows(
 def write_overlay_sheet(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
     """Write at most six pictures in a row, cut to the head, with the mesh over the same pictures below them.
 
-    Timesteps are evenly spread, and so are cameras, beginning with the frontal one. It takes less than a second, so an
+    Timesteps are evenly spread, and so are cameras, beginning with the frontal one. They are few, so an
     import writes it for every sequence.
     """
     painter, cameras = OverlayPainter(capture, tracking, face_model), len(tracking.cameras)
