@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, Rate
 from mien.avatar.mono_gaussian_avatar import motion
@@ -414,3 +415,39 @@ def test_nearest_vertices_of_many_points_take_little_memory(monkeypatch: pytest.
     found = nearest_vertices(points, vertices)
     assert torch.equal(found, (points[:, None] - vertices).norm(dim=-1).argmin(1))
     assert max(sizes) == 64
+
+
+def test_losses_near_the_face_model_hold_no_distances_of_all_pairs() -> None:
+    """Their largest array is some numbers for each point, with any number of vertices."""
+    model = toy_face_model(rings=40, around=40)
+    points, vertices = 20_000, len(model.template)
+    outputs = 3 * (1 + model.expression_basis.shape[0] + 9 * len(model.free_joint_names)) + len(model.joint_names) + 1
+    avatar = new_avatar(plain_mono_gaussian_avatar(points=points, max_points=points, face_points=points), model)
+    with LargestArray() as arrays:
+        sum(avatar.regularizers(avatar.pose(toy_face(5)[0]), pictured(points), Progress(0, 100)).values()).backward()
+    widest = 2 * max(outputs, 2 * avatar.config.deformation_width)
+    assert widest < vertices / 3, "the bound would not see them"
+    assert points <= arrays.numbers <= points * widest
+
+
+class LargestArray(TorchDispatchMode):
+    """Notes how many numbers the largest array has that PyTorch makes."""
+
+    numbers = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        made = func(*args, **(kwargs or {}))
+        tensors = made if isinstance(made, tuple | list) else (made,)
+        self.numbers = max([self.numbers, *(one.numel() for one in tensors if isinstance(one, Tensor))])
+        return made
+
+
+def test_neighbors_are_found_where_points_are_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A point that moves to another vertex within a round is compared with that one."""
+    avatar, asked = new_avatar(), []
+    monkeypatch.setattr(motion, "nearest_vertices", lambda *them: asked.append(nearest_vertices(*them)) or asked[-1])
+    for _ in range(2):
+        avatar.regularizers(avatar.pose(toy_face(5)[0]), pictured(30), Progress(0, 100))
+        with torch.no_grad():
+            avatar.store["means"].neg_()
+    assert (asked[0] != asked[1]).float().mean() > 0.9

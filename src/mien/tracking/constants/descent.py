@@ -48,9 +48,6 @@ class DescentConstants:
     """Share by which a turn of the very first frame's steps must lower its cost for another turn. Not varied."""
     first_most_turns: int = 8
     """Largest number of turns. One alone leaves vertices 1.51 mm off instead of 1.48 on drawn frames."""
-    pass_smoothness: float = 0.0
-    """Factor of the smoothness of motion in the pass along the frames; the epochs have all of it. With 1, as the paper
-    has it, motion errs more on drawn frames: 0.08 -> 0.17 degrees of rotation, landmarks 0.08 -> 0.14 px (log)."""
     further_start_divisor: int = 5
     """The first frames of further sequences get the first frame's number of steps divided by this. Not varied."""
 

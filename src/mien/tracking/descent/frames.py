@@ -161,7 +161,7 @@ def _turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appe
 
 def _fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
     sequence, row = targets[0].sequence, targets[0].row
-    rate, smoothness = descent.scene.settings.rates.frame, TRACKING.descent.pass_smoothness
+    rate, smoothness = descent.scene.settings.rates.frame, descent.scene.settings.pass_smoothness
     stepper = descent.stepper(sequence, row, smoothness)
     weights, even, around = descent.trusted(), list(targets), _expected_around(descent, sequence, row)
     for step in range(steps):
