@@ -424,7 +424,8 @@ def test_losses_near_the_face_model_hold_no_distances_of_all_pairs() -> None:
     outputs = 3 * (1 + model.expression_basis.shape[0] + 9 * len(model.free_joint_names)) + len(model.joint_names) + 1
     avatar = new_avatar(plain_mono_gaussian_avatar(points=points, max_points=points, face_points=points), model)
     with LargestArray() as arrays:
-        sum(avatar.regularizers(avatar.pose(toy_face(5)[0]), pictured(points), Progress(0, 100)).values()).backward()
+        losses = avatar.regularizers(avatar.pose(toy_face(5)[0]), pictured(points), Progress(0, 100))
+        torch.stack(list(losses.values())).sum().backward()
     widest = 2 * max(outputs, 2 * avatar.config.deformation_width)
     assert widest < vertices / 3, "the bound would not see them"
     assert points <= arrays.numbers <= points * widest
