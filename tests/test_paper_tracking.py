@@ -103,6 +103,26 @@ def test_every_camera_of_a_timestep_counts_in_every_step(case):
     assert both == pytest.approx((one + other) / 2, rel=1e-5)
 
 
+def test_every_step_of_pass_and_epochs_has_all_cameras(case, monkeypatch):
+    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, first_steps=2, steps=1, texture_steps=1))
+    descent, counts = _descent(case, settings), []
+    frame_cost = Descent.frame_cost
+
+    def counted(self: Descent, targets: list, *more: object) -> torch.Tensor:
+        counts.append(len(targets))
+        return frame_cost(self, targets, *more)
+
+    monkeypatch.setattr(Descent, "cameras", lambda *_: [0, 0])  # one camera, seen twice
+    monkeypatch.setattr(Descent, "frame_cost", counted)
+    cache = StageCache(None)
+    frames.fit_sequence(descent, 0, lambda *_, **__: None, cache)
+    in_pass, descent.done = len(counts), descent.frames
+    descent.fit_epoch(0, lambda *_, **__: None, cache)
+    assert len(counts) == in_pass + descent.frames
+    assert in_pass > descent.frames
+    assert set(counts) == {2}
+
+
 def test_the_frame_pass_can_be_smooth_in_both_directions(case):
     """A frame's neighbours are those before it, as fitted, and those after it, as they are expected."""
     settings = replace(LANDMARKS, schedule="paper", paper=QUICK)
