@@ -265,7 +265,7 @@ def test_figures_of_wide_gaussians_are_those_of_the_log() -> None:
     )
     gaps = [rounds(int(number.replace(",", ""))) for number in (steps, more_steps)]
     says("a round every {} or {} steps instead of every 2,000".format(*(steps[1] - steps[0] for steps in gaps)),
-         "With the rule, foreheads get holes.", "removes Gaussians that are wider than 20 pixels on screen",
+         "With the rule, foreheads get holes.", "removes Gaussians with a radius of more than 20 pixels on screen",
          "Neither was run at full length.")  # fmt: skip
 
 
