@@ -56,6 +56,19 @@ def test_a_file_is_read_as_it_was_written(tmp_path, monkeypatch):
     assert read_response(other, 0.002).rest_sigma == 0.002
 
 
+def test_another_detector_has_what_people_differ_by_from_mediapipe(tmp_path, monkeypatch):
+    model = make_small_face_model()
+    ours, theirs = (_some_response(len(model.expression_names), seed=seed) for seed in (0, 1))
+    where = "mien.tracking.landmarks.detector_response.response_path"
+    monkeypatch.setattr(where, lambda name, detector="mediapipe": tmp_path / f"{name}_{detector}.npz")
+    write_response(tmp_path / f"{model.name}_litert.npz", model, theirs, 5, "litert")
+    assert len(read_response(model, 0.003, "litert").by_person) == 0, "nothing is known without mediapipe's file"
+    write_response(tmp_path / f"{model.name}_mediapipe.npz", model, ours, 5)
+    read = read_response(model, 0.003, "litert")
+    for name, expected in (("mean", theirs), ("by_turn", theirs), ("by_expression", ours), ("by_person", ours)):
+        torch.testing.assert_close(getattr(read, name), getattr(expected, name), atol=3e-6, rtol=0)
+
+
 def _people(truth: DetectorResponse, count: int, pictures: int = 30) -> list[Sightings]:
     random = torch.Generator().manual_seed(7)
     people = []

@@ -12,7 +12,7 @@ from mien import runtime
 from mien.cli import main
 from mien.errors import UserError
 from mien.export import find_webcam_files, write_page
-from mien.export.webcam import OWN, POLICY, VERSION, webcam_part
+from mien.export.webcam import OWN, POLICY, VERSION, own_model, webcam_part
 from web_case import WEB, drawn_head, tasks_vision
 
 
@@ -62,13 +62,33 @@ def test_the_command_needs_nothing_but_what_comes_with_mien(
 
 def test_the_model_comes_with_its_licence() -> None:
     """The file is that which MediaPipe publishes, and NOTICE says so."""
-    content = (OWN / "face_landmarker.task").read_bytes()
+    content = own_model()
     digest = hashlib.sha256(content).hexdigest()
     assert (len(content), digest) == (3_758_596, "64184e229b263107bc2b804c6625db1341ff2bb731874b0bcc2fe6544e0bc9ff")
     notice = (OWN / "NOTICE").read_text()
     assert f"{len(content):,} bytes" in notice
     assert digest in notice
     assert "Apache License" in (OWN / "LICENSE").read_text()
+
+
+def test_a_model_without_its_second_part_is_explained(
+    avatar_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """mien from a source distribution lacks the network for blend shapes. A model that is given serves."""
+    monkeypatch.setenv("MIEN_TASKS_VISION", str(tasks_vision()))
+    monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
+    model, expected = tmp_path / "any.task", webcam_part(find_webcam_files())
+    model.write_bytes(own_model())
+    shutil.copy(OWN / "face_landmarker.task.xz.1", tmp_path)
+    monkeypatch.setattr("mien.export.webcam.OWN", tmp_path)
+    assert exported(avatar_file, "--webcam") == 2
+    told = capsys.readouterr().err
+    assert "mien's source distribution leaves out" in told
+    assert "--webcam-model" in told
+    assert webcam_part(find_webcam_files(model)) == expected
+    model.write_bytes(b"")
+    assert exported(avatar_file, "--webcam", "--webcam-model", str(model)) == 2
+    assert "mien has one" not in capsys.readouterr().err
 
 
 def test_a_wrong_model_is_explained(

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import tomllib
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,26 @@ def test_a_missing_package_is_named_with_its_extra(
     assert done.stderr.count("\n") == 1
     assert package in done.stderr
     assert f"pip install 'mien[{extra}]'" in done.stderr
+
+
+def test_a_file_is_viewed_without_torch(exported: Path):
+    """With mien[viewer] alone, the viewer serves its page. viser brings zstandard, and pillow by imageio."""
+    missing = set(extras.EXTRA_OF) - {"viser", "zstandard", "PIL"}
+    words = [sys.executable, "-c", WITHOUT.format(missing=sorted(missing)), "view", str(exported), "--port", "0"]
+    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as viewer:
+        assert viewer.stdout is not None
+        told = []
+        try:
+            for line in viewer.stdout:
+                told.append(line)
+                if address := next((word for word in line.split() if word.startswith("http://")), None):
+                    with browser.open(address, timeout=60) as answer:
+                        assert b"<html" in answer.read()
+                    return
+        finally:
+            viewer.terminate()
+    pytest.fail("".join(told))
 
 
 def test_a_missing_library_of_the_system_is_named():

@@ -1,7 +1,12 @@
 """The detector on ai-edge-litert: like mediapipe's, on drawn and real faces, near and far; and who chooses it."""
 
+import hashlib
+import io
 import itertools
+import re
+import zipfile
 from dataclasses import replace
+from importlib import resources
 from importlib.util import find_spec
 
 import cv2
@@ -12,9 +17,11 @@ from mien.capture import backend
 from mien.capture.faces import FaceFinder, LandmarkDetector, MeshReader
 from mien.capture.from_video import open_job
 from mien.capture.litert.mesh import Mesh
+from mien.capture.litert.networks import network_content
 from mien.capture.matte import Segmenter
 from mien.capture.settings import CaptureSettings
 from mien.capture.video import read_video_frames
+from mien.export.webcam import own_model
 from mien.face import FaceModel
 from mien.lab.synthetic import SyntheticRecipe, SyntheticScene
 from mien.picture_files import write_png
@@ -108,6 +115,19 @@ def test_a_capture_by_litert_is_another_capture(drawn, tmp_path):
     assert [backend.detector_of(backend.detector_entry(job.detector)) for job in jobs.values()] == [
         "mediapipe", "mediapipe", "litert",
     ]  # fmt: skip
+
+
+def test_networks_are_the_published_ones():
+    """After decompression, two have the sums of NOTICE; two are files of face_landmarker.task, whose sum is tested."""
+    notice = (resources.files("mien.capture") / "data" / "NOTICE").read_text(encoding="utf-8")
+    for name, file in (("far_faces", "face_detection_full_range_sparse"), ("person", "selfie_segmentation")):
+        content = network_content(name)
+        told = re.search(rf"{file}\.tflite: ([\d,]+) bytes, SHA-256\s+([0-9a-f]{{64}})\.", notice)
+        assert told is not None
+        assert told.groups() == (f"{len(content):,}", hashlib.sha256(content).hexdigest())
+    with zipfile.ZipFile(io.BytesIO(own_model())) as task:
+        assert network_content("near_faces") == task.read("face_detector.tflite")
+        assert network_content("landmarks") == task.read("face_landmarks_detector.tflite")
 
 
 def test_each_detector_has_its_own_offsets(anny: FaceModel):

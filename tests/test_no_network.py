@@ -1,14 +1,45 @@
 """Every command works, and finds nobody to call, in a network namespace that has not even a loopback."""
 
+import fcntl
 import os
+import shutil
+import socket
+import struct
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
 
+from batch_stub import PROGRAM
 from mien.avatar import DEFAULT_METHOD
+from mien.cli import COMMANDS
 from needs import NO_NAMESPACE
+from toy_workspace import write_toy_workspace
+
+LINES = {
+    "create": "{video} --out {out}/created --preset draft --steps 2 --alignment.when never",
+    "capture": "{video} --out {out}/captured",
+    "track": "{me} --again",
+    "align": "{me} --alignment.template-steps 2 --alignment.iterations 1",
+    "train": "{me} --run third --steps 2",
+    "evaluate": "{me} --run {run}",
+    "analyze": "gaussian-avatars {me} --run {run} --parts speed --seconds 0.01",
+    "study": "make {me} --out {out}/study.html --seconds 0.2 --side 64",
+    "render": "{mien} --out {out}/still.png",
+    "drive": "{me} --run {run} --by {me} --out {out}/driven.mp4",
+    "export": "{me} --run {run} --out {out}/me.html",
+    "import": "{exported} --out {out}/imported",
+    "batch": "{table} --out {out}/batch --program {stub}",
+    "face-models": "--json",
+    "bench": "render --seconds 0.01 --json",
+    "licenses": "--json",
+    "plugins": "--json",
+}
+"""A line of every command. `demo` makes the subject, and `view` has a test of its own."""
+DATASET = "gaussian-avatars"
+_FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
 
 
 def offline(*arguments: str, code: int = 0) -> str:
@@ -23,26 +54,34 @@ def offline(*arguments: str, code: int = 0) -> str:
 
 @pytest.fixture(scope="module")
 def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A demo whose video, capture, tracking, training and report were made without a network."""
+    """A demo whose video, capture, tracking, training and report were made without a network; beside it, its files."""
     tried = subprocess.run(["unshare", "-rn", "true"], capture_output=True, check=False) if os.name == "posix" else None
     if tried is None or tried.returncode:
         pytest.skip(NO_NAMESPACE)
     folder = tmp_path_factory.mktemp("offline") / "me"
     offline("demo", "--out", str(folder), "--seconds", "0.6", "--steps", "2")
+    offline("export", str(folder), "--out", str(folder.parent / "me.mien"))
+    write_toy_workspace(folder.parent / "toy")
+    offline("export", str(folder.parent / "toy"), "--out", str(folder.parent / "exported"), "--format", DATASET)
     return folder
 
 
+def test_every_command_is_tried() -> None:
+    assert {*LINES, "demo", "view"} == set(COMMANDS)
+
+
 @pytest.mark.slow
-def test_an_avatar_is_made_and_used_without_a_network(subject: Path) -> None:
-    run = subject / "runs" / DEFAULT_METHOD
-    assert (run / "report.html").is_file()
-    avatar, out = str(subject), subject.parent
-    for ending in ("html", "mien"):
-        offline("export", avatar, "--out", str(out / f"me.{ending}"))
-    offline("render", str(out / "me.mien"), "--out", str(out / "still.png"))
-    offline("drive", avatar, "--by", avatar, "--out", str(out / "driven.mp4"))
-    assert (out / "still.png").is_file()
-    assert (out / "driven.mp4").is_file()
+@pytest.mark.parametrize("command", LINES)
+def test_a_command_needs_no_network(subject: Path, tmp_path: Path, command: str) -> None:
+    me, video = tmp_path / "me", next(subject.glob("synthetic*.mp4"))
+    shutil.copytree(subject, me)
+    shutil.copytree(me / "runs" / DEFAULT_METHOD, me / "runs" / "second")
+    (tmp_path / "table.csv").write_text(f"video\n{video}\n")
+    given = {
+        "me": me, "run": DEFAULT_METHOD, "video": video, "out": tmp_path, "table": tmp_path / "table.csv",
+        "mien": subject.parent / "me.mien", "exported": subject.parent / "exported", "stub": " ".join(PROGRAM),
+    }  # fmt: skip
+    offline(command, *(word.format(**given) for word in LINES[command].split()))
 
 
 @pytest.mark.slow
@@ -52,11 +91,37 @@ def test_a_capture_by_litert_is_made_without_a_network(subject: Path) -> None:
     offline("capture", str(video), "--out", str(subject.parent / "other"), "--capture.detector", "litert")
 
 
-@pytest.mark.parametrize("command", ["view", "create", "study", "bench"])
-def test_help_needs_no_network(subject: Path, command: str) -> None:
-    assert f"mien {command}" in offline(command, "--help")
+@pytest.mark.slow
+def test_the_viewer_needs_no_network_but_the_loopback(subject: Path) -> None:
+    """It serves its page to this machine, where nothing else can be reached."""
+    code = "import sys; from test_no_network import view_alone; view_alone(sys.argv[1])"
+    avatar, here = str(subject.parent / "me.mien"), {"PYTHONPATH": str(Path(__file__).parent)}
+    words = ["unshare", "-rn", sys.executable, "-c", code, avatar]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=400, check=False, env=os.environ | here)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "<html" in done.stdout
 
 
-def test_licences_and_plugins_need_no_network(subject: Path) -> None:
-    assert "mien" in offline("licenses", "--json")
-    offline("plugins")
+def view_alone(avatar: str) -> None:
+    """Raise the loopback of this namespace, show an avatar, and print the viewer's page."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        asked = struct.pack("16sH14x", b"lo", 0)
+        _, flags = struct.unpack("16sH14x", fcntl.ioctl(any_socket, _FLAGS, asked))
+        fcntl.ioctl(any_socket, _SET_FLAGS, struct.pack("16sH14x", b"lo", flags | _UP))
+    words = [sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]
+    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as viewer:
+        assert viewer.stdout is not None
+        lines = []
+        try:
+            for line in viewer.stdout:
+                lines.append(line)
+                address = next((word for word in line.split() if word.startswith("http://")), None)
+                if address is not None:
+                    with browser.open(address, timeout=60) as answer:
+                        print(answer.read().decode())
+                    break
+            else:
+                sys.exit("".join(lines))
+        finally:
+            viewer.terminate()

@@ -48,7 +48,7 @@ COMMANDS = {
     "face-models": "list the face models and bake them ahead of time",
     "bench": "speed of this machine; quality on reference captures with known truth",
     "licenses": "what is installed, under which terms, and what that means",
-    "plugins": "what other packages add: methods, formats and datasets, and what is wrong with them",
+    "plugins": "what other packages add: methods, formats, datasets and engines, and their faults",
     "demo": "the whole path on a synthetic head, in minutes: start here",
 }
 """Name -> summary. `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.

@@ -11,7 +11,7 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.batch.drive import Driver, shard_of
-    from mien.batch.engines import EngineOptions
+    from mien.batch.engines import ENGINES, Engine, EngineOptions, engine_named, engine_names
     from mien.batch.plan import WORKSPACE, Batch, Row, State, with_fingerprint
     from mien.batch.progress import batch_progress, progress_text
     from mien.batch.results import RESULT_COLUMNS, latex_table, markdown_table, means_by, result_rows, write_results
@@ -23,7 +23,8 @@ else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 
 __all__ = [
-    "RESULT_COLUMNS", "WORKSPACE", "Batch", "Driver", "EngineOptions", "Row", "State", "batch_progress", "do_with",
-    "is_url", "latex_table", "markdown_table", "means_by", "progress_text", "repeat_command", "result_rows",
-    "row_process", "run_row", "shard_of", "with_fingerprint", "write_results", "write_wall",
+    "ENGINES", "RESULT_COLUMNS", "WORKSPACE", "Batch", "Driver", "Engine", "EngineOptions", "Row", "State",
+    "batch_progress", "do_with", "engine_named", "engine_names", "is_url", "latex_table", "markdown_table", "means_by",
+    "progress_text", "repeat_command", "result_rows", "row_process", "run_row", "shard_of", "with_fingerprint",
+    "write_results", "write_wall",
 ]  # fmt: skip

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from mien.batch.engines import EARLIER, PLACES, Engine, EngineOptions, Work
+from mien.batch.engines import EngineOptions, Work, engine_named
 from mien.batch.plan import Batch, Row, State
 from mien.batch.row import PROGRAM, attempt
 from mien.batch.store import Returned, attempt_in_store
 from mien.errors import UserError
 from mien.files import write_atomically
-from mien.lazy import named
 from mien.locks import BeingWrittenError, hold, holder_of
 from mien.progress import progress_bar, say
 from mien.terminal import counted
@@ -48,16 +47,15 @@ class Driver:
 
     def run(self, rows: Sequence[Row]) -> None:
         """Run the rows until each is done, has failed too often, or is run by another command."""
-        engine: Engine = named(PLACES[self.engine])
-        if self.engine in EARLIER:
-            named(EARLIER[self.engine])(self.options.root)
+        engine = engine_named(self.engine)
+        engine.wait_for_earlier(self.options.root)
         left = [row for row in rows if not self.batch.is_done(row)]
         say(f"{counted(len(rows), 'row')}: {len(rows) - len(left)} done before, {len(left)} to do on {self.engine}")
         with progress_bar("batch", len(rows), len(rows) - len(left)) as advance:
             for turn in range(self.retry + 1):
                 with ExitStack() as claims:
                     taken = self._taken(left, claims)
-                    for row, outcome in engine(self._work(taken), taken, self.options) if taken else ():
+                    for row, outcome in engine.run(self._work(taken), taken, self.options) if taken else ():
                         done = self._keep(row, outcome)
                         if done:
                             advance(1, row.name)

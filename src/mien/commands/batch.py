@@ -6,25 +6,24 @@ import shlex
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from mien.batch import Batch, EngineOptions, shard_of
+from mien.batch import Batch, EngineOptions, engine_named, engine_names, shard_of
+from mien.commands.help_text import Described
 from mien.errors import UserError
+from mien.extras import EXTRA_OF
 from mien.terminal import show
 
 _WATCH_SECONDS = 5.0
 _TASKS = {
     "status": ("what", "watch", "as_json"),
     "table": ("what", "rows", "columns", "as_json"),
-    "local": ("out", "shard", "retry", "jobs", "threads", "store", "program"),
-    "slurm": ("out", "on", "shard", "retry", "jobs", "threads", "gpus", "partition", "time", "program"),
-    "ray": ("out", "on", "shard", "retry", "jobs", "threads", "gpus", "ray_address", "store", "program"),
 }
-"""Options that a task has, or a batch that runs on an engine. Elsewhere they would change nothing."""
-_ENGINES = {"slurm": ("submitit",), "ray": ("ray",)}
-"""Packages of the engines. One that is missing is told before the rows are read."""
+"""Options that a task has. Elsewhere they would change nothing."""
+_OF_ENGINES = ("out", "on", "shard", "retry", "jobs", "threads", "program")
+"""Options that a batch has on every engine. `mien.batch.Engine` names others."""
 NEEDS_TORCH = False
 """Rows run in processes of their own. Without torch, the driver of thousands stays small."""
 
@@ -44,8 +43,7 @@ class Command:
     """A csv or json of captures, or a folder of videos. Or a task, and the folder of a batch."""
     out: Path | None = None
     """Folder of the batch, new or existing. Needed to run rows."""
-    on: Literal["local", "slurm", "ray"] = "local"
-    """What runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
+    on: Annotated[str, Described(lambda: _engines())] = "local"
     shard: str = ""
     """Run only rows I, I+N, ..., given as I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
     retry: int = 2
@@ -91,8 +89,10 @@ class Command:
         if self.out is None:
             raise UserError("--out is missing; give a folder for the batch")
         self._check_given(self.on)
-        for package in _ENGINES.get(self.on, ()):
+        for package in engine_named(self.on).packages:
             if importlib.util.find_spec(package) is None:
+                if package not in EXTRA_OF:
+                    raise UserError(f"--on {self.on}: needs the module {package}, which is not installed; install it")
                 raise ModuleNotFoundError(f"No module named {package!r}", name=package)
         check_writable(self.out, folder=True)
         for name, value in (("retry", self.retry), ("jobs", self.jobs), ("threads", self.threads), ("time", self.time)):
@@ -124,9 +124,10 @@ class Command:
 
     def _check_given(self, task: str) -> None:
         """Check that no option is given which the task does not have."""
+        known = _TASKS.get(task) or (*_OF_ENGINES, *engine_named(task).options)
         for each in fields(self):
             value, name = getattr(self, each.name), each.name.removeprefix("as_").replace("_", "-")
-            if each.name != "what" and each.name not in _TASKS[task] and value != each.default:
+            if each.name != "what" and each.name not in known and value != each.default:
                 where = f"`mien batch {task}`" if task in ("status", "table") else f"a batch that runs on {task}"
                 raise UserError(f"--{name}: changes nothing for {where}; leave it out")
 
@@ -201,3 +202,8 @@ class Command:
         for name, text in (("table.md", markdown_table(table)), ("table.tex", latex_table(table))):
             write_atomically(batch.root / name, lambda aside, text=text: aside.write_text(text, encoding="utf-8"))
         show(json.dumps(table) if self.as_json else markdown_table(table).rstrip())
+
+
+def _engines() -> str:
+    about = "What runs the rows: processes of this machine, a Slurm cluster (submitit), a Ray cluster, or an engine of"
+    return f"{about} another package: {', '.join(engine_names())}."

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Command:
-    """List methods, formats and datasets: mien's own, and those of other packages, with what is wrong with them."""
+    """List methods, formats, datasets and engines: mien's own, and those of other packages, with their faults."""
 
     json: bool = False
     """Print an object for programs instead of a list."""
@@ -23,6 +23,7 @@ class Command:
     def run(self) -> None:
         """Print the list."""
         from mien.avatar import METHODS, Method
+        from mien.batch import ENGINES, Engine
         from mien.datasets import Dataset, datasets
         from mien.formats import Format, formats
         from mien.plugins import added
@@ -31,6 +32,7 @@ class Command:
             "methods": (list(METHODS), added("mien.methods", Method)),
             "formats": ([each.name for each in formats()], added("mien.formats", Format)),
             "datasets": ([each.name for each in datasets()], added("mien.datasets", Dataset)),
+            "engines": (list(ENGINES), added("mien.engines", Engine)),
         }
         rows = {
             group: {"own": _without(names, others), "added": list(map(asdict, others))}
@@ -44,7 +46,8 @@ class Command:
             for each in others:
                 state = f"left out: {each.fault}" if each.fault else each.place
                 show(f"  {each.name}, added by {each.package} {each.version} ({state})")
-        show('Packages add to these by entry points of the groups "mien.methods", "mien.formats" and "mien.datasets".')
+        groups = [f'"mien.{group}"' for group in found]
+        show(f"Packages add to these by entry points of the groups {', '.join(groups[:-1])} and {groups[-1]}.")
 
 
 def _without(names: list[str], others: "list[Added]") -> list[str]:

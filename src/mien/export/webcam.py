@@ -1,8 +1,9 @@
 """A webcam in a page: MediaPipe's face landmarker, embedded with its model (docs/web.md).
 
 webcam.html beside this file is built from web/ and committed. The landmarker's model comes with mien, in the folder
-`landmarker` beside this file. Its code is that of the npm package @mediapipe/tasks-vision, which `make setup` puts
-there.
+`landmarker` beside this file, compressed and in two parts. The second holds the network for blend shapes, which only
+pages need, so that source distributions leave it out. The landmarker's code is that of the npm package
+@mediapipe/tasks-vision, which `make setup` puts into the same folder.
 """
 
 import base64
@@ -41,6 +42,8 @@ _MEMBERS = {"face_detector.tflite", "face_landmarks_detector.tflite", "face_blen
 """Networks in a model that finds blend shapes."""
 _MOST_BYTES = 64 << 20
 """Largest file that goes into a page."""
+_MODEL_PARTS = ("face_landmarker.task.xz.1", "face_landmarker.task.xz.2")
+"""The model in mien's own folder: parts that are decompressed one by one and put together."""
 _SHRUNK = ".xz"
 """Further ending of files that lie compressed in mien's own folder, so that mien is quickly downloaded."""
 
@@ -51,8 +54,8 @@ class WebcamFiles:
 
     package: Path
     """Folder of the npm package."""
-    model: Path
-    """The file face_landmarker.task."""
+    model: Path | None = None
+    """The file face_landmarker.task. None for that of mien."""
 
 
 def find_webcam_files(model: Path | None = None) -> WebcamFiles:
@@ -75,20 +78,33 @@ def webcam_part(files: WebcamFiles) -> str:
     Raises:
         UserError: a file cannot be read.
     """
-    paths = {name: _place(files.package, path) for name, (path, _) in _FILES.items()} | {"model": files.model}
+    contents = {name: _read(_place(files.package, path)) for name, (path, _) in _FILES.items()}
+    contents["model"] = own_model() if files.model is None else _read(files.model)
     parts = "\n".join(
-        f'<script type="application/octet-stream" id="webcam-{name}">{_packed(path)}</script>'
-        for name, path in paths.items()
+        f'<script type="application/octet-stream" id="webcam-{name}">{_packed(content)}</script>'
+        for name, content in contents.items()
     )
     page = TEMPLATE.read_text(encoding="utf-8").replace("{{notices}}", html.escape(NOTICES.read_text(encoding="utf-8")))
     return page.replace("{{parts}}", parts)
 
 
-def _packed(path: Path) -> str:
+def own_model() -> bytes:
+    """Return the bytes of the face_landmarker.task that comes with mien.
+
+    Raises:
+        UserError: a part is missing, as where mien was built from its source distribution, or is damaged.
+    """
+    return b"".join(_read(OWN / part) for part in _MODEL_PARTS)
+
+
+def _read(path: Path) -> bytes:
     try:
-        content = _content(path)
+        return _content(path)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+
+
+def _packed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
 
 
@@ -100,7 +116,7 @@ def _content(path: Path) -> bytes:
         OSError: the file is missing or cannot be read.
     """
     content = read_bytes(path, _MOST_BYTES)
-    if path.suffix != _SHRUNK:
+    if _SHRUNK not in path.suffixes:
         return content
     try:
         return lzma.LZMADecompressor(memlimit=4 * _MOST_BYTES).decompress(content, _MOST_BYTES)
@@ -132,10 +148,18 @@ def _package() -> Path:
     return folder
 
 
-def _model(given: Path | None) -> Path:
+def _model(given: Path | None) -> Path | None:
     named = os.environ.get(MODEL_VARIABLE)
-    path = given or (Path(named) if named else OWN / "face_landmarker.task")
-    remedy = "give MediaPipe's face landmarker with blend shapes, or leave it out: mien has one"
+    path = given or (Path(named) if named else None)
+    own = all((OWN / part).is_file() for part in _MODEL_PARTS)
+    if path is None and own:
+        return None
+    if path is None:
+        raise UserError(
+            "--webcam needs MediaPipe's network for blend shapes, which mien's source distribution leaves out: install "
+            "mien from a wheel or a checkout, or give MediaPipe's face_landmarker.task with --webcam-model"
+        )
+    remedy = "give MediaPipe's face landmarker with blend shapes" + (", or leave it out: mien has one" if own else "")
     if not path.is_file():
         raise UserError(f"{path}: no such file; {remedy}")
     try:

@@ -1,7 +1,8 @@
 """The networks: read from mien's own files, and run by ai-edge-litert on one thread."""
 
 import functools
-import zipfile
+import lzma
+import struct
 from importlib import resources
 from typing import Literal
 
@@ -23,7 +24,7 @@ class Network:
         with quiet_mediapipe():
             from ai_edge_litert.interpreter import Interpreter
 
-            self._interpreter = Interpreter(model_content=_content(name), num_threads=1)
+            self._interpreter = Interpreter(model_content=network_content(name), num_threads=1)
             self._interpreter.allocate_tensors()
         given, found = self._interpreter.get_input_details()[0], self._interpreter.get_output_details()
         self._input, self._outputs = given["index"], [each["index"] for each in found]
@@ -38,12 +39,25 @@ class Network:
 
 
 @functools.cache
-def _content(name: NetworkName) -> bytes:
+def network_content(name: NetworkName) -> bytes:
+    """Return the bytes of a network, a .tflite file."""
     if name in _IN_DATA:
-        return (resources.files("mien.capture") / "data" / _IN_DATA[name]).read_bytes()
-    task = resources.files("mien.export") / "landmarker" / "face_landmarker.task"
-    with task.open("rb") as file, zipfile.ZipFile(file) as members:
-        return members.read(_IN_TASK[name])
+        return lzma.decompress((resources.files("mien.capture") / "data" / f"{_IN_DATA[name]}.xz").read_bytes())
+    return _member(_first_part(), _IN_TASK[name])
+
+
+@functools.cache
+def _first_part() -> bytes:
+    """The start of face_landmarker.task. Its end, which only pages need, may be missing (mien.export.webcam)."""
+    return lzma.decompress((resources.files("mien.export") / "landmarker" / "face_landmarker.task.xz.1").read_bytes())
+
+
+def _member(archive: bytes, name: str) -> bytes:
+    """Return a file of a zip archive that holds it as it is. `zipfile` would need the archive's end."""
+    at = archive.index(name.encode())  # The local header: 18 bytes, two sizes, two lengths, then the name.
+    size, _, name_length, extra_length = struct.unpack("<IIHH", archive[at - 12 : at])
+    start = at + name_length + extra_length
+    return archive[start : start + size]
 
 
 def cut_out(

@@ -19,6 +19,9 @@ from mien.face import FaceModel
 from mien.tracking.constants import TRACKING
 
 _COMMAND = "python -m mien.lab.synthetic.detector_calibration"
+_ARRAYS = ("mean", "by_turn", "by_expression", "by_person")
+_OF_MEDIAPIPE = ("by_expression", "by_person")
+"""Arrays that every detector has from mediapipe's file, because they were measured on more people there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +81,17 @@ def read_response(face_model: FaceModel, sigma: float, detector: Detector = "med
 
     If it was never measured, or on another mesh, only `sigma` is known.
     """
-    path, expressions = response_path(face_model.name, detector), len(face_model.expression_names)
-    landmarks = len(face_model.landmarks["mediapipe"].faces)
-    if not path.is_file():
+    path, of_mediapipe = response_path(face_model.name, detector), response_path(face_model.name)
+    landmarks, expressions = len(face_model.landmarks["mediapipe"].faces), len(face_model.expression_names)
+    if not (path.is_file() and of_mediapipe.is_file()):
         return unknown_response(landmarks, expressions, sigma)
-    with np.load(path, allow_pickle=False) as file:
-        if str(file["topology_hash"]) != face_model.topology_hash:
+    with np.load(path, allow_pickle=False) as file, np.load(of_mediapipe, allow_pickle=False) as base:
+        if not str(file["topology_hash"]) == str(base["topology_hash"]) == face_model.topology_hash:
             return unknown_response(landmarks, expressions, sigma)
         scale = 1e-3  # Files hold millimetres, for which half precision is enough.
         mean, by_turn, by_expression, by_person = (
-            scale * torch.from_numpy(file[name].astype(np.float64))
-            for name in ("mean", "by_turn", "by_expression", "by_person")
+            scale * torch.from_numpy((base if name in _OF_MEDIAPIPE else file)[name].astype(np.float64))
+            for name in _ARRAYS
         )
         return DetectorResponse(mean, by_turn, by_expression, by_person, scale * float(file["rest_sigma"]))
 
@@ -96,10 +99,11 @@ def read_response(face_model: FaceModel, sigma: float, detector: Detector = "med
 def write_response(
     path: Path, face_model: FaceModel, response: DetectorResponse, people: int, detector: Detector = "mediapipe"
 ) -> None:
-    """Write a response for `read_response`."""
+    """Write a response for `read_response`. Of another detector than mediapipe, it leaves out what is mediapipe's."""
     arrays = {
         name: (1e3 * getattr(response, name)).numpy().astype(np.float16)
-        for name in ("mean", "by_turn", "by_expression", "by_person")
+        for name in _ARRAYS
+        if detector == "mediapipe" or name not in _OF_MEDIAPIPE
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     ending = "" if detector == "mediapipe" else f" --detector {detector}"
