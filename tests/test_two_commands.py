@@ -16,7 +16,7 @@ from mien.locks import lock_file
 from other_process import Holder
 from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio, waits_to_meet
 
-ROUNDS = 30
+ROUNDS = 12
 TWO_RUNS = ["--runs", "alone", "twin"]
 MEETINGS = ROUNDS // 4  # a pair that meets less often goes on, up to four times as many rounds
 
@@ -190,6 +190,7 @@ def assert_apart(outcomes: list[Outcome], name: str) -> bool:
     return any(one.code == 2 for one in outcomes)
 
 
+@pytest.mark.slow
 def test_two_trainings_of_one_run(studio: Studio, both: Pair) -> None:
     """One of two trainings of a run works, and the run is that of a single training."""
     told = 0
@@ -269,6 +270,7 @@ def without_perceptual(content: Any) -> Any:
     return {key: without_perceptual(value) for key, value in content.items() if key != "perceptual"}
 
 
+@pytest.mark.slow
 def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
     """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first.
 
