@@ -54,8 +54,8 @@ def test_an_avatar_is_made_and_used_without_a_network(subject: Path) -> None:
     avatar, out = str(subject), subject.parent
     for ending in ("html", "mien"):
         offline("export", avatar, "--out", str(out / f"me.{ending}"))
-    offline("render", str(out / "me.mien"), "--out", str(out / "still.png"))
-    offline("drive", avatar, "--by", avatar, "--out", str(out / "driven.mp4"))
+    offline("render", str(out / "me.mien"), "--out", str(out / "still.png"), "--size", "64")
+    offline("drive", avatar, "--by", avatar, "--out", str(out / "driven.mp4"), "--size", "64")
     assert (out / "still.png").is_file()
     assert (out / "driven.mp4").is_file()
 
