@@ -23,7 +23,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256, help="side of the pictures in pixels")
     options = parser.parse_args()
 
-    recipe = replace(RECIPES["plain"], seconds=options.seconds, width=options.size, height=options.size)
+    side = options.size
+    recipe = replace(RECIPES["plain"], seconds=options.seconds, width=side, height=side, texture_size=6 * side)
     capture, truth = synthesize(recipe, options.seed)
     print(f"{capture.timesteps} frames of {capture.width}x{capture.height}, {len(capture.camera_ids)} camera(s)")
 

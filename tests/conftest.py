@@ -66,6 +66,16 @@ def anny() -> "FaceModel":
     return load_face_model("anny")
 
 
+@pytest.fixture(scope="module")
+def short_films() -> Iterator[None]:
+    """Let films of avatars have two pictures a second, for tests of a file that are about other things."""
+    from mien.evaluation import living
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(living, "FPS", 2)
+        yield
+
+
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with a fresh build of the web runtime, for reading."""

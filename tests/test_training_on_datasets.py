@@ -66,15 +66,14 @@ def not_white(images: np.ndarray, mattes: np.ndarray, plate: np.ndarray | None =
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_films")
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_an_import_is_trained_on_and_scored_by_its_protocol(
     layout: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from mien.datasets import matting, overlay, sequences
-    from mien.evaluation import living
 
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)  # it finds no face in drawings this small
-    monkeypatch.setattr(living, "FPS", 2)  # a film of the avatar is no part of this
     shutil.copytree(cache_folder() / "face_models", tmp_path / "cache" / "face_models")
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
@@ -96,7 +95,7 @@ def test_an_import_is_trained_on_and_scored_by_its_protocol(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("quick", "short_films")
 def test_ten_people_are_imported_trained_and_scored_by_one_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,9 +103,6 @@ def test_ten_people_are_imported_trained_and_scored_by_one_table(
 
     Nine rows run inside this process, without what draws most of the time. `mien batch` does the tenth alone.
     """
-    from mien.evaluation import living
-
-    monkeypatch.setattr(living, "FPS", 3)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     scene = tiny_scene(tmp_path)
     add_face_model(scene.model, Path("tiny.npz"), "0")

@@ -23,7 +23,7 @@ from mien.training import read_sequence
 
 PERSON = replace(
     RECIPES["plain"], width=550, height=802, fps=25.0, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),
-    script=(Segment("speech", 0.32),),
+    script=(Segment("speech", 0.32),), texture_size=512,
 )  # fmt: skip
 SERIALS = (FRONTAL, "222200036", "222200046")
 """The cameras in the order of the drawn ring, whose first one is in front."""
@@ -90,12 +90,8 @@ def trained_and_scored(root: Path, *options: str) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_raw_recordings_of_nersemble_become_an_avatar(
-    rig: SyntheticScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from mien.evaluation import living
-
-    monkeypatch.setattr(living, "FPS", 2)  # a film of the avatar is no part of this
+@pytest.mark.usefixtures("short_films")
+def test_raw_recordings_of_nersemble_become_an_avatar(rig: SyntheticScene, tmp_path: Path) -> None:
     person, root = tmp_path / "017", tmp_path / "me"
     mattes = write_person(person, rig)
     assert main(["import", str(person), "--out", str(root)]) == 0
@@ -153,11 +149,9 @@ def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mat
 
 
 @pytest.mark.slow
-def test_a_take_of_live_link_face_becomes_an_avatar(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("short_films")
+def test_a_take_of_live_link_face_becomes_an_avatar(tmp_path: Path) -> None:
     """Its video is captured, tracked and trained on, and its own csv drives the avatar."""
-    from mien.evaluation import living
-
-    monkeypatch.setattr(living, "FPS", 2)
     scene = SyntheticScene(replace(PERSON, width=256, height=320, script=(Segment("speech", 0.8),)), 3)
     pictures = [frame.image for frame in scene.frames()]
     take, root = tmp_path / "20240131_Me_3", tmp_path / "me"

@@ -16,9 +16,9 @@ from mien.locks import lock_file
 from other_process import Holder
 from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio, waits_to_meet
 
-ROUNDS = 30
+ROUNDS, MOST_ROUNDS = 12, 120
 TWO_RUNS = ["--runs", "alone", "twin"]
-MEETINGS = ROUNDS // 4  # a pair that meets less often goes on, up to four times as many rounds
+MEETINGS = ROUNDS // 4  # a pair that meets less often goes on, up to ten times as many rounds
 
 
 @pytest.fixture(scope="module")
@@ -190,10 +190,11 @@ def assert_apart(outcomes: list[Outcome], name: str) -> bool:
     return any(one.code == 2 for one in outcomes)
 
 
+@pytest.mark.slow
 def test_two_trainings_of_one_run(studio: Studio, both: Pair) -> None:
     """One of two trainings of a run works, and the run is that of a single training."""
     told = 0
-    for index in range(4 * ROUNDS):
+    for index in range(MOST_ROUNDS):
         if index >= ROUNDS and told > MEETINGS:
             break
         command = ["train", str(studio.root), "--run", f"t{index}", "--steps", "3", "--split", "tail", *RANK]
@@ -208,7 +209,7 @@ def test_two_captures_of_one_video(studio: Studio, both: Pair, tmp_path: Path) -
     """One of two captures of a video works, and the result is that of a single one."""
     expected = tree_bytes(studio.root / "sequences" / "clip" / "capture")
     told = 0
-    for index in range(4 * ROUNDS):
+    for index in range(MOST_ROUNDS):
         if index >= ROUNDS and told > MEETINGS:
             break
         root = tmp_path / str(index)
@@ -223,7 +224,7 @@ def test_two_captures_of_one_video(studio: Studio, both: Pair, tmp_path: Path) -
 def test_two_imports_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> None:
     """One of two imports of a run works. The other one names it, or says that the run is there."""
     told = 0
-    for index in range(4 * ROUNDS):
+    for index in range(MOST_ROUNDS):
         if index >= ROUNDS and told > MEETINGS:
             break
         out = tmp_path / str(index)
@@ -243,7 +244,7 @@ def test_two_imports_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> N
 def test_two_analyses_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> None:
     """One of two analyses works at a time, and nothing is measured twice."""
     told = 0
-    for index in range(2 * ROUNDS):
+    for index in range(MOST_ROUNDS // 2):
         if index >= ROUNDS // 2 and told > 0:
             break
         out = tmp_path / str(index)
@@ -269,6 +270,7 @@ def without_perceptual(content: Any) -> Any:
     return {key: without_perceptual(value) for key, value in content.items() if key != "perceptual"}
 
 
+@pytest.mark.slow
 def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
     """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first.
 
@@ -276,7 +278,7 @@ def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
     """
     runs, told, figures = studio.root / "runs", 0, []
     waits: dict[bool, tuple[float, float]] = {True: (0, 0), False: (0, 0)}
-    for index in range(4 * ROUNDS):
+    for index in range(MOST_ROUNDS):
         if index >= ROUNDS and told > MEETINGS:
             break
         name, run = f"e{index}", runs / f"e{index}"

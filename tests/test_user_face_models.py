@@ -152,26 +152,34 @@ def test_landmarks_give_its_jaw_and_shape(added):
     )
 
 
+QUICKLY = (
+    "--tracking.keyframes", "4", "--tracking.photometric.keyframes", "4", "--tracking.photometric.sizes", "64",
+    "--tracking.photometric.texture-size", "64", "--tracking.photometric.shared-steps", "1",
+)  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def capture() -> Capture:
     """Return ten small pictures of a head that is drawn with another model, anny."""
     recipe = SyntheticRecipe(
-        name="clip", width=96, height=96, seconds=0.4, hair="none", glasses=False, brows_and_lashes=False, clothes=False
-    )
+        name="clip", width=96, height=96, seconds=0.4, hair="none", glasses=False, brows_and_lashes=False,
+        clothes=False, texture_size=256,
+    )  # fmt: skip
     return synthesize(recipe, seed=2)[0]
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_films")
 def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path, capsys):
     path, _ = added
     workspace, root = tmp_path, str(tmp_path)
     write_capture(tmp_path / "sequences" / "clip" / "capture", capture)
-    assert main(["track", root, "--face-model", str(path)]) == 0
+    assert main(["track", root, "--face-model", str(path), *QUICKLY]) == 0
     tracking = read_tracking(workspace / "sequences" / "clip" / "tracking")
     assert tracking.face_model == "my_head"
     assert tracking.pixel_residuals is not None
     assert main(["train", root, "--steps", "6", "--run", "a"]) == 0
-    assert main(["evaluate", root, "--run", "a"]) == 0
+    assert main(["evaluate", root, "--run", "a", "--no-perceptual"]) == 0
     picture = workspace / "a.png"
     assert main(["render", root, "--run", "a", "--set", "expression_000=1", "jaw_x=0.2", "--out", str(picture)]) == 0
     assert main(["drive", root, "--run", "a", "--by", root, "--out", str(workspace / "a.mp4")]) == 0

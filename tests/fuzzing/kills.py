@@ -27,11 +27,15 @@ from typing import Any
 from fuzzing.run_lines import Server
 from fuzzing.same_bytes import differing_files, hidden_files
 
-CLIP, FRAMES, SIDE = "clip.mp4", 10, 256
+CLIP, FRAMES, SIDE = "clip.mp4", 10, 192
+TRACK = (
+    "--tracking.keyframes", "4", "--tracking.photometric.keyframes", "4", "--tracking.photometric.sizes", "64", "64",
+    "--tracking.photometric.texture-size", "128", "--tracking.photometric.shared-steps", "1",
+)  # fmt: skip
 TRAIN = ("--preset", "draft", "--steps", "30", "--training.checkpoint-every", "4")
 STAGES = {
     "capture": ("capture", CLIP, "--out", "W"),
-    "track": ("track", "W"),
+    "track": ("track", "W", *TRACK),
     "train": ("train", "W", *TRAIN),
     "evaluate": ("evaluate", "W"),
     "export": ("export", "W", "--out", "me.mien"),
@@ -94,7 +98,7 @@ class Place:
 
         recipe = RECIPES["demo"]
         self.box.mkdir(parents=True)
-        small = replace(recipe, seconds=FRAMES / recipe.fps, width=SIDE, height=SIDE, supersample=1)
+        small = replace(recipe, seconds=FRAMES / recipe.fps, width=SIDE, height=SIDE, supersample=1, texture_size=256)
         write_synthetic_video(small, self.box / CLIP, 0)
         for stage in STAGES:
             shutil.copytree(self.box, self._kept / f"before {stage}")
