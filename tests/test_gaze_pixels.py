@@ -6,7 +6,7 @@ The avatar has green eyeballs with blue irises, and everything else has one colo
 import json
 import math
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
