@@ -1,5 +1,5 @@
 // Mouths of what a voice sounds like at each moment, for tests/test_web_microphone.py:
-//   node voice.mjs VOICE.JS < [[loudness, low, high, seconds], ..] prints them as json.
+//   node voice.mjs VOICE.JS < [[loudness, vowel, low, high, seconds], ..] prints them as json.
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 

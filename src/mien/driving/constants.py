@@ -94,22 +94,28 @@ class DrivingConstants:
 
     # speech.py
     speech_window: float = 0.04
-    """Length of the pieces of sound that are measured, in seconds. No number of speech was varied; with all of them, a
-    swelling tone has a correlation of 0.956 between jaw and loudness (log, 11-23)."""
-    speech_smoothing: float = 0.035
+    """Length of the pieces of sound that are measured, in seconds. Bands, weights, smoothing, exponent and drops were
+    chosen on 5 English sentences of 4 voices of a synthesiser, and judged on others (docs/using.md, "A voice")."""
+    speech_bands: tuple[tuple[float, float], ...] = ((500.0, 900.0), (1400.0, 3000.0))
+    """Bands in Hz in which open vowels are louder than closed ones: their first formant, and what lies above."""
+    speech_band_weights: tuple[float, ...] = (1.0, 0.5)
+    """How much the share of each band counts, in dB, beside the loudness."""
+    speech_least_share: float = 10**-2.5
+    """Smallest share of the energy that a band counts with."""
+    speech_smoothing: float = 0.02
     """Standard deviation of the smoothing over time, in seconds. It is even before and after, so there is no lag."""
     speech_floor: float = 10
-    """Percentile of the loudness that is the noise floor."""
+    """Percentile of the level that is the noise floor."""
     speech_loud: float = 95
-    """Percentile of the loudness that is a loud voice."""
+    """Percentile of the level that is a loud voice."""
     speech_range: tuple[float, float] = (25.0, 45.0)
     """Bounds of the distance from the noise floor to a loud voice, in dB."""
     speech_gate: float = 0.15
     """Share of this distance above the noise floor that still counts as silence."""
     speech_silence: float = -55.0
     """Loudness of silence in dB, where 0 is the loudest possible. Files that are never louder do not move the mouth."""
-    speech_exponent: float = 1.6
-    """Exponent from loudness to opening: between loudness in dB (1) and pressure (about 2)."""
+    speech_exponent: float = 2.0
+    """Exponent from the level in dB to opening."""
     speech_split: tuple[float, float] = (700.0, 2500.0)
     """Frequencies in Hz below which sound is low, and above which it is high."""
     speech_jaw: float = 0.55
@@ -128,12 +134,13 @@ class DrivingConstants:
     """Largest coefficient of pressed lips, at p, b and m."""
     speech_shut_within: float = 0.14
     """Time within which sound is as loud before and after a drop at which lips shut, in seconds."""
-    speech_shut_drop: tuple[float, float] = (4.0, 9.0)
-    """Drops of the loudness in dB from which on lips begin to shut, and at which they are shut. Chosen on synthesised
-    speech, where 9 in 10 of p, b and m shut the lips with them, and 3 in 10 without (tests/test_driving_by_speech.py).
-    No real speech was compared."""
-    speech_shut_hiss: float = 3.0
+    speech_shut_drop: tuple[float, float] = (14.0, 26.0)
+    """Drops of the level in dB from which on lips begin to shut, and at which they are shut. No real speech was
+    compared."""
+    speech_shut_hiss: float = 6.0
     """How much energy at high frequencies keeps lips open, as at s: from its inverse on, they are."""
+    speech_shut_beside: float = 0.3
+    """How shut lips are in the picture before and after that in which they are shut."""
     speech_sway: tuple[float, float, float] = (0.012, 0.02, 0.008)
     """Sizes of the head's slow waves about x, y and z, in radians."""
     speech_blink_every: float = 3.5

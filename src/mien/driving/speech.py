@@ -1,9 +1,11 @@
-"""Motion from the loudness of a voice: the jaw and the mouth open with the sound, and the head lives meanwhile.
+"""Motion from a voice: the jaw and the mouth open with its open vowels, and the head lives meanwhile.
 
-It knows no words, so it makes mouths that fit the rhythm of speech, not its sounds. Loudness is in dB above the noise
-floor of the file, because the ear hears it so and because recordings differ. Where most energy is at high frequencies
-(s, sh, i), the mouth is wide and less open; where it is at low ones (o, u), the lips are rounded. Where the sound drops
-for a moment (p, b, m), the lips shut.
+It knows no words, so it makes mouths that fit the rhythm of speech, not its sounds. An open vowel, such as a, has much
+energy where its first formant lies, and above 1,400 Hz. Closed ones (i, u) and sounds through closed lips (m, b) are as
+loud, but below. So the level of these two bands opens the jaw. It counts in dB above the noise floor of the file,
+because the ear hears it so and because recordings differ. Where most energy is at high frequencies (s, sh, i), the
+mouth is wide and less open; where it is at low ones (o, u), the lips are rounded. Where the level drops for a moment
+(p, b, m), the lips shut.
 """
 
 import math
@@ -33,9 +35,9 @@ def read_speech(path: Path) -> Motion:
 def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
     """The motion for a sound with one channel and `mien.capture.sound.RATE` samples a second, -1..1."""
     count = max(1, math.ceil(len(samples) / RATE * FPS))
-    loudness, low, high = _measured(samples, count)
-    shut = _shut(loudness, high)
-    opening = _smooth(_opening(loudness)) * (1 - shut)
+    loudness, level, low, high = _measured(samples, count)
+    shut = _shut(level, high)
+    opening = _smooth(_opening(loudness, level)) * (1 - shut)
     low, high = _smooth(low), _smooth(high)
     seconds = np.arange(count) / FPS
     blink = np.array([blink_at(moment) for moment in seconds])
@@ -60,55 +62,59 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
     return Motion(FPS, coefficients, np.zeros((count, 2, 3), np.float32), sway_at(seconds), still, 0)
 
 
-def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Loudness in dB around each moment, and how much of it is low and how much is high, 0..1."""
+def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Loudness and level of open vowels in dB around each moment, and how much is low and how much is high, 0..1."""
     size = round(DRIVING.speech_window * RATE)
     padded = np.pad(samples, (size // 2, size + RATE))
     starts = np.round(np.arange(count) / FPS * RATE).astype(int)
     window = np.hanning(size)
     frequencies = np.fft.rfftfreq(size, 1 / RATE)
-    power, low, high = np.empty(count), np.empty(count), np.empty(count)
+    bands = [(frequencies >= lowest) & (frequencies < highest) for lowest, highest in DRIVING.speech_bands]
+    power, level, low, high = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     for index, start in enumerate(starts):
         piece = padded[start : start + size].astype(np.float64)
         piece = (piece - piece.mean()) * window
         spectrum = np.abs(np.fft.rfft(piece)) ** 2
         total = max(float(spectrum.sum()), 1e-20)
         power[index] = float((piece**2).sum()) / float((window**2).sum())
+        shares = [max(float(spectrum[band].sum()) / total, DRIVING.speech_least_share) for band in bands]
+        level[index] = 10 * np.dot(DRIVING.speech_band_weights, np.log10(shares))
         low[index] = spectrum[frequencies < DRIVING.speech_split[0]].sum() / total
         high[index] = spectrum[frequencies > DRIVING.speech_split[1]].sum() / total
     # Most voices have most of their energy in low sounds, so only the rest of the way is rounding.
-    return 10 * np.log10(np.maximum(power, 1e-12)), np.clip(2 * low - 1, 0, 1), np.clip(high, 0, 1)
+    loudness = 10 * np.log10(np.maximum(power, 1e-12))
+    return loudness, loudness + level, np.clip(2 * low - 1, 0, 1), np.clip(high, 0, 1)
 
 
-def _opening(loudness: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    """How open the mouth is, 0..1."""
-    loud = float(np.percentile(loudness, DRIVING.speech_loud))
-    if loud < DRIVING.speech_silence:
-        return np.zeros(len(loudness))
-    floor = float(
-        np.clip(
-            np.percentile(loudness, DRIVING.speech_floor),
-            loud - DRIVING.speech_range[1],
-            loud - DRIVING.speech_range[0],
-        )
-    )
-    above = (loudness - floor) / (loud - floor)
-    return np.clip((above - DRIVING.speech_gate) / (1 - DRIVING.speech_gate), 0, 1) ** DRIVING.speech_exponent
+def _opening(loudness: Float[np.ndarray, " t"], level: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """How open the mouth is, 0..1. What is no louder than the noise floor does not open it, whatever its bands."""
+    if float(np.percentile(loudness, DRIVING.speech_loud)) < DRIVING.speech_silence:
+        return np.zeros(len(level))
+    return _above_floor(level) ** DRIVING.speech_exponent * (_above_floor(loudness) > 0)
 
 
-def _shut(loudness: Float[np.ndarray, " t"], high: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    """How shut the lips are in the midst of speech, 0..1: at p, b and m, sound drops for a moment, but does not hiss.
+def _above_floor(decibels: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """How far each moment is above the noise floor, 0..1, where 1 is a loud voice."""
+    loud = float(np.percentile(decibels, DRIVING.speech_loud))
+    bounds = loud - DRIVING.speech_range[1], loud - DRIVING.speech_range[0]
+    floor = float(np.clip(np.percentile(decibels, DRIVING.speech_floor), *bounds))
+    above = (decibels - floor) / (loud - floor)
+    return np.clip((above - DRIVING.speech_gate) / (1 - DRIVING.speech_gate), 0, 1)
+
+
+def _shut(level: Float[np.ndarray, " t"], high: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """How shut the lips are in the midst of speech, 0..1: at p, b and m, the level drops for a moment without a hiss.
 
     So it does at t and k, behind open lips. The mouth shuts there, too, for a tenth of a second.
     """
     reach = round(DRIVING.speech_shut_within * FPS)
-    around = np.pad(loudness, reach, constant_values=-np.inf)
+    around = np.pad(level, reach, constant_values=-np.inf)
     windows = np.lib.stride_tricks.sliding_window_view(around, reach + 1)
-    drop = np.minimum(windows[: len(loudness)].max(1), windows[reach:].max(1)) - loudness
+    drop = np.minimum(windows[: len(level)].max(1), windows[reach:].max(1)) - level
     least, most = DRIVING.speech_shut_drop
     found = np.clip((drop - least) / (most - least), 0, 1) * (1 - np.clip(DRIVING.speech_shut_hiss * high, 0, 1))
     spread = np.pad(found, 1, mode="edge")
-    return np.maximum(found, 0.5 * np.maximum(spread[:-2], spread[2:]))
+    return np.maximum(found, DRIVING.speech_shut_beside * np.maximum(spread[:-2], spread[2:]))
 
 
 def _smooth(values: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
