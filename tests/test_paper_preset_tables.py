@@ -154,10 +154,11 @@ def updates_of(paper: Any, steps: int) -> int:
     """The number of optimiser steps of a run, whose frames a step are fewer the more points there are."""
     schedule, done, updates = Schedule(paper.schedule, paper.epochs, paper.points), 0, 0
     times = schedule.rounds()
-    while done < steps:
-        passed = sum(max(1, round(time * steps)) <= done for time in times)
-        points = paper.points if passed == 0 else min(paper.max_points, schedule.points_at(times[passed - 1]))
-        done, updates = done + max(1, min(paper.frames_per_step, paper.points_per_step // points)), updates + 1
+    points = [paper.points, *(min(paper.max_points, schedule.points_at(time)) for time in times)]
+    frames = [max(1, min(paper.frames_per_step, paper.points_per_step // count)) for count in points]
+    for end, some in zip([*(max(1, round(time * steps)) for time in times), steps], frames, strict=True):
+        more = max(0, -(-(end - done) // some))
+        done, updates = done + more * some, updates + more
     return updates
 
 
