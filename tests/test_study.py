@@ -21,7 +21,7 @@ from mien.lab.analysis.study.files import read_all_answers
 from mien.lab.analysis.study.shuffling import shuffled
 from mien.training import read_sequence, train
 from toy_workspace import write_toy_workspace
-from web_case import browse, chromium, node
+from web_case import browse, chromium, node, violations
 
 RUNS = ("headgas", "begun", "toy")
 SIDE = 64
@@ -342,3 +342,15 @@ def test_participants_see_different_orders(page: Path) -> None:
         told = browse(page, [START, read, 'document.getElementById("participant").textContent'])
         seen.add(told["results"][2])
     assert len(seen) == 2
+
+
+STARTED = 'document.getElementById("start").click();'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", ["", STARTED])
+def test_everybody_can_take_part(page: Path, first: str) -> None:
+    """axe-core finds no fault in the words before the study, nor beside a clip."""
+    chromium()
+    for size, device in (((1280, 800), []), ((390, 844), ["dark", "touch"])):
+        assert violations(page, size, device, first) == []

@@ -16,7 +16,7 @@ from mien import runtime
 from mien.export import write_glb, write_packed
 from test_glb import mesh_model
 from test_web import picture, psnr
-from web_case import WEB, browse, build, chromium, drawn_head, node
+from web_case import WEB, browse, build, chromium, drawn_head, node, violations
 
 SIDE = 320
 EXAMPLES = WEB / "examples"
@@ -230,6 +230,16 @@ def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
     assert glb[2] > 5
     assert psnr(smile, by_glb) < 45
     assert none[0] == "none.txt is not a .mien file"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", [[], ["dark", "touch"]])
+def test_everybody_can_use_the_playground(site: Path, device: list[str]) -> None:
+    """axe-core finds no fault in it, with and without an avatar."""
+    (site / "playground.html").write_text((EXAMPLES / "playground.html").read_text())
+    with served(site) as address:
+        for first in ("", DROP % ("me.packed", "me.packed")):
+            assert violations(f"{address}/playground.html", (390, 844), device, first) == []
 
 
 def scene_camera(turn: float, side: int) -> runtime.Camera:

@@ -95,7 +95,7 @@ def browse(
     return json.loads(done.stdout)
 
 
-def violations(page: Path, size: tuple[int, int], device: Sequence[str] = (), first: str = "") -> list[list[str]]:
+def violations(page: Path | str, size: tuple[int, int], device: Sequence[str] = (), first: str = "") -> list[list[str]]:
     """Return what axe-core finds in a page with all parts unfolded: each rule, and the first element that breaks it.
 
     `first` is JavaScript that runs before.

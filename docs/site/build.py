@@ -50,6 +50,11 @@ _LIVING = """
 ```"""
 _MOST_BYTES = 1_200_000
 """Largest page of an avatar that the front page shows, in bytes."""
+_MENDED = {
+    '<p class="caption" role="heading">': '<p class="caption" role="heading" aria-level="2">',
+    '<aside class="sidebar-drawer">': '<aside class="sidebar-drawer" aria-label="All pages">',
+}
+"""What screen readers miss in the theme's pages -> what they get."""
 _REFERENCE = "| Reference |"
 """Where the front page names the reference, which exists in the site only."""
 
@@ -186,6 +191,15 @@ def marks_in_the_reference(site: Path) -> list[str]:
     return [str(page.relative_to(site)) for page in pages if "Annotated[" in page.read_text("utf-8")]
 
 
+def mend(site: Path) -> None:
+    """Add what screen readers need and the theme leaves out."""
+    for page in sorted(site.rglob("*.html")):
+        text = page.read_text("utf-8")
+        for missing, whole in _MENDED.items():
+            text = text.replace(missing, whole)
+        page.write_text(text, "utf-8")
+
+
 def is_small(avatar: Path) -> bool:
     """Whether there is a page of an avatar that the front page can show. If not, say why."""
     if not avatar.is_file():
@@ -209,6 +223,7 @@ def build(out: Path, avatar: Path) -> int:
     arguments = ["-b", "html", "-q", "-W", "--keep-going", "-c", str(Path(__file__).parent)]
     code = sphinx_build([*arguments, "-d", str(work / "_doctrees"), str(work), str(out)])
     (out / ".buildinfo").unlink(missing_ok=True)
+    mend(out)
     if living:
         shutil.copyfile(avatar, out / "avatar.html")
     leaks = paths_of_this_machine(out)

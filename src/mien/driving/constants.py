@@ -97,7 +97,7 @@ class DrivingConstants:
     """Length of the pieces of sound that are measured, in seconds. Bands, weights, smoothing, exponent and drops were
     chosen on 5 English sentences of 4 voices of a synthesiser, and judged on others (docs/using.md, "A voice")."""
     speech_bands: tuple[tuple[float, float], ...] = ((500.0, 900.0), (1400.0, 3000.0))
-    """Bands in Hz in which open vowels are louder than closed ones: their first formant, and what lies above."""
+    """Bands in Hz in which open vowels are louder than closed ones: one of the first of their formants, one above."""
     speech_band_weights: tuple[float, ...] = (1.0, 0.5)
     """How much the share of each band counts, in dB, beside the loudness."""
     speech_least_share: float = 10**-2.5

@@ -1,7 +1,7 @@
 """Motion from a voice: the jaw and the mouth open with its open vowels, and the head lives meanwhile.
 
 It knows no words, so it makes mouths that fit the rhythm of speech, not its sounds. An open vowel, such as a, has much
-energy where its first formant lies, and above 1,400 Hz. Closed ones (i, u) and sounds through closed lips (m, b) are as
+energy at the first of its formants, and above 1,400 Hz. Closed ones (i, u) and sounds through closed lips (m, b) are as
 loud, but below. So the level of these two bands opens the jaw. It counts in dB above the noise floor of the file,
 because the ear hears it so and because recordings differ. Where most energy is at high frequencies (s, sh, i), the
 mouth is wide and less open; where it is at low ones (o, u), the lips are rounded. Where the level drops for a moment
