@@ -74,7 +74,7 @@ def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
     assert (tmp_path / "aside.png").read_bytes() != (tmp_path / "still.png").read_bytes()
     assert main(["export", avatar, "--out", str(tmp_path / "me.mien")]) == 0
     assert runtime.load(tmp_path / "me.mien").render()[1].max() > 0.5
-    series = ["--series", "synthetic", "--every", "12"]
+    series = ["--series", "synthetic", "--every", "8"]
     assert main(["export", avatar, "--out", str(tmp_path / "talk.ply"), *series]) == 0
     assert len(list(tmp_path.glob("talk_*.ply"))) == 3
     clear = ["--background", "transparent", "--size", "64"]
