@@ -2,8 +2,8 @@
 
 `make release` calls it. Every file gets the time of the commit, so that the same commit gives the same bytes. Two
 checkouts in two folders gave the same sdist, wheels for Python 3.11 and 3.12 (of this machine), npm package, site and
-page (7883219a). A wheel that others can install comes from cibuildwheel, which needs Docker or Podman; without them,
-the wheels are those of this machine's Pythons, and the page says so.
+page (7883219a, and d0a88274). A wheel that others can install comes from cibuildwheel, which needs Docker or Podman;
+without them, the wheels are those of this machine's Pythons, and the page says so.
 """
 
 import argparse

@@ -86,6 +86,21 @@ def test_the_source_distribution_is_small(tmp_path: Path, monkeypatch: pytest.Mo
     assert not [name for name in names if name.startswith(unneeded)]
 
 
+def test_two_checkouts_give_the_same_source_distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither folders nor times of files matter. A release sets the variable to the commit's time."""
+    from scikit_build_core.build import build_sdist
+
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    sums = []
+    for folder, time in ((tmp_path / "here", 1_600_000_000), (tmp_path / "elsewhere" / "deep", 1_650_000_000)):
+        make.copy_tracked(folder / "source")
+        for path in (folder / "source").rglob("*"):
+            os.utime(path, (time, time))
+        monkeypatch.chdir(folder / "source")
+        sums.append(hashlib.sha256((folder / build_sdist(str(folder))).read_bytes()).hexdigest())
+    assert sums[0] == sums[1]
+
+
 @pytest.mark.parametrize(("code", "answers"), [(0, True), (1, False), (None, False)])
 def test_containers_need_a_service(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None, answers: bool
