@@ -108,7 +108,7 @@ def test_every_step_of_pass_and_epochs_has_all_cameras(case, monkeypatch):
     descent, counts = _descent(case, settings), []
     frame_cost = Descent.frame_cost
 
-    def counted(self: Descent, targets: list, *more: object) -> torch.Tensor:
+    def counted(self: Descent, targets: list, *more: Any) -> torch.Tensor:
         counts.append(len(targets))
         return frame_cost(self, targets, *more)
 
