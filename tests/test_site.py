@@ -34,18 +34,25 @@ def builder() -> ModuleType:
         return importlib.import_module("build")
 
 
-def test_an_avatar_of_more_than_a_megabyte_and_a_fifth_is_left_out(
-    builder: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_avatar_of_more_than_a_megabyte_and_a_fifth_is_made_smaller_or_left_out(
+    builder: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    avatar = tmp_path / "me.html"
-    assert not builder.is_small(avatar)
+    avatar, aside = tmp_path / "me.html", tmp_path / "site" / "avatar.html"
+    assert builder.small_page(avatar, aside) is None
     assert "is made by `make demo`" in capsys.readouterr().out
-    for size, small in ((MOST, True), (MOST + 1, False)):
+    for size, page in ((MOST, avatar), (MOST + 1, None)):
         avatar.write_bytes(b" " * size)
-        assert builder.is_small(avatar) == small
-        builder.copy_pages(tmp_path / "pages", small)
-        assert ('src="avatar.html"' in (tmp_path / "pages" / "index.md").read_text()) == small
+        assert builder.small_page(avatar, aside) == page
+        builder.copy_pages(tmp_path / "pages", page is not None)
+        assert ('src="avatar.html"' in (tmp_path / "pages" / "index.md").read_text()) == (page is not None)
     assert "has more than 1,200,000 bytes" in capsys.readouterr().out
+    (tmp_path / "sequences" / "demo").mkdir(parents=True)
+    asked: list[list[str]] = []
+    monkeypatch.setattr(builder, "mien", lambda words: asked.append(words) or 0)
+    assert builder.small_page(avatar, aside) == aside
+    assert asked[0][:6] == ["export", str(tmp_path), "--out", str(aside), "--largest", "1.2"]
+    monkeypatch.setattr(builder, "mien", lambda _: 2)
+    assert builder.small_page(avatar, aside) is None
 
 
 @pytest.fixture(scope="module")

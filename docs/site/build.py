@@ -25,6 +25,8 @@ from urllib.parse import unquote
 from doors import PublicName, doors, first_line
 from sphinx.cmd.build import main as sphinx_build
 
+from mien.cli import main as mien
+
 ROOT = Path(__file__).parent.parent.parent
 FRONT = "docs/README.md"
 _BESIDE_CODE = {
@@ -200,15 +202,23 @@ def mend(site: Path) -> None:
         page.write_text(text, "utf-8")
 
 
-def is_small(avatar: Path) -> bool:
-    """Whether there is a page of an avatar that the front page can show. If not, say why."""
+def small_page(avatar: Path, aside: Path) -> Path | None:
+    """Return the page of an avatar that the front page can show: `avatar`, or a smaller one in its place.
+
+    The smaller one is exported from the workspace that the page lies in, to `aside`. If there is none, say why.
+    """
     if not avatar.is_file():
         print(f"The front page has no living avatar: {avatar} is made by `make demo`; then run `make docs` again.")
-        return False
-    if avatar.stat().st_size > _MOST_BYTES:
+        return None
+    if avatar.stat().st_size <= _MOST_BYTES:
+        return avatar
+    sequences = sorted((avatar.parent / "sequences").glob("*/"))
+    if not sequences:
         print(f"The front page has no living avatar: {avatar} has more than {_MOST_BYTES:,} bytes.")
-        return False
-    return True
+        return None
+    aside.parent.mkdir(parents=True, exist_ok=True)
+    limits = ["--largest", str(_MOST_BYTES / 1e6), "--series", sequences[0].name, "--every", "2"]
+    return aside if mien(["export", str(avatar.parent), "--out", str(aside), *limits]) == 0 else None
 
 
 def build(out: Path, avatar: Path) -> int:
@@ -216,16 +226,16 @@ def build(out: Path, avatar: Path) -> int:
     work = out.with_name(out.name + "-pages")
     for folder in (work, out):
         shutil.rmtree(folder, ignore_errors=True)
-    living = is_small(avatar)
-    copy_pages(work, living)
+    living = small_page(avatar, out.with_name(out.name + "-avatar.html"))
+    copy_pages(work, living is not None)
     write_reference(work)
     (out.parent).mkdir(parents=True, exist_ok=True)
     arguments = ["-b", "html", "-q", "-W", "--keep-going", "-c", str(Path(__file__).parent)]
     code = sphinx_build([*arguments, "-d", str(work / "_doctrees"), str(work), str(out)])
     (out / ".buildinfo").unlink(missing_ok=True)
     mend(out)
-    if living:
-        shutil.copyfile(avatar, out / "avatar.html")
+    if living is not None:
+        shutil.copyfile(living, out / "avatar.html")
     leaks = paths_of_this_machine(out)
     for name in leaks:
         print(f"{out / name} holds a path of this machine", file=sys.stderr)

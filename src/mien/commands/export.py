@@ -31,6 +31,7 @@ _REFUSED = {
     "title": "only an .html page has a title; leave --title out",
     "address": "only an .html page has an address; leave --address out",
     "soft_cut": "only .html, .mien and .packed files have a soft cut; leave --sharp-cut out",
+    "largest": "only .html and .packed files are made smaller; leave --largest out",
 }
 """Messages for options that the format does not take."""
 
@@ -123,6 +124,9 @@ class Command:
     show a picture of the avatar, which is written beside the page."""
     sharp_cut: bool = False
     """For .html, .mien and .packed: the head ends sharply at the neck, as in training (default: it fades over 3 cm)."""
+    largest: float | None = None
+    """For .html and .packed: largest size of the file in MB. Gaussians that add least to pictures are left out until it
+    fits (default: all stay)."""
     sequence: str | None = None
     """For a capture: the sequence that is written (default: the only one)."""
     split: CaptureSplit | None = None
@@ -273,7 +277,7 @@ class Command:
             "--sh": self.sh is not None, "--spz-version": self.spz_version, "--webgpu": self.webgpu,
             "--webcam": self.webcam, "--webcam-model": self.webcam_model,
             "--microphone": self.microphone, "--title": self.title,
-            "--address": self.address, "--sharp-cut": self.sharp_cut,
+            "--address": self.address, "--sharp-cut": self.sharp_cut, "--largest": self.largest is not None,
         }  # fmt: skip
         return next((option for option, value in given.items() if value), None)
 
@@ -332,10 +336,12 @@ class Command:
         given = {"webgpu": self.webgpu, "sh": self.sh is not None, "webcam": self.webcam, "microphone": self.microphone}
         given |= {"spz_version": self.spz_version is not None}
         given |= {"title": self.title is not None, "address": self.address is not None}
-        given |= {"soft_cut": self.sharp_cut}
+        given |= {"soft_cut": self.sharp_cut, "largest": self.largest is not None}
         for option, is_given in given.items():
             if is_given and option not in kind.options:
                 raise UserError(f"{self.out}: {_REFUSED[option]}")
+        if self.largest is not None and not self.largest > 0:
+            raise UserError(f"--largest {self.largest:g}: give a number of MB above 0")
         if self.address is not None:
             from mien.export.page_head import check_address
 
@@ -352,8 +358,8 @@ class Command:
 
         webcam = find_webcam_files(self.webcam_model) if self.webcam else None
         version = self.spz_version or 4
-        soft_cut = not self.sharp_cut
-        return Options(self.sh, self.webgpu, webcam, version, self.title, self.address, soft_cut, self.microphone)
+        named = {"soft_cut": not self.sharp_cut, "microphone": self.microphone, "largest": self.largest}
+        return Options(self.sh, self.webgpu, webcam, version, self.title, self.address, **named)
 
     def _check_file(self, kind: Format) -> None:
         from mien.files import check_writable

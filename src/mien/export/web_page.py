@@ -15,6 +15,7 @@ import numpy as np
 from mien import runtime
 from mien.export.packed import Motion, pack, unpacked
 from mien.export.page_head import Described, head_part, write_poster
+from mien.export.thinning import fitted
 from mien.export.webcam import POLICY, WebcamFiles, webcam_part
 from mien.files import check_writable, write_atomically
 from mien.runtime import PortableAvatar
@@ -36,6 +37,8 @@ _MOST_PSNR = 120.0
 class WrittenPage:
     """A page, or a packed avatar, on disk."""
 
+    count: int
+    """Number of its Gaussians."""
     size: int
     """Size in bytes."""
     psnr: float
@@ -51,6 +54,7 @@ def write_page(
     webgpu: bool = False,
     described: Described | None = None,
     microphone: bool = False,
+    largest: int | None = None,
 ) -> WrittenPage:
     """Write a page with an avatar, and a motion that it can play, as one file.
 
@@ -63,9 +67,11 @@ def write_page(
         described: What the page says of itself. None for the avatar's name. With an address, a poster for messengers is
             written beside the page, with its name and the ending .jpg.
         microphone: Whether a button lets the lips follow a voice.
+        largest: Largest size of the page in bytes, for which Gaussians that add least are left out. None for all.
 
     Raises:
-        UserError: pages cannot draw the avatar's colours, a file cannot be read, or the path cannot be written.
+        UserError: pages cannot draw the avatar's colours, a file cannot be read, `largest` is too small for any page,
+            or the path cannot be written.
     """
     check_writable(path)
     described = described or Described(avatar.about.name)
@@ -73,7 +79,6 @@ def write_page(
     if poster:
         check_writable(poster)
     drawn = runtime.Avatar(avatar)
-    packed = base64.b64encode(pack(avatar, motion)).decode()
     parts = {
         "head": head_part(drawn, described, poster),
         "policy": POLICY if webcam else _SILENT if microphone else "",
@@ -81,13 +86,19 @@ def write_page(
         "webcam": webcam_part(webcam) if webcam else "",
         "title": html.escape(described.title),
         "webgpu": f"\n<script>{WEBGPU.read_text(encoding='utf-8').strip()}</script>" if webgpu else "",
-        "avatar": packed,
+        "avatar": "",
     }
-    content = filled(TEMPLATE.read_text(encoding="utf-8"), parts).encode()
+    template = TEMPLATE.read_text(encoding="utf-8")
+    empty = len(filled(template, parts).encode())
+    shown = avatar
+    if largest is not None:
+        shown = fitted(path, avatar, motion, largest, lambda packed: empty + 4 * -(-len(packed) // 3))
+    parts["avatar"] = base64.b64encode(pack(shown, motion)).decode()
+    content = filled(template, parts).encode()
     if poster:
         write_poster(poster, drawn)
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
-    return WrittenPage(len(content), _psnr(avatar))
+    return _written(len(content), avatar, shown)
 
 
 def filled(template: str, parts: Mapping[str, str]) -> str:
@@ -95,20 +106,29 @@ def filled(template: str, parts: Mapping[str, str]) -> str:
     return re.sub(rf"{{{{({'|'.join(parts)})}}}}", lambda mark: parts[mark[1]], template)
 
 
-def write_packed(path: Path, avatar: PortableAvatar, motion: Motion | None = None) -> WrittenPage:
+def write_packed(
+    path: Path, avatar: PortableAvatar, motion: Motion | None = None, largest: int | None = None
+) -> WrittenPage:
     """Write the packed form alone, for pages of one's own (`<mien-avatar src=...>`, docs/publishing.md).
 
+    With `largest`, Gaussians that add least are left out until it has at most so many bytes.
+
     Raises:
-        UserError: pages cannot draw the avatar's colours, or the path cannot be written.
+        UserError: pages cannot draw the avatar's colours, `largest` is too small, or the path cannot be written.
     """
     check_writable(path)
-    content = pack(avatar, motion)
+    shown = avatar if largest is None else fitted(path, avatar, motion, largest, len)
+    content = pack(shown, motion)
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
-    return WrittenPage(len(content), _psnr(avatar))
+    return _written(len(content), avatar, shown)
 
 
-def _psnr(avatar: PortableAvatar) -> float:
-    exact, read = runtime.Avatar(avatar), runtime.Avatar(unpacked(avatar))
+def _written(size: int, avatar: PortableAvatar, shown: PortableAvatar) -> WrittenPage:
+    return WrittenPage(len(shown.baked.attributes.opacity_logits), size, _psnr(avatar, shown))
+
+
+def _psnr(avatar: PortableAvatar, shown: PortableAvatar) -> float:
+    exact, read = runtime.Avatar(avatar), runtime.Avatar(unpacked(shown))
     camera = avatar.camera.resized(_SIDE, _SIDE)
     low, high = avatar.expression_bounds.T
     rest = avatar.neutral.expression

@@ -81,6 +81,8 @@ class Options:
     """Whether a head fades towards its neck cut."""
     microphone: bool = False
     """Whether the lips of a page follow a voice."""
+    largest: float | None = None
+    """Largest size of a page or a packed avatar, in MB. None for all Gaussians."""
 
 
 def _no_check(path: Path) -> None:

@@ -86,5 +86,6 @@ def convert(source: Path, out: Path, kind: Format, options: Options) -> None:
         UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
     """
     content = FileContent(source)
-    kind.write(out, content, options)
-    say(f"{out}: {content.name!r} of {source}, {out.stat().st_size / 1e6:.1f} MB")
+    told = kind.write(out, content, options)
+    size = f"{out.stat().st_size / 1e6:.1f} MB" if options.largest is None else told
+    say(f"{out}: {content.name!r} of {source}, {size}")
