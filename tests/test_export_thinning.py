@@ -105,6 +105,9 @@ def test_the_command_says_what_is_left(tmp_path: Path, capsys: pytest.CaptureFix
     assert "of 8,000 Gaussians that add most to its pictures" in told
     assert "dB against the picture with all of them" in told
     assert out.stat().st_size <= half * 1e6
+    assert "gaps show" not in told
+    assert main(["export", str(source), "--out", str(out), "--largest", str(round(half * 0.8, 2))]) == 0
+    assert "gaps show, in the eyes first" in " ".join(capsys.readouterr().err.split())
     for words, message in (
         (["--out", str(tmp_path / "me.ply"), "--largest", "1"], "only .html and .packed files are made smaller"),
         (["--out", str(out), "--largest", "0"], "--largest 0: give a number of MB above 0"),
