@@ -66,6 +66,7 @@ ALIVE = """(async () => {
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_page_opens_alive(page: Path) -> None:
     """The camera turns to the front, the filmed motion plays once, then the head blinks and looks at the pointer."""
     told = browse(page, [ALIVE], size=(300, 200), device=["lively"], opening=NOTES)
