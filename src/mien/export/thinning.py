@@ -58,7 +58,7 @@ def fitted(
     if least > largest:
         raise UserError(
             f"{path}: would have {least / 1e6:.2f} MB with the fewest Gaussians, and --largest asks for "
-            f"{largest / 1e6:g} MB at most; give more, or leave the motion out"
+            f"{largest / 1e6:g} MB at most; give more, or leave out what else is in it, such as a motion or a webcam"
         )
     fits, fails = 1, _STEPS
     while fails - fits > 1:
