@@ -1,4 +1,4 @@
-"""What the papers say, with the place: the column "paper" of the tables of docs/paper_preset.md, and why mien differs.
+"""Statements of the papers, each with its place: the column "paper" of docs/paper_preset.md, and why mien differs.
 
 Places are the paper (P), its supplement (S) with the section, the published code (C) with the part of it, or another
 work by name. Main papers are known by the numbers that other papers quote of them. `tests/test_paper_preset_page.py`
@@ -19,7 +19,7 @@ class Row(NamedTuple):
     published: str
     """The column "paper"."""
     place: str
-    """Where that is published."""
+    """Place where that is published."""
     why: str = ""
     """The column "why different"."""
     held: str = ""

@@ -1,4 +1,4 @@
-"""Which tests hold each paragraph of docs/paper_preset.md, by the paragraph's digest (`paper_preset_page.digest`).
+"""The tests that hold each paragraph of docs/paper_preset.md, by the paragraph's digest (`paper_preset_page.digest`).
 
 Tables with a column "paper" are in `paper_preset_facts.py`. Where a paragraph says what a published code does, the
 place is beside it as there: P is the paper, S its supplement, C its published code.

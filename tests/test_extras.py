@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import tomllib
-import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from mien import extras
 from mien.cli import main
 from mien.export.pixels import png_bytes
 from mien.licences.spdx import requirements_of
+from viewer_alone import page_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -122,20 +122,8 @@ def test_a_file_is_viewed_without_torch(exported: Path):
     """With mien[viewer] alone, the viewer serves its page. viser brings zstandard, and pillow by imageio."""
     missing = set(extras.EXTRA_OF) - {"viser", "zstandard", "PIL"}
     words = [sys.executable, "-c", WITHOUT.format(missing=sorted(missing)), "view", str(exported), "--port", "0"]
-    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as viewer:
-        assert viewer.stdout is not None
-        told = []
-        try:
-            for line in viewer.stdout:
-                told.append(line)
-                if address := next((word for word in line.split() if word.startswith("http://")), None):
-                    with browser.open(address, timeout=60) as answer:
-                        assert b"<html" in answer.read()
-                    return
-        finally:
-            viewer.terminate()
-    pytest.fail("".join(told))
+    told = page_of(words)
+    assert "<html" in told, told
 
 
 def test_a_missing_library_of_the_system_is_named():

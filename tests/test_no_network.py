@@ -8,7 +8,6 @@ import socket
 import struct
 import subprocess
 import sys
-import urllib.request
 from pathlib import Path
 
 import pytest
@@ -18,6 +17,7 @@ from mien.avatar import DEFAULT_METHOD
 from mien.cli import COMMANDS
 from needs import NO_NAMESPACE
 from toy_workspace import write_toy_workspace
+from viewer_alone import page_of
 
 LINES = {
     "create": "{video} --out {out}/created --preset draft --steps 2 --alignment.when never",
@@ -133,19 +133,4 @@ def view_alone(avatar: str) -> None:
         _, flags = struct.unpack("16sH14x", fcntl.ioctl(any_socket, _FLAGS, asked))
         fcntl.ioctl(any_socket, _SET_FLAGS, struct.pack("16sH14x", b"lo", flags | _UP))
     words = [sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]
-    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as viewer:
-        assert viewer.stdout is not None
-        lines = []
-        try:
-            for line in viewer.stdout:
-                lines.append(line)
-                address = next((word for word in line.split() if word.startswith("http://")), None)
-                if address is not None:
-                    with browser.open(address, timeout=60) as answer:
-                        print(answer.read().decode())
-                    break
-            else:
-                sys.exit("".join(lines))
-        finally:
-            viewer.terminate()
+    print(page_of(words))

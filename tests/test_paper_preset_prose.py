@@ -1,4 +1,4 @@
-"""What docs/paper_preset.md says outside of its tables is what the code does, and its figures are those of the log."""
+"""The code does what docs/paper_preset.md says outside of its tables, and the log has its figures."""
 
 import math
 import re
@@ -302,7 +302,7 @@ def test_the_page_has_the_numbers_of_the_extent() -> None:
 
 
 def test_with_an_extent_of_0_nothing_moves_all_is_split_and_all_is_too_large() -> None:
-    """What the floor of E is for."""
+    """The floor of E serves a single camera, and two that stand side by side."""
     says("centres would never move, every Gaussian that grows would be split, and from step 60,000 on every Gaussian "
          "would be too large.")  # fmt: skip
     avatar = GaussianAvatars(PAPER, toy_face_model(), toy_face(5))

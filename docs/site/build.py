@@ -56,7 +56,7 @@ _MENDED = {
     '<p class="caption" role="heading">': '<p class="caption" role="heading" aria-level="2">',
     '<aside class="sidebar-drawer">': '<aside class="sidebar-drawer" aria-label="All pages">',
 }
-"""What screen readers miss in the theme's pages -> what they get."""
+"""Elements of the theme's pages that screen readers cannot use -> the elements that replace them."""
 _REFERENCE = "| Reference |"
 """Where the front page names the reference, which exists in the site only."""
 

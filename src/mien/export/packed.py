@@ -16,6 +16,7 @@ from jaxtyping import Float32
 
 from mien.errors import UserError
 from mien.export.bound_features import bound_features
+from mien.export.rows import with_rows
 from mien.runtime import BlendSkinned, Face, MeshBound, PortableAvatar, Static
 
 FORMAT, VERSION = "mien.packed", 1
@@ -155,23 +156,9 @@ def _ordered(baked: MeshBound) -> MeshBound:
     opacity_logits = raw.opacity_logits
     if baked.changes is None:  # otherwise a change may lift a value back into the range
         opacity_logits = np.clip(opacity_logits, *_OPACITY_LOGITS, dtype=np.float32)
-    attributes = replace(
-        raw,
-        quats=quats[order].astype(np.float32),
-        log_scales=np.maximum(raw.log_scales, np.float32(_LEAST_LOG_SCALE))[order],
-        opacity_logits=opacity_logits[order],
-        sh=raw.sh[order],
-    )
-    changes = baked.changes
-    if changes is not None:
-        parts = {name: getattr(changes, name) for name in ("color", "opacity_logits", "means")}
-        changes = replace(changes, **{name: part[order] for name, part in parts.items() if part is not None})
-        if (features := changes.features) is not None:
-            rows = {name: getattr(features, name)[order] for name in ("neutral", "basis", "own")}
-            changes = replace(changes, features=replace(features, **rows))
-    return replace(
-        baked, face_index=baked.face_index[order], means=baked.means[order], attributes=attributes, changes=changes
-    )
+    log_scales = np.maximum(raw.log_scales, np.float32(_LEAST_LOG_SCALE))
+    attributes = replace(raw, quats=quats.astype(np.float32), log_scales=log_scales, opacity_logits=opacity_logits)
+    return with_rows(replace(baked, attributes=attributes), order)
 
 
 def _check_colors(baked: BlendSkinned | Static, name: str) -> None:

@@ -5,17 +5,17 @@ against the picture with all of them.
 """
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32
 
 from mien import _native
 from mien.errors import UserError
 from mien.export.packed import Motion, pack
-from mien.runtime import Avatar, BlendSkinned, Camera, Gaussians, MeshBound, PortableAvatar, Static, presets_for
+from mien.export.rows import with_rows
+from mien.runtime import Avatar, Camera, Gaussians, PortableAvatar, presets_for
 from mien.runtime.named import GAZE_NAMES, is_gaze
 from mien.runtime.posing import SH_C0
 from mien.runtime.rotation import axis_angle_from_matrix, compose_rigid, matrix_from_axis_angle
@@ -52,7 +52,8 @@ def fitted(
     order = np.argsort(-contributions(avatar), kind="stable")
 
     def with_share(steps: int) -> PortableAvatar:
-        return with_rows(avatar, np.sort(order[: max(1, len(order) * steps // _STEPS)]))
+        rows = np.sort(order[: max(1, len(order) * steps // _STEPS)])
+        return replace(avatar, baked=with_rows(avatar.baked, rows))
 
     least = bytes_of(with_share(1))
     if least > largest:
@@ -119,45 +120,3 @@ def _weights(gaussians: Gaussians, camera: Camera) -> Float32[np.ndarray, " n"]:
     )
     _native.rasterize_views_backward([gradients])
     return found[-1][:, 0, 0] / np.float32(SH_C0)
-
-
-def with_rows(avatar: PortableAvatar, rows: Int[np.ndarray, " k"]) -> PortableAvatar:
-    """The avatar with the Gaussians of these indices alone, in their order."""
-    baked = avatar.baked
-    attributes = _rows(baked.attributes, rows, *(field.name for field in fields(baked.attributes)))
-    match baked:
-        case MeshBound():
-            changes = _rows(baked.changes, rows, "color", "opacity_logits", "means")
-            if changes is not None:
-                changes = replace(changes, features=_rows(changes.features, rows, "neutral", "basis", "own"))
-            face_index, means = baked.face_index[rows], baked.means[rows]
-            kept = replace(baked, face_index=face_index, means=means, attributes=attributes, changes=changes)
-        case Static():
-            bases, network = _bases(baked, rows), _network(baked, rows)
-            kept = replace(baked, means=baked.means[rows], attributes=attributes, bases=bases, network=network)
-        case BlendSkinned():
-            own = ("expression_basis", "pose_basis")
-            rig = _rows(baked.rig, rows, "template", "skinning_weights", second=own)
-            still = None if baked.still_weights is None else baked.still_weights[rows]
-            bases, network = _bases(baked, rows), _network(baked, rows)
-            kept = replace(baked, rig=rig, attributes=attributes, bases=bases, network=network, still_weights=still)
-    return replace(avatar, baked=kept)
-
-
-def _bases(baked: BlendSkinned | Static, rows: Int[np.ndarray, " k"]) -> Any:
-    return _rows(baked.bases, rows, second=("means", "log_scales", "opacity_logits", "sh"))
-
-
-def _network(baked: BlendSkinned | Static, rows: Int[np.ndarray, " k"]) -> Any:
-    network = _rows(baked.network, rows, "base")
-    return network if network is None else replace(network, along=_rows(network.along, rows, "basis"))
-
-
-def _rows(record: Any, rows: Int[np.ndarray, " k"], *first: str, second: tuple[str, ...] = ()) -> Any:
-    """A record, or None, with some rows of its arrays along their first or second axis. None stays None."""
-    if record is None:
-        return None
-    axes = dict.fromkeys(first, 0) | dict.fromkeys(second, 1)
-    found = {name: getattr(record, name) for name in axes}
-    kept = {name: np.take(array, rows, axes[name]) for name, array in found.items() if array is not None}
-    return replace(record, **kept)

@@ -89,9 +89,9 @@ def write_page(
         "avatar": "",
     }
     template = TEMPLATE.read_text(encoding="utf-8")
-    empty = len(filled(template, parts).encode())
     shown = avatar
     if largest is not None:
+        empty = len(filled(template, parts).encode())
         shown = fitted(path, avatar, motion, largest, lambda packed: empty + 4 * -(-len(packed) // 3))
     parts["avatar"] = base64.b64encode(pack(shown, motion)).decode()
     content = filled(template, parts).encode()

@@ -44,12 +44,12 @@ Run = Callable[[Work, Sequence[Row], EngineOptions], Iterator[tuple[Row, Any]]]
 
 @dataclass(frozen=True)
 class Engine:
-    """What starts rows. Its functions are imported at their first use, because they need packages of their own."""
+    """An engine starts rows. Its functions are imported at their first use, because they need packages of their own."""
 
     run_place: str
     """"MODULE:NAME" of its function, a `Run`."""
     options: tuple[str, ...] = ()
-    """Which of gpus, partition, time, ray_address and store it heeds, as fields of `mien batch`. Others are refused."""
+    """Options that it heeds, of gpus, partition, time, ray_address and store of `mien batch`. Others are refused."""
     packages: tuple[str, ...] = ()
     """Modules that it needs. One that is missing is told before rows are read."""
     wait_place: str = ""
