@@ -11,7 +11,7 @@ from mien.avatar.files import write_avatar
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.schedules import Progress
 from mien.face import FaceParams
-from test_mono_gaussian_avatar import new_avatar
+from mono_avatars import new_avatar
 from toy_scene import toy_face, toy_face_model
 
 method = pytest.mark.parametrize("method", ["headgas", "mono_gaussian_avatar"])

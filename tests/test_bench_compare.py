@@ -104,24 +104,31 @@ def test_minutes_become_steps_by_trials_that_are_kept(
     assert len(trained) == before
 
 
-def test_the_longer_trial_decides(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step costs more once there are more Gaussians, so the rate of a trial with the whole schedule counts."""
-    rates, asked = {100: 0.01, 600: 0.02}, []
+def test_what_two_trials_share_is_not_counted_for_each_step(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run prepares much before its first step, and each step costs more once there are more Gaussians."""
+    times, asked = {100: 10.0, 200: 14.0, 60: 10.0}, []
 
     def trial(subject: Any, config: Any, settings: Any, folder: Path) -> float:
         asked.append(settings.steps)
-        return rates[settings.steps]
+        return times[settings.steps]
 
     monkeypatch.setattr(comparing, "_trial", trial)
     from mien.commands.stages.comparing import _of_workspace, _steps
     from mien.training import PRESETS
     from mien.workspace import Workspace
 
-    chosen = CompareSettings(("gaussian_avatars",), "standard", Budget(minutes=1.0), "tail")
+    chosen = CompareSettings(("gaussian_avatars",), "standard", Budget(minutes=2.0), "tail")
     subject = _of_workspace(Workspace(workspace), chosen)
     config = PRESETS["standard"].config("gaussian_avatars")
-    assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == 3000
-    assert asked == [100, 600]
+    # 6 s before the first step, and 40 ms for each.
+    assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == 114 / 0.04
+    assert asked == [100, 200]
+    times[200] = 9.0  # The machine was busier in the first trial: a step takes at least 0.3 of the mean.
+    assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == round(113.7 / 0.0135)
+    # There is no time for a second trial.
+    assert _steps(subject, config, subject.settings, Budget(minutes=0.2), tmp_path / "new") == 120
     assert _steps(subject, config, subject.settings, Budget(steps=7), tmp_path / "new") == 7
     assert _steps(subject, config, subject.settings, Budget(), tmp_path / "new") == subject.settings.steps
 

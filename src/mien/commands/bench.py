@@ -183,8 +183,8 @@ class Compare:
     """Reference captures as well. They are drawn, captured and tracked in --out first."""
     methods: Annotated[tuple[str, ...], listed_methods("Methods to compare")] = tuple(METHODS)
     minutes: float = 0.0
-    """Minutes of training for each method on each capture. Trials on this machine, which take a tenth more, turn them
-    into steps. 0 means --steps."""
+    """Minutes of training for each method on each capture. Two short trials on this machine turn them into steps. 0
+    means --steps."""
     steps: int = 0
     """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
     preset: PresetName = "standard"

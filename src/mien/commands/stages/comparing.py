@@ -33,7 +33,9 @@ _FORMAT, _VERSION = "mien.bench_compare", 1
 _SCORED = EvaluationSettings(perceptual_frames=16, video_frames=0)
 _FIRST_TRIAL_STEPS = 100
 _TRIAL_SHARE = 0.1
-"""Share of the budget that the trial may take beside it. A shorter trial grows fewer Gaussians than the run will."""
+"""Share of the budget that the second trial may take beside it. A shorter one grows fewer Gaussians than the run."""
+_LEAST_MARGIN = 0.3
+"""Smallest ratio of the seconds of a further step to the mean of all, because trials are noisy."""
 
 
 @dataclass(frozen=True)
@@ -162,29 +164,39 @@ def _unseen(subject: _Subject, run: str) -> dict[str, Any]:
 
 
 def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, budget: Budget, folder: Path) -> int:
-    """The number of steps of a run. A budget of minutes is turned into steps by two trials, which are kept."""
+    """The number of steps of a run. A budget of minutes is turned into steps by two trials, which are kept.
+
+    The run is expected to need the same time before its first step as the trials, and the time by which the longer
+    trial exceeds the shorter one for each further step.
+    """
     if not budget.minutes:
         return budget.steps or settings.steps
     finished = subject.workspace.run_dir(folder.name) / "training.json"
     if finished.is_file():
         return read_training_summary(finished.parent)["steps"]
-    steps = _FIRST_TRIAL_STEPS
-    rate = _trial(subject, config, replace(settings, steps=steps), folder / "first")
-    longer = round(_TRIAL_SHARE * 60 * budget.minutes / rate)
-    if longer > steps:
-        rate = _trial(subject, config, replace(settings, steps=longer), folder / "second")
-    steps = max(1, round(60 * budget.minutes / rate))
-    say(f"{folder.name}: {1e3 * rate:.1f} ms a step in the trial, so {steps:,} steps in {budget.minutes:g} minutes")
+    count = _FIRST_TRIAL_STEPS
+    took = _trial(subject, config, replace(settings, steps=count), folder / "first")
+    rate, began = took / count, 0.0
+    longer = max(2 * count, round(_TRIAL_SHARE * 60 * budget.minutes / rate))
+    if longer * rate < 60 * budget.minutes:
+        # The first step of a run prepares much, so that the mean of a short trial is too high.
+        both = _trial(subject, config, replace(settings, steps=longer), folder / "second")
+        rate = min(max((both - took) / (longer - count), _LEAST_MARGIN * both / longer), both / longer)
+        began = both - longer * rate
+    steps = max(1, round((60 * budget.minutes - began) / rate))
+    say(
+        f"{folder.name}: {1e3 * rate:.1f} ms a step and {began:.1f} s before the first one in trials, "
+        f"so {steps:,} steps in {budget.minutes:g} minutes"
+    )
     return steps
 
 
 def _trial(subject: _Subject, config: MethodConfig, settings: TrainSettings, folder: Path) -> float:
-    """Seconds of a step of a short run, whose schedules are as short. A trial that was done is only read."""
+    """Seconds of a short run, whose schedules are as short. A trial that was done is only read."""
     folders = [subject.workspace.sequence_dir(name) for name in subject.sequences]
     tracked = "".join(file_digest(one / "tracking/tracking.safetensors")[:8] for one in folders)[:32]
     run_dir = folder.with_name(f"{folder.name}-{settings.steps}-{tracked}")
     if not (run_dir / "training.json").is_file():
         sequences = [read_sequence(one) for one in folders]
         train(sequences, load_face_model(sequences[0].tracking.face_model), config, settings, run_dir)
-    summary = read_training_summary(run_dir)
-    return max(summary["seconds"], 0.05) / summary["steps"]
+    return max(read_training_summary(run_dir)["seconds"], 0.05)
