@@ -107,7 +107,7 @@ def test_minutes_become_steps_by_trials_that_are_kept(
 def test_what_two_trials_share_is_not_counted_for_each_step(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run prepares much before its first step, and each step costs more once there are more Gaussians."""
+    """A run prepares much before its first step, and the first use of each frame takes longest."""
     times, asked = {100: 10.0, 200: 14.0, 60: 10.0}, []
 
     def trial(subject: Any, config: Any, settings: Any, folder: Path) -> float:
@@ -122,7 +122,7 @@ def test_what_two_trials_share_is_not_counted_for_each_step(
     chosen = CompareSettings(("gaussian_avatars",), "standard", Budget(minutes=2.0), "tail")
     subject = _of_workspace(Workspace(workspace), chosen)
     config = PRESETS["standard"].config("gaussian_avatars")
-    # 6 s before the first step, and 40 ms for each.
+    # 6 s beside the steps, and 40 ms for each.
     assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == 114 / 0.04
     assert asked == [100, 200]
     times[200] = 9.0  # The machine was busier in the first trial: a step takes at least 0.3 of the mean.

@@ -31,7 +31,7 @@ from mien.workspace import Workspace
 
 _FORMAT, _VERSION = "mien.bench_compare", 1
 _SCORED = EvaluationSettings(perceptual_frames=16, video_frames=0)
-_FIRST_TRIAL_STEPS = 100
+_FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
 _TRIAL_SHARE = 0.1
 """Share of the budget that the second trial may take beside it. A shorter one grows fewer Gaussians than the run."""
 _LEAST_MARGIN = 0.3
@@ -166,26 +166,27 @@ def _unseen(subject: _Subject, run: str) -> dict[str, Any]:
 def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, budget: Budget, folder: Path) -> int:
     """The number of steps of a run. A budget of minutes is turned into steps by two trials, which are kept.
 
-    The run is expected to need the same time before its first step as the trials, and the time by which the longer
-    trial exceeds the shorter one for each further step.
+    The run is expected to need as much time beside its steps as the trials, and for each step the time that a step of
+    the longer trial takes after the length of the shorter one. By then each frame was used once, which takes longest.
     """
     if not budget.minutes:
         return budget.steps or settings.steps
     finished = subject.workspace.run_dir(folder.name) / "training.json"
     if finished.is_file():
         return read_training_summary(finished.parent)["steps"]
-    count = _FIRST_TRIAL_STEPS
+    sequences = [read_sequence(subject.workspace.sequence_dir(name)) for name in subject.sequences]
+    pictures = sum(len(one.tracking.face) * len(one.tracking.cameras) for one in sequences)
+    count = max(_FIRST_TRIAL_STEPS, min(pictures, _MOST_FIRST_STEPS))
     took = _trial(subject, config, replace(settings, steps=count), folder / "first")
     rate, began = took / count, 0.0
     longer = max(2 * count, round(_TRIAL_SHARE * 60 * budget.minutes / rate))
     if longer * rate < 60 * budget.minutes:
-        # The first step of a run prepares much, so that the mean of a short trial is too high.
         both = _trial(subject, config, replace(settings, steps=longer), folder / "second")
         rate = min(max((both - took) / (longer - count), _LEAST_MARGIN * both / longer), both / longer)
         began = both - longer * rate
     steps = max(1, round((60 * budget.minutes - began) / rate))
     say(
-        f"{folder.name}: {1e3 * rate:.1f} ms a step and {began:.1f} s before the first one in trials, "
+        f"{folder.name}: {1e3 * rate:.1f} ms a step and {began:.1f} s beside the steps in trials, "
         f"so {steps:,} steps in {budget.minutes:g} minutes"
     )
     return steps
