@@ -41,6 +41,7 @@ from mien.plots import Axes, Series
 from mien.storage import write_tensors
 from mien.training import read_curves
 from toy_workspace import write_toy_workspace
+from web_case import chromium, violations
 
 SIZES = {(16, 24): 187, (24, 32): 95}
 TRAINED = ["--train", "--steps", "3", "--seconds", "0.01"]
@@ -263,6 +264,16 @@ def test_parts_of_another_method_give_charts_pictures_and_films(workspace: Path,
     assert again["parts"] == first["parts"]
     assert again["parts"]["all"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
     assert (folder / "analysis.html").read_text() == page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", [[], ["dark", "touch"]])
+def test_everybody_can_use_the_page(workspace: Path, tmp_path: Path, device: list[str]) -> None:
+    """axe-core finds no fault in a page of tables, charts, pictures and films."""
+    chromium()
+    analysis = Analysis("gaussian_avatars", "a paper", (Part("all", "All kinds", "test_analysis:part_of_everything"),))
+    run_analysis(analysis, analysis.parts, workspace / "runs/toy", (), tmp_path, AnalysisOptions())
+    assert violations(tmp_path / "analysis.html", (390, 844), device) == []
 
 
 def part_of_everything(context: Any) -> PartResult:

@@ -10,7 +10,7 @@ import pytest
 
 from mien.export import write_packed
 from test_web_element import LOADED, script, served
-from web_case import WEB, browse, build, chromium, drawn_head
+from web_case import WEB, browse, build, chromium, drawn_head, violations
 
 PRESS = """
 const buttons = [...document.querySelectorAll("nav button")];
@@ -41,6 +41,7 @@ def test_the_starter_is_built_from_the_packed_package_and_shows_an_avatar(tmp_pa
     npm(starter, "run", "build")
     with served(starter / "dist") as address:
         told = browse(address, [script(LOADED, PRESS)], size=(640, 480), screenshots=[str(tmp_path / "page.png")])
+        assert violations(address, (390, 844)) == []
     (count, jaw), shown = told["results"][0], cv2.imread(str(tmp_path / "page.png"))
     assert told["messages"] == []
     assert count >= 6

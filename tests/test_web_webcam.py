@@ -15,7 +15,7 @@ from mien.driving.live import OneEuro
 from mien.export import find_webcam_files, write_packed, write_page
 from mien.export.webcam import TEMPLATE, VERSION
 from test_web_element import served
-from web_case import WEB, browse, chromium, drawn_head, node, tasks_vision
+from web_case import WEB, browse, chromium, drawn_head, node, tasks_vision, violations
 from webcam_case import CELL, STILL, TRUE, Clip, write_clip
 
 FAKE = "--use-fake-device-for-media-stream"
@@ -255,6 +255,14 @@ def test_every_control_has_a_name_and_is_reached_by_keys(page: Path) -> None:
         ["mirrored", 0, True, "Mirrored"],
         ["preview", 0, True, "My picture"],
     ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", [[], ["dark", "touch"]])
+def test_everybody_can_use_the_page(page: Path, device: list[str]) -> None:
+    """axe-core finds no fault in the page with its camera's controls and notices."""
+    first = 'await webcam; document.getElementById("more").click();'
+    assert violations(page, (390, 700), device, first) == []
 
 
 def found(
