@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mien.commands.stages.comparing import Budget, CompareSettings
 from mien.face import add_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
 from mien.training import read_run_config, read_training_summary
+from mien.training.settings import Preset
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
@@ -47,8 +49,20 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return seen
 
 
+@pytest.fixture
+def few_lessons(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let methods that learn before the first picture take few lessons, with few points."""
+    original = Preset.config
+
+    def small(self: Preset, method: str) -> Any:
+        config = original(self, method)
+        return replace(config, pretraining=5, points=400, max_points=800) if hasattr(config, "pretraining") else config
+
+    monkeypatch.setattr(Preset, "config", small)
+
+
 @pytest.mark.slow
-@pytest.mark.usefixtures("short_films")
+@pytest.mark.usefixtures("short_films", "few_lessons")
 def test_every_method_gets_the_same_frames_and_steps(
     workspace: Path, tmp_path: Path, trained: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
