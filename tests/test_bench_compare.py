@@ -119,7 +119,7 @@ def test_minutes_become_steps_by_trials_that_are_kept(
 
 
 def test_what_two_trials_share_is_not_counted_for_each_step(
-    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A run prepares much before its first step, and the first use of each frame takes longest."""
     times, asked = {100: 10.0, 200: 14.0, 60: 10.0}, []
@@ -143,6 +143,9 @@ def test_what_two_trials_share_is_not_counted_for_each_step(
     assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == round(113.7 / 0.0135)
     # There is no time for a second trial.
     assert _steps(subject, config, subject.settings, Budget(minutes=0.2), tmp_path / "new") == 120
+    assert "too few steps" not in capsys.readouterr().err
+    assert _steps(subject, config, subject.settings, Budget(minutes=0.002), tmp_path / "new") == 1
+    assert "0.002 minutes are too few steps to see each of" in capsys.readouterr().err
     assert _steps(subject, config, subject.settings, Budget(steps=7), tmp_path / "new") == 7
     assert _steps(subject, config, subject.settings, Budget(), tmp_path / "new") == subject.settings.steps
 

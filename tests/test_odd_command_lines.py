@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -233,3 +234,14 @@ def test_an_unfinished_run_does_not_ask_for_its_name(tmp_path: Path):
     (workspace.run_dir("good") / "avatar").mkdir()
     assert workspace.pick_run(None) == "good"
     assert workspace.pick_run("stopped") == "stopped"
+
+
+def test_compared_runs_do_not_ask_for_a_name(tmp_path: Path):
+    workspace = Workspace(tmp_path)
+    for run in ("compare-headgas-4min", "good"):
+        (workspace.run_dir(run) / "avatar").mkdir(parents=True)
+        (workspace.run_dir(run) / "config.json").touch()
+    assert workspace.pick_run(None) == "good"
+    assert workspace.pick_run("compare-headgas-4min") == "compare-headgas-4min"
+    shutil.rmtree(workspace.run_dir("good"))
+    assert workspace.pick_run(None) == "compare-headgas-4min"

@@ -8,6 +8,8 @@ from pathlib import Path
 from mien.errors import UserError
 from mien.inside import check_subtrees, inside
 
+COMPARED = "compare-"
+"""First letters of the names of runs that `mien bench compare` makes."""
 _FOLDERS = ("sequences", "runs")
 
 
@@ -69,14 +71,20 @@ class Workspace:
         return _pick("sequence", name, self.sequence_names(), self.root, "--sequence")
 
     def pick_run(self, name: str | None) -> str:
-        """`name`, or the only run if no name is given. Runs without an avatar then count only if no run has one.
+        """`name`, or the only run if no name is given.
+
+        Runs without an avatar then count only if no run has one, and those of `mien bench compare` only if there is no
+        other.
 
         Raises:
             UserError: there is no run, none of that name, or several and no name is given.
         """
         names = self.run_names()
         trained = [run for run in names if (self.run_dir(run) / "avatar").is_dir()]
-        return _pick("run", name, trained if name is None and trained else names, self.root, "--run")
+        if name is None:
+            names = trained or names
+            names = [run for run in names if not run.startswith(COMPARED)] or names
+        return _pick("run", name, names, self.root, "--run")
 
 
 def open_workspace(root: Path) -> Workspace:

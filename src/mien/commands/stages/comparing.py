@@ -27,10 +27,10 @@ from mien.progress import say
 from mien.storage import file_digest, read_json, write_atomically, write_json
 from mien.terminal import show
 from mien.training import PRESETS, TrainSettings, read_sequence, read_training_summary, train
-from mien.workspace import Workspace
+from mien.workspace import COMPARED, Workspace
 
 _FORMAT, _VERSION = "mien.bench_compare", 1
-_SCORED = EvaluationSettings(perceptual_frames=16, video_frames=0)
+_SCORED = EvaluationSettings(video_frames=0)
 _FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
 _TRIAL_SHARE = 0.1
 """Share of the budget that the second trial may take beside it. A shorter one grows fewer Gaussians than the run."""
@@ -64,7 +64,7 @@ class CompareSettings:
 
     def run_name(self, method: str) -> str:
         """The name of a method's run."""
-        parts = ["compare", method, self.budget.name]
+        parts = [COMPARED + method, self.budget.name]
         parts += [] if self.preset == "standard" else [self.preset]
         return "-".join(parts + ([] if self.split == "blocks" else [self.split]))
 
@@ -189,6 +189,11 @@ def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, bud
         f"{folder.name}: {1e3 * rate:.1f} ms a step and {began:.1f} s beside the steps in trials, "
         f"so {steps:,} steps in {budget.minutes:g} minutes"
     )
+    if steps < pictures:
+        say(
+            f"{folder.name}: {budget.minutes:g} minutes are too few steps to see each of {pictures} pictures once, so "
+            "the figures say little; give more --minutes"
+        )
     return steps
 
 
@@ -198,6 +203,7 @@ def _trial(subject: _Subject, config: MethodConfig, settings: TrainSettings, fol
     tracked = "".join(file_digest(one / "tracking/tracking.safetensors")[:8] for one in folders)[:32]
     run_dir = folder.with_name(f"{folder.name}-{settings.steps}-{tracked}")
     if not (run_dir / "training.json").is_file():
+        say(f"{folder.parent.name}: a trial of {settings.steps} steps")
         sequences = [read_sequence(one) for one in folders]
         train(sequences, load_face_model(sequences[0].tracking.face_model), config, settings, run_dir)
     return max(read_training_summary(run_dir)["seconds"], 0.05)
