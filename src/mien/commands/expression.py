@@ -40,7 +40,8 @@ def tell_of_unfilmed(assignments: tuple[str, ...], face: FaceParams, model: Face
             index = names.index(part.name)
             value, shown = (values[index], f"{values[index]:.2f}") if part.is_added else (part.value, text)
             lowest, highest = min(0.0, float(filmed.lowest[index])), max(0.0, float(filmed.highest[index]))
-            if not lowest <= value <= highest:
+            # To the digits that are shown: nobody sees what lies between.
+            if not round(lowest, 2) <= round(value, 2) <= round(highest, 2):
                 beyond.append(f"{part.name}={shown} ({lowest:.2f} to {highest:.2f})")
     if beyond:
         say(f"beyond what was filmed, so it may look wrong: {', '.join(beyond)}")
