@@ -41,9 +41,11 @@ from mien.plots import Axes, Series
 from mien.storage import write_tensors
 from mien.training import read_curves
 from toy_workspace import write_toy_workspace
-from web_case import chromium, violations
+from web_case import violations
 
 SIZES = {(16, 24): 187, (24, 32): 95}
+EVERYTHING = Analysis("gaussian_avatars", "a paper", (Part("all", "All kinds", "test_analysis:part_of_everything"),))
+"""An analysis with every kind of result."""
 TRAINED = ["--train", "--steps", "3", "--seconds", "0.01"]
 _plain = toy_scene.toy_face_model
 
@@ -252,9 +254,8 @@ def test_sequences_that_are_gone_cost_only_their_parts(workspace: Path, capsys: 
 
 def test_parts_of_another_method_give_charts_pictures_and_films(workspace: Path, tmp_path: Path) -> None:
     """The frame knows no method: an analysis of tables, charts, pictures and films is written and read again."""
-    analysis = Analysis("gaussian_avatars", "a paper", (Part("all", "All kinds", "test_analysis:part_of_everything"),))
     folder = tmp_path / "out"
-    arguments = (analysis, analysis.parts, workspace / "runs/toy", (), folder, AnalysisOptions())
+    arguments = (EVERYTHING, EVERYTHING.parts, workspace / "runs/toy", (), folder, AnalysisOptions())
     first = run_analysis(*arguments)
     page = (folder / "analysis.html").read_text()
     for words in ("a &lt;b&gt; note", "1,234", "–", "<video", "data:video/mp4", "data:image/png", "<circle"):
@@ -270,9 +271,7 @@ def test_parts_of_another_method_give_charts_pictures_and_films(workspace: Path,
 @pytest.mark.parametrize("device", [[], ["dark", "touch"]])
 def test_everybody_can_use_the_page(workspace: Path, tmp_path: Path, device: list[str]) -> None:
     """axe-core finds no fault in a page of tables, charts, pictures and films."""
-    chromium()
-    analysis = Analysis("gaussian_avatars", "a paper", (Part("all", "All kinds", "test_analysis:part_of_everything"),))
-    run_analysis(analysis, analysis.parts, workspace / "runs/toy", (), tmp_path, AnalysisOptions())
+    run_analysis(EVERYTHING, EVERYTHING.parts, workspace / "runs/toy", (), tmp_path, AnalysisOptions())
     assert violations(tmp_path / "analysis.html", (390, 844), device) == []
 
 

@@ -15,7 +15,7 @@ from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands import batch as batch_command
 from mien.errors import UserError
-from web_case import chromium, violations
+from web_case import violations
 
 
 def scored(batch: Batch) -> list[dict[str, object]]:
@@ -73,7 +73,6 @@ def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
 @pytest.mark.parametrize("device", [[], ["dark", "touch"]])
 def test_everybody_can_use_the_wall(tmp_path: Path, device: list[str]):
     """axe-core finds no fault in it."""
-    chromium()
     batch = Batch(tmp_path)
     write_wall(batch, scored(batch))
     assert violations(tmp_path / "index.html", (390, 844), device) == []

@@ -1,7 +1,7 @@
 """From workspaces and methods to one table, as the command line runs it."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Sequence as Items
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -26,12 +26,14 @@ from mien.locks import WAIT, hold
 from mien.progress import say
 from mien.storage import file_digest, read_json, write_atomically, write_json
 from mien.terminal import show
-from mien.training import PRESETS, TrainSettings, read_sequence, read_training_summary, train
+from mien.training import PRESETS, Sequence, TrainSettings, read_sequence, read_training_summary, train
+from mien.training.footage import training_frames
 from mien.workspace import COMPARED, Workspace
 
 _FORMAT, _VERSION = "mien.bench_compare", 1
 _SCORED = EvaluationSettings(video_frames=0)
 _FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
+"""Least and largest number of steps of the first trial. Between them, it uses each training frame once."""
 _TRIAL_SHARE = 0.1
 """Share of the budget that the second trial may take beside it. A shorter one grows fewer Gaussians than the run."""
 _LEAST_MARGIN = 0.3
@@ -84,7 +86,7 @@ class _Subject:
 
 
 def run_compare_stage(
-    out: Path, workspaces: Sequence[Workspace], captures: Sequence[str], settings: CompareSettings, *, as_json: bool
+    out: Path, workspaces: Items[Workspace], captures: Items[str], settings: CompareSettings, *, as_json: bool
 ) -> None:
     """Train and score every method on every capture, and print the table. Writes OUT/compare.json and compare.md.
 
@@ -112,7 +114,7 @@ def run_compare_stage(
     say(f"The table is in {out / 'compare.md'}")
 
 
-def _write(out: Path, rows: Sequence[MethodRow], settings: CompareSettings) -> dict[str, Any]:
+def _write(out: Path, rows: Items[MethodRow], settings: CompareSettings) -> dict[str, Any]:
     chosen = {**asdict(settings), "methods": list(settings.methods)}
     content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": [row.as_json() for row in rows]}
     content = json.loads(json.dumps(content))
@@ -174,14 +176,16 @@ def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, bud
     finished = subject.workspace.run_dir(folder.name) / "training.json"
     if finished.is_file():
         return read_training_summary(finished.parent)["steps"]
-    sequences = [read_sequence(subject.workspace.sequence_dir(name)) for name in subject.sequences]
-    pictures = sum(len(one.tracking.face) * len(one.tracking.cameras) for one in sequences)
+    folders = [subject.workspace.sequence_dir(name) for name in subject.sequences]
+    tracked = "".join(file_digest(one / "tracking/tracking.safetensors")[:8] for one in folders)[:32]
+    sequences = [read_sequence(one) for one in folders]
+    pictures = len(training_frames(sequences, settings))
     count = max(_FIRST_TRIAL_STEPS, min(pictures, _MOST_FIRST_STEPS))
-    took = _trial(subject, config, replace(settings, steps=count), folder / "first")
+    took = _trial(sequences, config, replace(settings, steps=count), folder / f"first-{count}-{tracked}")
     rate, began = took / count, 0.0
     longer = max(2 * count, round(_TRIAL_SHARE * 60 * budget.minutes / rate))
     if longer * rate < 60 * budget.minutes:
-        both = _trial(subject, config, replace(settings, steps=longer), folder / "second")
+        both = _trial(sequences, config, replace(settings, steps=longer), folder / f"second-{longer}-{tracked}")
         rate = min(max((both - took) / (longer - count), _LEAST_MARGIN * both / longer), both / longer)
         began = both - longer * rate
     steps = max(1, round((60 * budget.minutes - began) / rate))
@@ -197,13 +201,9 @@ def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, bud
     return steps
 
 
-def _trial(subject: _Subject, config: MethodConfig, settings: TrainSettings, folder: Path) -> float:
+def _trial(sequences: list[Sequence], config: MethodConfig, settings: TrainSettings, run_dir: Path) -> float:
     """Seconds of a short run, whose schedules are as short. A trial that was done is only read."""
-    folders = [subject.workspace.sequence_dir(name) for name in subject.sequences]
-    tracked = "".join(file_digest(one / "tracking/tracking.safetensors")[:8] for one in folders)[:32]
-    run_dir = folder.with_name(f"{folder.name}-{settings.steps}-{tracked}")
     if not (run_dir / "training.json").is_file():
-        say(f"{folder.parent.name}: a trial of {settings.steps} steps")
-        sequences = [read_sequence(one) for one in folders]
+        say(f"{run_dir.parent.name}: a trial of {settings.steps} steps")
         train(sequences, load_face_model(sequences[0].tracking.face_model), config, settings, run_dir)
     return max(read_training_summary(run_dir)["seconds"], 0.05)
