@@ -11,13 +11,13 @@ from mien.avatar import GaussianAvatars, Progress, method_named
 from mien.camera import camera_from_fov
 from mien.commands.picture import PictureOptions
 from mien.commands.stages import pictures
-from mien.face import FaceModel
+from mien.face import FaceModel, FaceParams
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import NeckParts, head_cutter
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame, resolved
-from mien.training.whole_head.side_views import SideViews, side_views, turned_to_side
+from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
 from mien.training.whole_head.unseen import fills_sides
 from plain_settings import plain_gaussian_avatars
 from test_runtime import new_avatar
@@ -46,6 +46,14 @@ def _random(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+def _view(views: SideViews, face: FaceParams, step: int) -> SideView:
+    return views.drawn(face, _camera(), step, _random())()
+
+
+def _loss(views: SideViews, avatar: GaussianAvatars, face: FaceParams, step: int) -> torch.Tensor:
+    return views.loss(avatar, _view(views, face, step), _PROGRESS)
+
+
 def _opaque_avatar(model: FaceModel, color: float) -> GaussianAvatars:
     """One flat opaque Gaussian of one colour on each triangle."""
     torch.manual_seed(0)
@@ -70,18 +78,15 @@ def test_a_head_turns_about_its_own_upright_axis(anny):
 @pytest.mark.parametrize(("step", "most"), [(0, 0.7), (4, 0.3)])  # From aside, the neck below the cut costs too.
 def test_a_head_in_the_colors_of_the_mesh_costs_less_than_one_in_others(anny, step, most):
     views = _views(anny)
-    costs = [
-        float(views.loss(_opaque_avatar(anny, color), _face(anny), _camera(), _PROGRESS, step, _random()).detach())
-        for color in (0.5, 0.9)
-    ]
+    costs = [float(_loss(views, _opaque_avatar(anny, color), _face(anny), step).detach()) for color in (0.5, 0.9)]
     assert costs[0] < most * costs[1]
 
 
 def test_transparent_sides_cost(anny):
     views, avatar = _views(anny), _opaque_avatar(anny, 0.5)
-    closed = float(views.loss(avatar, _face(anny), _camera(), _PROGRESS, 0, _random()).detach())
+    closed = float(_loss(views, avatar, _face(anny), 0).detach())
     avatar.store.assign("opacity_logits", torch.full_like(avatar.store["opacity_logits"], -4.0))
-    opened = views.loss(avatar, _face(anny), _camera(), _PROGRESS, 0, _random())
+    opened = _loss(views, avatar, _face(anny), 0)
     assert float(opened.detach()) > 3 * closed
 
 
@@ -93,7 +98,7 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     avatar.activations.directions.fill_(1.0)
     avatar.activations.seen = torch.full((1, 2), 0.5**0.5)
     views = replace(_views(anny), weight=0.0)
-    turned, raised = (views.loss(avatar, face, _camera(), _PROGRESS, step, _random()).detach() for step in (0, 4))
+    turned, raised = (_loss(views, avatar, face, step).detach() for step in (0, 4))
     assert float(turned) == 0
     # The random numbers raise coefficients until the activations, 2 alike, have the length that they approach.
     assert 0 < float(raised) <= 8 * 3 * 2 * 1.1**2
@@ -103,13 +108,13 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     assert 0.1 < float(hair.float().mean()) < 0.9
     kept = torch.where(hair[:, None, None], 0.0, avatar.store["offset_basis"])
     avatar.store.assign("offset_basis", kept)
-    assert float(views.loss(avatar, face, _camera(), _PROGRESS, 4, _random()).detach()) == pytest.approx(float(raised))
+    assert float(_loss(views, avatar, face, 4).detach()) == pytest.approx(float(raised))
 
 
 def test_gradients_reach_gaussians_and_not_the_face(anny):
     avatar, face = _opaque_avatar(anny, 0.9), _face(anny)
     face = replace(face, head_translation=face.head_translation.requires_grad_())
-    _views(anny).loss(avatar, face, _camera(), _PROGRESS, 0, _random()).backward()
+    _loss(_views(anny), avatar, face, 0).backward()
     gradient = avatar.store["sh_constant"].grad
     assert gradient is not None
     assert float(gradient.abs().sum()) > 0
@@ -126,24 +131,22 @@ def test_raised_expressions_stay_within_the_bounds_and_change_with_the_random_nu
 
 
 def test_the_outline_has_the_hair(anny):
-    face, camera = _face(anny), _camera()
-    white = torch.ones(3)
-    alphas = [_views(anny, hair=hair)._target(face, camera, white)[1] for hair in (0.0, _HAIR)]
+    views = [_view(_views(anny, hair=hair), _face(anny), 0) for hair in (0.0, _HAIR)]
+    alphas = [view.alpha for view in views]
     head_faces = anny.faces[~anny.region_mask("neck")]
-    head = rasterize_mesh(anny(face)[0], head_faces, camera).face_index >= 0
+    head = rasterize_mesh(anny(views[0].face)[0], head_faces, views[0].camera).face_index >= 0
     assert bool((alphas[0][head] == 1).all())
     assert float(alphas[1].sum()) > 1.05 * float(alphas[0].sum())
 
 
 def test_the_outline_ends_at_the_cut_at_the_neck(anny):
-    face, camera = turned_to_side(_face(anny), 1.0), _camera()
-    views = _views(anny)
-    picture, alpha, _ = views._target(face, camera, torch.tensor([1.0, 0.0, 0.0]))
+    view = _view(_views(anny), _face(anny), 0)
+    face, camera, picture, alpha = view.face, view.camera, view.picture, view.alpha
     bare = np.where(rasterize_mesh(anny(face)[0], anny.faces, camera).face_index.numpy() >= 0, 255, 0).astype(np.uint8)
     expected = head_cutter(anny, NeckParts.of(anny), face)(bare, camera)
     assert alpha.equal(torch.from_numpy(expected).float() / 255)
     assert float(alpha.sum()) < 0.97 * (bare > 0).sum(), "the mesh goes on below the cut"
-    torch.testing.assert_close(picture[alpha == 0], torch.tensor([1.0, 0.0, 0.0]).expand(int((alpha == 0).sum()), 3))
+    torch.testing.assert_close(picture[alpha == 0], view.background.expand(int((alpha == 0).sum()), 3))
 
 
 def test_every_fourth_step_has_a_view(anny):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
         write_overlay_sheet,
         write_residual_report,
     )
-    from mien.tracking.scoring import Scoring, head_crop, head_cutter, make_scoring
+    from mien.tracking.scoring import Scoring, head_crop, head_cutter, head_mask, make_scoring
     from mien.tracking.scoring_files import (
         check_scoring_cut,
         read_scoring,
@@ -56,6 +56,7 @@ __all__ = [
     "has_enough_faces",
     "head_crop",
     "head_cutter",
+    "head_mask",
     "make_scoring",
     "overlay_stride",
     "read_scoring",

@@ -8,6 +8,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
@@ -16,7 +17,7 @@ from mien.picture_files import PictureStack
 from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.constants import TRACKING
-from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
+from mien.tracking.neck_cut import NeckCut, NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.settings import ScoringSettings
 from mien.tracking.tracking import Tracking
 
@@ -83,10 +84,29 @@ def head_cutter(
     cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
 
     def mask_of(matte: UInt8[np.ndarray, "h w"], camera: Camera) -> UInt8[np.ndarray, "h w"]:
-        head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
-        return cut_matte(matte, head, above_neck_cut(cut, camera))
+        return head_mask(matte, camera, vertices, head_faces, cut)
 
     return mask_of
+
+
+def head_mask(
+    matte: UInt8[np.ndarray, "h w"],
+    camera: Camera,
+    vertices: Float[Tensor, "v 3"],
+    head_faces: Int[Tensor, "f 3"],
+    cut: NeckCut,
+) -> UInt8[np.ndarray, "h w"]:
+    """The mask of the head in a camera's matte.
+
+    Args:
+        matte: The matte; 255 is person.
+        camera: The camera.
+        vertices: The posed mesh, in world coordinates.
+        head_faces: Its triangles without those of the neck.
+        cut: The neck cut of the same timestep.
+    """
+    head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
+    return cut_matte(matte, head, above_neck_cut(cut, camera))
 
 
 def cut_matte(

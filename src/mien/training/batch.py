@@ -18,7 +18,7 @@ from mien.face import concatenate
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
-from mien.training.ahead import TargetQueue
+from mien.training.ahead import Result, TargetQueue
 from mien.training.checkpoint import TrainingState
 from mien.training.constants import TRAINING
 from mien.training.footage import (
@@ -74,9 +74,11 @@ class TrainingData:
     ) -> Callable[[], PerceptualGoal]:
         """A function that returns the goal of a step's perceptual loss. With `ahead`, it is made meanwhile."""
         make = partial(perceptual_goal, target, perceptual, crop_random(settings, step))
-        return (
-            make if self.ahead is None or target.background.device.type != "cpu" else self.ahead.meanwhile(make).result
-        )
+        return self.meanwhile(make) if target.background.device.type == "cpu" else make
+
+    def meanwhile(self, make: Callable[[], Result]) -> Callable[[], Result]:
+        """A function that returns what `make` does. With `ahead`, another thread begins at once."""
+        return make if self.ahead is None else self.ahead.meanwhile(make).result
 
 
 def coarse_steps(targets: Items[Targets], settings: TrainSettings) -> int:

@@ -7,6 +7,7 @@ of a run in the order in which they are called.
 from collections.abc import Callable
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, field
+from typing import Any
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -38,6 +39,10 @@ class BatchFrame:
     """Makes the goal of the perceptual loss. None if the frame is compared without that loss."""
 
 
+def _when_asked(make: Callable[[], Any]) -> Callable[[], Any]:
+    return make
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """A training step, as parts see it."""
@@ -53,6 +58,8 @@ class Step:
     """Returns the camera of a frame, at training resolution."""
     representative: tuple[Frame, ...]
     """A few frames that show the head from all the sides that were filmed."""
+    meanwhile: Callable[[Callable[[], Any]], Callable[[], Any]] = _when_asked
+    """Returns a function that returns what the given one does, which another thread may call until then."""
     changed: bool = False
     """Whether density control has changed the Gaussians in this step."""
 

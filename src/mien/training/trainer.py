@@ -310,7 +310,10 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     avatar, parts = state.avatar, state.parts
     batch = next_batch(state, data, settings)
     progress = Progress(state.step, settings.steps, data.order.at(state.step)[1], data.extent, len(batch))
-    now = Step(avatar, state.track, state.density, settings, tuple(batch), progress, data.camera, data.representative)
+    now = Step(
+        avatar, state.track, state.density, settings, tuple(batch), progress,
+        data.camera, data.representative, data.meanwhile,
+    )  # fmt: skip
     for part in parts:
         part.before_step(now)
     whole, posed, renderings = draw(state, batch, progress)

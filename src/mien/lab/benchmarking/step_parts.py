@@ -48,7 +48,12 @@ _PHASES: dict[str, tuple[Any, str]] = {
     "update": (trainer, "_update"),
 }
 """The parts of `trainer.step`, by name: where each function is looked up, and its name there."""
-_OF_PARTS = {"losses": "side views", "after_backward": "after backward", "after_update": "after update"}
+_OF_PARTS = {
+    "before_step": "side views",
+    "losses": "side views",
+    "after_backward": "after backward",
+    "after_update": "after update",
+}
 """Functions of parts, and their phases."""
 
 

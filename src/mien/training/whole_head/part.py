@@ -15,7 +15,7 @@ from mien.training.settings import TrainSettings
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.contribution import prune_hidden
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
-from mien.training.whole_head.side_views import SideViews, side_views_of
+from mien.training.whole_head.side_views import SideView, SideViews, side_views_of
 from mien.training.whole_head.unseen import Unseen, fills_sides, moved, spare_fills, unseen_of
 
 
@@ -32,6 +32,8 @@ class WholeHead:
         self.unseen = unseen
         self.side_views: SideViews | None = side_views_of(avatar, unseen, settings.side_weight)
         self.hair: HairSurface | None = hair_surface(avatar, unseen.prior) if unseen.fills else None
+        self._next_view: Callable[[], SideView] | None = None
+        """Returns the side view of the step that runs. None if it has none."""
         self._avatar = avatar
         self._surface: BoundSurface | None = avatar.surface()
 
@@ -42,6 +44,7 @@ class WholeHead:
             settings=lambda settings: resolved(settings, filled=True) if self.unseen.fills else settings,
             density=lambda control: spare_fills(self._avatar, control, self.unseen),
             weights=lambda weights: self.unseen.weights(weights),
+            before_step=self._before_step,
             losses=self._losses,
             rare_losses=() if self.side_views is None else ("side_views",),
             after_backward=self._after_backward,
@@ -60,16 +63,22 @@ class WholeHead:
         if self.side_views is not None:
             self.side_views = self.side_views.at_height(prior.fill_height)
 
-    def _losses(self, step: Step) -> dict[str, Float[Tensor, ""]]:
-        """The loss of a side view, if one of the frames is due for it: that of the first such frame."""
-        side_views = self.side_views
+    def _before_step(self, step: Step) -> None:
+        """Begin a side view if one of the frames is due for it: that of the first such frame."""
+        side_views, self._next_view = self.side_views, None
         due = [] if side_views is None else [one for one in step.batch if side_views.due(one.number)]
-        if side_views is None or not due:
+        if side_views is not None and due:
+            one = due[0]
+            random, face = side_random(step.settings, one.number), step.track.face(one.index)
+            self._next_view = step.meanwhile(side_views.drawn(face, one.camera, one.number, random))
+
+    def _losses(self, step: Step) -> dict[str, Float[Tensor, ""]]:
+        """The loss of the side view, if the step has one."""
+        side_views, view = self.side_views, self._next_view
+        if side_views is None or view is None:
             return {}
-        one = due[0]
-        random = side_random(step.settings, one.number)
-        face = step.track.face(one.index)
-        return {"side_views": side_views.loss(step.avatar, face, one.camera, step.progress, one.number, random)}
+        self._next_view = None
+        return {"side_views": side_views.loss(step.avatar, view(), step.progress)}
 
     def _after_backward(self, step: Step, renderings: Items[Rendering]) -> None:
         if self.hair is not None and self._surface is not None:

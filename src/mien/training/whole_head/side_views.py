@@ -7,7 +7,9 @@ pulled towards those of the mesh. In raised expressions, a difference that a rea
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,10 +23,28 @@ from mien.face.head_parts import head_parts
 from mien.render import rasterize
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import NeckParts, head_cutter
+from mien.tracking import NeckParts, fit_neck_cut, head_mask
 from mien.training.whole_head.completion import vertex_means
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen
+
+
+@dataclass(frozen=True, eq=False)
+class SideView:
+    """One side view. All tensors but those of the face are on the CPU."""
+
+    face: FaceParams
+    """The turned head, or the raised expression. It has no gradient."""
+    raised: bool
+    """Whether the expression is raised."""
+    camera: Camera
+    background: Float[Tensor, " 3"]
+    picture: Float[Tensor, "h w 3"]
+    """The completed mesh over the background."""
+    alpha: Float[Tensor, "h w"]
+    """Its alpha."""
+    compared: Bool[Tensor, "h w"]
+    """Pixels that show triangles of `SideViews.compared`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +62,8 @@ class SideViews:
     """The parts of the neck that tell where it is cut."""
     compared: Bool[Tensor, " f"]
     """Triangles whose colours are compared in raised expressions: skin, lips and the inside of the mouth."""
+    head_faces: Int[Tensor, "n 3"]
+    """The face model's triangles without those of the neck."""
 
     def at_height(self, height: Float[Tensor, " f"]) -> "SideViews":
         """The same views of a head whose triangles have another height, in metres."""
@@ -51,53 +73,65 @@ class SideViews:
         """Whether a step has a side view."""
         return self.weight > 0 and step % (WHOLE_HEAD.side_views_every // 2) == 0
 
-    def loss(
-        self, avatar: Avatar, face: FaceParams, camera: Camera, progress: Progress, step: int, random: torch.Generator
-    ) -> Float[Tensor, ""]:
-        """The weighted difference between the avatar and the completed mesh in one side view.
+    @torch.no_grad()
+    def drawn(self, face: FaceParams, camera: Camera, step: int, random: torch.Generator) -> Callable[[], SideView]:
+        """A function that makes the side view of a step. It does not depend on the avatar, and any thread may call it.
 
         Args:
-            avatar: The avatar, on any device.
-            face: One timestep. Its joints and its place are kept, and its expression is that of views from the side. It
-                gets no gradient.
+            face: One timestep, on any device. Its joints and its place are kept, and its expression is that of views
+                from the side.
             camera: The camera in front of the head.
-            progress: How far training is.
             step: The step, which says whether the head is turned or the expression raised.
             random: Draws the angle and the coefficients.
         """
         raised = step % WHOLE_HEAD.side_views_every != 0
         angle = _drawn_angle(raised, random)
-        face = turned_to_side(face.detach(), angle)
+        # The same tensor of the identity says that the person's shape at rest need not be computed again.
+        face = replace(turned_to_side(face.detach(), angle), identity=face.identity, vertex_offsets=face.vertex_offsets)
         if raised:
             face = replace(face, expression=self._raised(face.expression, random))
         scale = WHOLE_HEAD.side_views_size / max(camera.width, camera.height)
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         background = torch.rand(3, generator=random)
-        picture, alpha, compared = self._target(face, small, background)
-        like = face.expression
-        posed = avatar.pose(face, progress)
-        seen = rasterize(posed.gaussians.timestep(0), small, background.to(like))
-        difference = (seen.image - picture.to(like)).abs()
-        if raised:
-            difference = (difference - WHOLE_HEAD.raised_free_difference).clamp_min(0) * compared.to(like)[..., None]
+        # Threads share the core's pool, and a loop of one makes those of the other serial. So the mesh is posed here.
+        posed = self.face_model(face.to(self.colors))[0]
+        up = face.T_world_head[0, :3, 1].to(self.colors)
+        return partial(self._made, SideViewPlan(face, raised, small, background, posed, up))
+
+    def loss(self, avatar: Avatar, view: SideView, progress: Progress) -> Float[Tensor, ""]:
+        """The weighted difference between the avatar and the completed mesh in one side view.
+
+        Args:
+            avatar: The avatar, on the device of the view's face.
+            view: The view.
+            progress: How far training is.
+        """
+        like = view.face.expression
+        posed = avatar.pose(view.face, progress)
+        seen = rasterize(posed.gaussians.timestep(0), view.camera, view.background.to(like))
+        difference = (seen.image - view.picture.to(like)).abs()
+        if view.raised:
+            free = WHOLE_HEAD.raised_free_difference
+            difference = (difference - free).clamp_min(0) * view.compared.to(like)[..., None]
             return self.weight * difference.mean() + _held_back(avatar, posed, self.compared)
-        outline = WHOLE_HEAD.side_views_outline_weight * (seen.alpha - alpha.to(like)).abs().mean()
+        outline = WHOLE_HEAD.side_views_outline_weight * (seen.alpha - view.alpha.to(like)).abs().mean()
         return self.weight * (difference.mean() + outline)
 
     @torch.no_grad()
-    def _target(
-        self, face: FaceParams, camera: Camera, background: Float[Tensor, " 3"]
-    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """The completed mesh over the background, its alpha, and which pixels show triangles of `compared`."""
-        face, camera = face.to(self.colors), camera.to(self.colors)
-        vertices = self.face_model(face)[0]
-        vertices = vertices + self.height[:, None] * vertex_normals(vertices, self.face_model.faces)
-        index = rasterize_mesh(vertices, self.face_model.faces, camera).face_index.long()
+    def _made(self, plan: "SideViewPlan") -> SideView:
+        """The view with the pictures that it is compared with."""
+        camera, faces = plan.camera.to(self.colors), self.face_model.faces
+        raised = plan.vertices + self.height[:, None] * vertex_normals(plan.vertices, faces)
+        index = rasterize_mesh(raised, faces, camera).face_index.long()
         matte = np.where(index.numpy() >= 0, 255, 0).astype(np.uint8)
-        alpha = torch.from_numpy(head_cutter(self.face_model, self.neck, face)(matte, camera)).float() / 255
-        triangle: Int[Tensor, "h w"] = index.clamp_min(0)
-        picture = background + alpha[..., None] * (self.colors[triangle] - background)
-        return picture, alpha, self.compared[triangle] & (alpha > 0)
+        cut = fit_neck_cut(self.neck, plan.vertices, plan.up)
+        mask = head_mask(matte, camera, plan.vertices, self.head_faces, cut)
+        alpha = torch.from_numpy(mask).float() / 255
+        triangle: Int[Tensor, " p"] = index.clamp_min(0).flatten()
+        colors = self.colors.index_select(0, triangle).view(*index.shape, 3)
+        picture = plan.background + alpha[..., None] * (colors - plan.background)
+        compared = self.compared.index_select(0, triangle).view(index.shape) & (alpha > 0)
+        return SideView(plan.face, plan.raised, plan.camera, plan.background, picture, alpha, compared)
 
     def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""
@@ -107,6 +141,20 @@ class SideViews:
         result = expression.clone()
         result[0, chosen.to(expression.device)] = values.to(expression)
         return result
+
+
+@dataclass(frozen=True, eq=False)
+class SideViewPlan:
+    """A side view without the pictures that it is compared with."""
+
+    face: FaceParams
+    raised: bool
+    camera: Camera
+    background: Float[Tensor, " 3"]
+    vertices: Float[Tensor, "v 3"]
+    """The posed mesh in world coordinates, on the CPU."""
+    up: Float[Tensor, " 3"]
+    """The head's upright axis in world coordinates, on the CPU."""
 
 
 def side_views(
@@ -122,7 +170,8 @@ def side_views(
     """
     parts, over = head_parts(face_model), _at_vertices(face_model, height)
     compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)
-    return SideViews(face_model, weight, colors, over, NeckParts.of(face_model), compared)
+    head_faces = face_model.faces[~face_model.region_mask("neck")]
+    return SideViews(face_model, weight, colors, over, NeckParts.of(face_model), compared, head_faces)
 
 
 def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Tensor, " v"]:
