@@ -115,7 +115,7 @@ class FaceModel:
         """SHA-256 over the triangles, as 16 hex digits. Landmarks belong to meshes with one such hash."""
         return hashlib.sha256(self.faces.to(torch.int64).cpu().contiguous().numpy().tobytes()).hexdigest()[:16]
 
-    @property
+    @cached_property
     def free_joint_names(self) -> tuple[str, ...]:
         """Names of the rows of `FaceParams.joints`."""
         return tuple(name for name, free in zip(self.joint_names, self.joint_free, strict=True) if free)

@@ -141,7 +141,7 @@ class GaussianSurface(BoundSurface):
         gradient, bound = self._store["means"].grad, self._store["face_index"]
         if gradient is None:
             return None
-        return torch.zeros_like(self.sizes).index_add(0, bound, gradient[:, 1] / self.sizes[bound])
+        return torch.zeros_like(self.sizes).index_add(0, bound, gradient[:, 1] / self.sizes.index_select(0, bound))
 
     @torch.no_grad()
     def raise_by(self, shift: Float[Tensor, " f"]) -> None:
@@ -151,7 +151,7 @@ class GaussianSurface(BoundSurface):
 
     def change_penalty(self, changes: Mapping[str, Tensor], held: Bool[Tensor, " f"]) -> Float[Tensor, ""] | None:
         """The sum of `change_penalties`."""
-        counts = held[self.triangles()]
+        counts = held.index_select(0, self.triangles())
         own = {name: values * counts.view(-1, *[1] * (values.ndim - 1)) for name, values in changes.items()}
         penalties = change_penalties(self._config, own)
         return torch.stack(list(penalties.values())).sum() if penalties else None

@@ -124,7 +124,7 @@ class _Network(torch.autograd.Function):
             _native.FeatureKept(*unpacked(*kept)) if kept else None,
             *unpacked(others, last),
         )
-        ctx.gradient = gradient
+        ctx.gradient, ctx.neutral = gradient, arguments[2] if arguments[2].is_leaf else None
         ctx.save_for_backward(bases, inputs, neutral, *rest, *kept)
         return others, last
 
@@ -146,5 +146,9 @@ class _Network(torch.autograd.Function):
             ),
         )
         if ctx.needs_input_grad[1]:
-            ctx.gradient.terms.append((by_features, inputs))
+            if ctx.neutral is not None and ctx.neutral.grad is not None:
+                # It may share the memory of an earlier term, and autograd adds to it in place.
+                ctx.neutral.grad = ctx.neutral.grad.clone()
+            # Autograd copies gradients that somebody else holds. It does not know of a second tensor in their memory.
+            ctx.gradient.terms.append((by_features.detach(), inputs))
         return None, None, by_inputs if len(by_inputs) else None, by_features, by_own, *by_layers

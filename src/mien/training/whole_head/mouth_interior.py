@@ -84,7 +84,7 @@ def cover_hidden(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None
     surface = avatar.surface()
     if hidden is None or surface is None:
         return posed
-    gaussians, own = posed.gaussians, hidden[surface.triangles()]
+    gaussians, own = posed.gaussians, hidden.index_select(0, surface.triangles())
     color = sh_from_rgb(torch.rand(3, generator=random)).to(gaussians.sh, non_blocking=True)
     # Only on a CPU are rows found without waiting for the device.
     covered = _Covered.apply if gaussians.sh.device.type == "cpu" else covered_reference

@@ -64,7 +64,8 @@ class Unseen:
     def filled_in(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
         surface = avatar.surface()
-        return None if self.prior.filled_in is None or surface is None else self.prior.filled_in[surface.triangles()]
+        filled_in = self.prior.filled_in
+        return None if filled_in is None or surface is None else filled_in.index_select(0, surface.triangles())
 
     def mask_gradients(self, avatar: Avatar, *renderings: Rendering) -> None:
         """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
