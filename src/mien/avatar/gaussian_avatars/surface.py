@@ -141,7 +141,8 @@ class GaussianSurface(BoundSurface):
         gradient, bound = self._store["means"].grad, self._store["face_index"]
         if gradient is None:
             return None
-        return torch.zeros_like(self.sizes).index_add(0, bound, gradient[:, 1] / self.sizes.index_select(0, bound))
+        sizes = self.sizes
+        return torch.zeros_like(sizes).index_add_(0, bound, gradient[:, 1] / sizes.index_select(0, bound))
 
     @torch.no_grad()
     def raise_by(self, shift: Float[Tensor, " f"]) -> None:

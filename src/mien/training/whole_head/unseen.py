@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import softshrink
 
 from mien.arrays import clear_rows
 from mien.avatar import Avatar, DensityControl, GaussianStore, Photometric, SurfacePrior
@@ -79,11 +80,10 @@ class Unseen:
         gradients += [rows for own in factored for rows, _ in own.terms]
         # The second axis of a triangle's frame is its normal.
         places = store["means"].grad
-        height = None if places is None else places[:, 1].clone()
+        strong = None if places is None else softshrink(places[:, 1], WHOLE_HEAD.fill_contradiction)
         clear_rows(filled_in, gradients)
-        if places is not None and height is not None:
-            strong = height.sign() * (height.abs() - WHOLE_HEAD.fill_contradiction).clamp_min(0)
-            places[:, 1] = torch.where(filled_in, strong, height)
+        if places is not None and strong is not None:
+            places[:, 1] = torch.where(filled_in, strong, places[:, 1])
 
 
 def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -> bool:
