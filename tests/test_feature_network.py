@@ -255,3 +255,20 @@ def test_published_update_has_the_bits_of_adam_with_the_whole_gradient(isa: str)
     factored_adam_update(factored)
     update_all([Update(whole.values, rows[:, None] * columns[:, None], whole.moments, whole.rate)])
     assert all(torch.equal(one, two) for one, two in zip(changed(factored), changed(whole), strict=True))
+
+
+def test_gradients_of_neutral_features_share_memory_until_a_second_backward_pass() -> None:
+    """Autograd adds the second gradient to the first one in place, which must not change the first term."""
+    given, by = arguments(SIZES[0]), gradients_of(SIZES[0])
+    bases, inputs, neutral, own, *layers = (tensor.clone().requires_grad_() for tensor in given)
+    gradient, passes = FactoredGradient(), 2
+    for number in range(passes):
+        outputs = feature_network(bases, inputs.detach(), neutral, own, Layers(*layers), gradient)
+        torch.autograd.backward(outputs, by)
+        assert neutral.grad is not None
+        assert (neutral.grad.data_ptr() == gradient.terms[0][0].data_ptr()) is (number == 0)
+    (first, _), (second, _) = gradient.take()
+    assert first.equal(second)
+    assert float(first.abs().sum()) > 0
+    assert neutral.grad is not None
+    assert neutral.grad.equal(first + second)
