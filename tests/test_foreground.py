@@ -3,12 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import train_toy
 from mien.training import train
-from mien.training.footage.foreground import foreground_colors, soft_pixels
+from mien.training.footage.constants import FOOTAGE
+from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.sequence import Targets, composite
 from toy_scene import toy_sequence
 
@@ -68,6 +70,40 @@ def test_large_pictures_are_cleaned_as_well() -> None:
     assert error[soft].mean() < 3
 
 
+def _everywhere(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """`foreground_colors` estimated at every pixel, and not at those between empty and opaque alone."""
+    windows = [max(3, 2 * round(share * max(image.shape[:2]) / 2) + 1) for share in FOOTAGE.foreground_windows]
+    share, person, background = (matte * np.float32(1 / 255))[..., None], image, image
+    for number, window in enumerate(windows):
+        near_person, near_background = _mean(person, matte, window), _mean(background, 255 - matte, window)
+        rest = image - near_background - share * (near_person - near_background)
+        person = np.rint(np.clip(near_person + share * rest, 0, 255)).astype(np.uint8)
+        if number == 0:
+            background = np.rint(np.clip(near_background + (1 - share) * rest, 0, 255)).astype(np.uint8)
+    return np.where((matte >= FOOTAGE.foreground_solid)[..., None], image, np.where(matte[..., None] > 0, person, 0))
+
+
+def _mean(colors: np.ndarray, weights: np.ndarray, window: int) -> np.ndarray:
+    sums = [
+        cv2.boxFilter(part, cv2.CV_64F, (window, window), normalize=False, borderType=cv2.BORDER_REFLECT)
+        for part in (colors * weights[..., None].astype(np.float64), weights.astype(np.float64))
+    ]
+    return sums[0].astype(np.float32) / np.maximum(sums[1], 1).astype(np.float32)[..., None]
+
+
+@pytest.mark.parametrize("size", [(60, 44), (90, 300)])
+def test_estimates_at_soft_pixels_alone_are_those_of_whole_pictures(size: tuple[int, int]) -> None:
+    """Noise, with every kind of opacity beside every other, and with empty borders."""
+    random = np.random.default_rng(3)
+    image = random.integers(0, 256, (*size, 3)).astype(np.uint8)
+    matte = random.choice(np.array([0, 1, 60, 128, 251, 252, 254, 255], np.uint8), size)
+    matte[:7], matte[:, -5:], matte[20:40, 8:30] = 0, 255, 0
+    expected, (place, colors) = _everywhere(image, matte), soft_colors(image, matte)
+    assert np.array_equal(foreground_colors(image, matte), expected)
+    assert np.array_equal(place, np.flatnonzero(soft_pixels(matte)))
+    assert np.array_equal(colors, expected.reshape(-1, 3)[place])
+
+
 def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch: pytest.MonkeyPatch) -> None:
     """The cut at the neck is no edge of the person; the scored mask only says what is shown."""
     _, sequence = toy_sequence(2, 32)
@@ -80,11 +116,11 @@ def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch: pyt
     expected = composite(foreground_colors(image, matte), cut[1, 0], background)
     cleaned: list[int] = []
 
-    def counted(*pictures: np.ndarray) -> np.ndarray:
+    def counted(*pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         cleaned.append(1)
-        return foreground_colors(*pictures)
+        return soft_colors(*pictures)
 
-    monkeypatch.setattr("mien.training.footage.sequence.foreground_colors", counted)
+    monkeypatch.setattr("mien.training.footage.sequence.soft_colors", counted)
     for keep in (True, False):
         targets = Targets(sequence, 0, cleaned=True)
         cleaned.clear()
@@ -102,11 +138,11 @@ def test_training_reads_the_setting(edges: str, tmp_path: Path, monkeypatch: pyt
     face_model, sequence = toy_sequence(6, 32)
     asked: list[int] = []
 
-    def counted(*pictures: np.ndarray) -> np.ndarray:
+    def counted(*pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         asked.append(1)
-        return foreground_colors(*pictures)
+        return soft_colors(*pictures)
 
-    monkeypatch.setattr("mien.training.footage.sequence.foreground_colors", counted)
+    monkeypatch.setattr("mien.training.footage.sequence.soft_colors", counted)
     settings = replace(train_toy.SETTINGS, edges=edges)  # type: ignore[arg-type]
     train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
     assert bool(asked) == (edges == "cleaned")

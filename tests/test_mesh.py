@@ -10,6 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 from trimesh.visual import TextureVisuals
 
 from mien.camera import Camera, camera_from_fov, look_at
@@ -237,6 +238,20 @@ def test_picture_of_a_sphere():
     behind = torch.rand(64, 64, 3)
     over, _ = render_mesh(vertices, faces, camera, background=behind)
     torch.testing.assert_close(over[0], behind[0])
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_finer_pictures_are_shrunk_by_the_mean_of_their_samples(samples: int):
+    """To the same bits as `avg_pool2d`, and with the same order in memory."""
+    vertices, faces = random_mesh()
+    camera, black = head_camera(33), (0.0, 0.0, 0.0)
+    colors = torch.rand(len(vertices), 3)
+    fine, covered = render_mesh(vertices, faces, camera.resized(33 * samples, 33 * samples), colors, background=black)
+    image, alpha = render_mesh(vertices, faces, camera, colors, background=black, supersample=samples)
+    expected = avg_pool2d(fine.permute(2, 0, 1), samples).permute(1, 2, 0)
+    assert torch.equal(image, expected)
+    assert image.stride() == expected.stride()
+    assert torch.equal(alpha, avg_pool2d(covered[None], samples)[0])
 
 
 def test_textures_and_light_have_gradients():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mien.errors import UserError
-from mien.evaluation.metrics import MAX_PSNR, crop_to, l1, psnr, ssim, ssim_map
+from mien.evaluation.metrics import MAX_PSNR, Windows, crop_to, l1, psnr, ssim, ssim_map
 from mien.perceptual import distance, load_perceptual, weights
 
 
@@ -108,3 +108,11 @@ def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path
     with pytest.raises(UserError, match="damaged"):
         load_perceptual()
     load_perceptual.cache_clear()
+
+
+def test_ssim_with_shared_windows_is_that_of_the_target_itself() -> None:
+    """To the same bits, also when the windows were used before."""
+    first, second, target = torch.rand(3, 40, 33, 3)
+    windows = Windows.of(target)
+    for image in (first, second, first):
+        assert torch.equal(ssim_map(image, windows), ssim_map(image, target))

@@ -1,14 +1,13 @@
 """Baselines that an avatar has to beat: the mean training picture, and the tracked mesh with the person's colours."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.evaluation.experiment import Experiment, target_image
-from mien.parallel import stream_in_threads
+from mien.evaluation.experiment import Experiment
+from mien.evaluation.trained_frames import TrainedFrames, look_at_trained
 from mien.render.mesh import render_mesh
 from mien.training.footage import Frame, vertex_colors
 
@@ -52,27 +51,16 @@ class Baselines:
 
 
 @torch.no_grad()
-def make_baselines(experiment: Experiment, threads: int | None = None) -> Baselines:
+def make_baselines(
+    experiment: Experiment, threads: int | None = None, trained: TrainedFrames | None = None
+) -> Baselines:
     """Both baselines, from training frames only.
 
     Args:
         experiment: The experiment.
         threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no figure.
+        trained: The means of the training frames, if they are known.
     """
     model, frames = experiment.avatar.face_model, experiment.training_frames
     colors = vertex_colors(model, experiment.sequences, experiment.faces, frames, threads)
-    return Baselines(_mean_frames(experiment, threads), colors)
-
-
-def _mean_frames(experiment: Experiment, threads: int | None = None) -> dict[Frame, Float[Tensor, "h w 3"]]:
-    sums: dict[Frame, Tensor] = {}
-    counts: dict[Frame, int] = {}
-    frames = experiment.training_frames
-    # Sums are taken here, in the order of the frames.
-    for frame, target in zip(
-        frames, stream_in_threads(partial(target_image, experiment), frames, threads), strict=True
-    ):
-        key = frame._replace(timestep=0)
-        sums[key] = sums[key].add_(target) if key in sums else target
-        counts[key] = counts.get(key, 0) + 1
-    return {key: total / counts[key] for key, total in sums.items()}
+    return Baselines((trained or look_at_trained(experiment, 0, threads)).means, colors)

@@ -19,6 +19,7 @@ from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report import RunRecord, write_report
 from mien.evaluation.report_sections import cross_section
+from mien.evaluation.scoring import worker_threads
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
 from mien.locks import hold
@@ -130,7 +131,9 @@ def _video(
     run_dir: Path, name: str, experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings
 ) -> ReportVideo:
     path = run_dir / "videos" / f"{name}.mp4"
-    count = write_comparison_video(path, experiment, evaluation, settings.video_frames)
+    count = write_comparison_video(
+        path, experiment, evaluation, settings.video_frames, worker_threads(settings.threads)
+    )
     return ReportVideo(path, count, len(evaluation.frames))
 
 

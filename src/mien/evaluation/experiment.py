@@ -12,6 +12,7 @@ from torch import Tensor
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.face import FaceParams, part_boxes
+from mien.gaussians import Gaussians
 from mien.pictures import Box
 from mien.render import close_holes, rasterize
 from mien.render.validation import drawable
@@ -99,13 +100,20 @@ def target_image(
     experiment: Experiment, frame: Frame, background: tuple[int, int, int] = WHITE
 ) -> Float[Tensor, "h w 3"]:
     """The target of a rendering, at 8 bits: the person inside the frozen scoring mask or the matte, over a colour."""
+    return target_images(experiment, frame, (background,))[0]
+
+
+def target_images(
+    experiment: Experiment, frame: Frame, backgrounds: Items[tuple[int, int, int]]
+) -> list[Float[Tensor, "h w 3"]]:
+    """`target_image` over several colours. The picture is read and cleaned once."""
     capture = experiment.sequences[frame.sequence].capture
     picture = np.asarray(capture.images[frame[1:]])
     if experiment.edges == "cleaned":
         picture = foreground_colors(picture, np.asarray(capture.mattes[frame[1:]]))
     masks = capture.mattes if experiment.whole_mattes else experiment.scorings[frame.sequence].masks
     mask = np.asarray(masks[frame[1:]])
-    return torch.from_numpy(composite(picture, mask, np.array(background, np.uint8))).float() / 255
+    return [torch.from_numpy(composite(picture, mask, np.array(each, np.uint8))).float() / 255 for each in backgrounds]
 
 
 def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[str, str]]:
@@ -115,7 +123,6 @@ def scored_on(experiment: Experiment, frames: Items[Frame]) -> dict[str, dict[st
     return {experiment.sequences[i].name: experiment.digests[i] for i in sorted({frame.sequence for frame in frames})}
 
 
-@torch.no_grad()
 def avatar_image(
     experiment: Experiment,
     frame: Frame,
@@ -133,7 +140,24 @@ def avatar_image(
     Raises:
         UserError: the avatar or the face parameters give Gaussians that are not finite.
     """
-    gaussians = experiment.avatar.pose(experiment.face(frame) if face is None else face).gaussians.timestep(0)
+    return drawn_image(experiment, frame, posed_avatar(experiment, frame, face), background)
+
+
+@torch.no_grad()
+def posed_avatar(experiment: Experiment, frame: Frame, face: FaceParams | None = None) -> Gaussians:
+    """The avatar posed as in a frame, or by other face parameters."""
+    return experiment.avatar.pose(experiment.face(frame) if face is None else face).gaussians.timestep(0)
+
+
+@torch.no_grad()
+def drawn_image(
+    experiment: Experiment, frame: Frame, gaussians: Gaussians, background: tuple[int, int, int] = WHITE
+) -> Float[Tensor, "h w 3"]:
+    """Gaussians of `posed_avatar` seen as in a frame, over a colour, clamped to 0..1.
+
+    Raises:
+        UserError: they are not finite.
+    """
     color = (torch.tensor(background) / 255).to(gaussians.means)
     with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
         image = rasterize(gaussians, experiment.camera(frame), color).image.clamp(0, 1)

@@ -1,5 +1,6 @@
 """Image metrics: pure functions of float32 RGB images in 0..1."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -43,7 +44,27 @@ def psnr(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], box: Box
     return float(-10 * torch.log10(squared.clamp_min(10 ** (-MAX_PSNR / 10))))
 
 
-def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], border: Border = "zeros") -> float:
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """What SSIM needs of a picture alone. Several pictures that are compared with one target share the target's."""
+
+    picture: Float[np.ndarray, "h w 3"]
+    mean: Float[np.ndarray, "h w 3"]
+    """Mean in the window around each pixel."""
+    squared_mean: Float[np.ndarray, "h w 3"]
+    variance: Float[np.ndarray, "h w 3"]
+
+    @staticmethod
+    def of(image: Float[Tensor, "h w 3"]) -> "Windows":
+        """The windows of a picture."""
+        picture = np.ascontiguousarray(image.detach().cpu().numpy())
+        mean = _blur(picture)
+        squared = mean * mean
+        variance = _blur(picture * picture)
+        return Windows(picture, mean, squared, np.subtract(variance, squared, out=variance))
+
+
+def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"] | Windows, border: Border = "zeros") -> float:
     """Structural similarity (Wang et al. 2004): the mean of `ssim_map` over pixels and channels.
 
     With `inside`, pixels whose window reaches beyond the picture do not count, unless the picture is smaller than that.
@@ -54,7 +75,7 @@ def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], border: 
     return float(found.double().mean())
 
 
-def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"] | Windows) -> Float[Tensor, "h w 3"]:
     """Structural similarity of every pixel and channel, -1..1.
 
     The definition is that of training codes for 3D Gaussians: an 11x11 Gaussian window of sigma 1.5, zeros beyond the
@@ -62,14 +83,22 @@ def ssim_map(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> F
     (`differentiable_ssim_map`) has the same definition, but other rounding: OpenCV blurs twenty times as fast as torch,
     and scores need no gradient.
     """
-    x, y = (np.ascontiguousarray(t.detach().cpu().numpy()) for t in (image, target))
-    mean_x, mean_y = _blur(x), _blur(y)
-    variance_x = _blur(x * x) - mean_x * mean_x
-    variance_y = _blur(y * y) - mean_y * mean_y
-    covariance = _blur(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
-    structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
-    return torch.from_numpy(luminance * structure)
+    x, y = Windows.of(image), target if isinstance(target, Windows) else Windows.of(target)
+    # Work in place, because large new buffers cost as much as the arithmetic on them.
+    product = x.mean * y.mean
+    covariance = _blur(x.picture * y.picture)
+    covariance -= product
+    for shared in (product, covariance):
+        shared *= 2
+    product += C1
+    covariance += C2
+    squares, variances = x.squared_mean + y.squared_mean, x.variance + y.variance
+    squares += C1
+    variances += C2
+    product /= squares
+    covariance /= variances
+    product *= covariance
+    return torch.from_numpy(product)
 
 
 def _blur(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

@@ -14,9 +14,19 @@ from torch import Tensor
 
 from mien.evaluation.baselines import Baselines, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
-from mien.evaluation.experiment import DARK, Edges, Experiment, avatar_image, scored_on, target_image
+from mien.evaluation.experiment import (
+    DARK,
+    WHITE,
+    Edges,
+    Experiment,
+    avatar_image,
+    drawn_image,
+    posed_avatar,
+    scored_on,
+    target_images,
+)
 from mien.evaluation.fitting import LOSS, FittedFaces
-from mien.evaluation.metrics import Border, psnr
+from mien.evaluation.metrics import Border
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
     PART_SIDE,
@@ -31,6 +41,7 @@ from mien.evaluation.scoring import (
     score_pictures,
     worker_threads,
 )
+from mien.evaluation.trained_frames import look_at_trained
 from mien.parallel import stream_in_threads
 from mien.perceptual.lpips import load_lpips
 from mien.progress import progress_bar
@@ -135,21 +146,23 @@ def evaluate_frames(
     metric, lpips = perceptual_metric(settings), lpips_metric(settings)
     perceptual_frames = set(spread_frames(frames, settings.perceptual_frames))
     threads = worker_threads(settings.threads)
-    baselines = make_baselines(experiment, threads) if settings.baselines else None
+    trained = look_at_trained(experiment, _MAX_TRAINING_FRAMES, threads, mean=settings.baselines)
+    baselines = make_baselines(experiment, threads, trained) if settings.baselines else None
     fitted = FittedFaces(experiment, settings.fit_steps) if settings.fit_faces else None
 
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
         frame, drawn, seconds = job
         pictures = {name: as_8_bit(picture) for name, picture in drawn.items()}
         dark = pictures.pop(OVER_DARK, None)
-        truth, crop = target_image(experiment, frame), experiment.crop(frame)
+        truth, *over_dark = target_images(experiment, frame, (WHITE,) if dark is None else (WHITE, DARK))
+        crop = experiment.crop(frame)
         judges = (metric, lpips) if frame in perceptual_frames else (None, None)
         parts, border = experiment.parts(frame), settings.border
         clothes = experiment.clothes_of(frame) if OPENED in pictures else None
         compared = None if settings.perceptual_of == "all" else (AVATAR,)
         scores = score_pictures(pictures, truth, crop, judges[0], parts, judges[1], border, compared)
         if dark is not None:
-            scores |= score_pictures({OVER_DARK: dark}, target_image(experiment, frame, DARK), crop, None)
+            scores |= score_pictures({OVER_DARK: dark}, over_dark[0], crop, None)
         if clothes is not None:
             bare = {UNCLOTHED: without(pictures[OPENED], clothes)}
             scores |= score_pictures(bare, without(truth, clothes), crop, judges[0], parts, judges[1], border)
@@ -166,7 +179,7 @@ def evaluate_frames(
     # Sequences without masks of clothes have no figures without clothes.
     scores = {subject: tuple(row[subject] for row in rows if subject in row) for subject in _figure_names(rows)}
     seconds = sorted(done[frame][1] for frame in frames)
-    return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, _training_psnr(experiment, threads))
+    return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, trained.psnr)
 
 
 def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
@@ -185,14 +198,15 @@ def _drawn(
     as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
     for frame in frames:
         start = time.perf_counter()
-        drawn = {AVATAR: avatar_image(experiment, frame)}
+        posed = posed_avatar(experiment, frame)
+        drawn = {AVATAR: drawn_image(experiment, frame, posed)}
         seconds = time.perf_counter() - start
         if as_tracked is not None:
             drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
         if fitted is not None:
             drawn[FITTED] = avatar_image(experiment, frame, fitted.face(frame))
         if OVER_DARK in subjects:
-            drawn[OVER_DARK] = avatar_image(experiment, frame, background=DARK)
+            drawn[OVER_DARK] = drawn_image(experiment, frame, posed, DARK)
         if OPENED in subjects:
             drawn[OPENED] = opened(drawn[AVATAR] if fitted is None else drawn[FITTED])
         if baselines is not None:
@@ -218,19 +232,6 @@ def _as_tracked(experiment: Experiment) -> Experiment:
         for sequence, used in zip(experiment.sequences, experiment.faces, strict=True)
     )
     return replace(experiment, faces=tuple(tracked))
-
-
-def _training_psnr(experiment: Experiment, threads: int) -> dict[Frame, tuple[float, float]]:
-    """PSNR on the whole frame and on the head crop of at most `_MAX_TRAINING_FRAMES` training frames."""
-
-    def score(job: tuple[Frame, Tensor]) -> tuple[Frame, tuple[float, float]]:
-        frame, drawn = job
-        image, target = as_8_bit(drawn), target_image(experiment, frame)
-        return frame, (psnr(image, target), psnr(image, target, experiment.crop(frame)))
-
-    frames = spread_frames(experiment.training_frames, _MAX_TRAINING_FRAMES)
-    drawn = ((frame, avatar_image(experiment, frame)) for frame in frames)
-    return dict(stream_in_threads(score, drawn, threads))
 
 
 def _mask_words(experiment: Experiment, frames: Sequence[Frame]) -> str:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.evaluation.metrics import Border, crop_to, l1, psnr, ssim
+from mien.evaluation.metrics import Border, Windows, crop_to, l1, psnr, ssim
 from mien.face import PARTS
 from mien.metric_names import METRICS
 from mien.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
@@ -108,12 +108,13 @@ def score_pictures(
     boxes += [(f"{name}_", box, PART_SIDE) for name, box in parts.items()]
     for prefix, box, least in boxes:
         cut = crop_to(target, box)
+        windows = Windows.of(cut)
         judged = enlarged(cut, least)
         large = min(judged.shape[:2]) >= MIN_SIDE
         references = [(key, each, each.features(judged)) for key, each in metrics] if large else []
         for name, picture in pictures.items():
             image, row = crop_to(picture, box), rows[name]
-            row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, cut, border)
+            row[f"{prefix}psnr"], row[f"{prefix}ssim"] = psnr(image, cut), ssim(image, windows, border)
             row[f"{prefix}l1"] = l1(image, cut)
             for key, each, reference in references if compared is None or name in compared else ():
                 row[f"{prefix}{key}"] = each.between(each.features(enlarged(image, least)), reference)

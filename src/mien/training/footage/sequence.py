@@ -18,7 +18,7 @@ from mien.face import FaceModel, part_boxes
 from mien.locks import read_beside_writers
 from mien.pictures import Box
 from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
-from mien.training.footage.foreground import foreground_colors, soft_pixels
+from mien.training.footage.foreground import soft_colors
 from mien.training.footage.hidden import hidden_triangles
 
 _CACHE_BYTES = 1 << 30
@@ -230,8 +230,7 @@ class Targets:
         if kept is None:
             # A copy: the pages of a mapped file are given back.
             matte = np.array(self._resize(capture.mattes[timestep, camera]))
-            place = np.flatnonzero(soft_pixels(matte)).astype(np.int32)
-            kept = place, foreground_colors(image, matte).reshape(-1, 3)[place]
+            kept = soft_colors(image, matte)
             size = sum(part.nbytes for part in kept)
             if again and size <= self._soft_room:
                 self._soft_room -= size
