@@ -134,19 +134,19 @@ def test_the_outline_has_the_hair(anny):
     views = [_view(_views(anny, hair=hair), _face(anny), 0) for hair in (0.0, _HAIR)]
     alphas = [view.alpha for view in views]
     head_faces = anny.faces[~anny.region_mask("neck")]
-    head = rasterize_mesh(anny(views[0].face)[0], head_faces, views[0].camera).face_index >= 0
+    head = rasterize_mesh(anny(views[0].plan.face)[0], head_faces, views[0].plan.camera).face_index >= 0
     assert bool((alphas[0][head] == 1).all())
     assert float(alphas[1].sum()) > 1.05 * float(alphas[0].sum())
 
 
 def test_the_outline_ends_at_the_cut_at_the_neck(anny):
     view = _view(_views(anny), _face(anny), 0)
-    face, camera, picture, alpha = view.face, view.camera, view.picture, view.alpha
+    face, camera, picture, alpha = view.plan.face, view.plan.camera, view.picture, view.alpha
     bare = np.where(rasterize_mesh(anny(face)[0], anny.faces, camera).face_index.numpy() >= 0, 255, 0).astype(np.uint8)
     expected = head_cutter(anny, NeckParts.of(anny), face)(bare, camera)
     assert alpha.equal(torch.from_numpy(expected).float() / 255)
     assert float(alpha.sum()) < 0.97 * (bare > 0).sum(), "the mesh goes on below the cut"
-    torch.testing.assert_close(picture[alpha == 0], view.background.expand(int((alpha == 0).sum()), 3))
+    torch.testing.assert_close(picture[alpha == 0], view.plan.background.expand(int((alpha == 0).sum()), 3))
 
 
 def test_every_fourth_step_has_a_view(anny):

@@ -46,7 +46,7 @@ def psnr(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], box: Box
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """What SSIM needs of a picture alone. Several pictures that are compared with one target share the target's."""
+    """The means and variances that SSIM needs of one picture. Pictures compared with one target share the target's."""
 
     picture: Float[np.ndarray, "h w 3"]
     mean: Float[np.ndarray, "h w 3"]

@@ -1,4 +1,4 @@
-"""What an evaluation looks at in training pictures: their mean, and how well the avatar draws them."""
+"""The figures of an evaluation that come from training pictures: their mean, and how well the avatar draws them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from mien.training.footage import Frame, spread_frames
 
 @dataclass(frozen=True, eq=False)
 class TrainedFrames:
-    """What was found in the training frames."""
+    """The means of the training frames, and the avatar's scores on some of them."""
 
     means: dict[Frame, Float[Tensor, "h w 3"]]
     """The mean target of each sequence and camera. The keys have timestep 0. Empty if it was not asked for."""

@@ -30,8 +30,8 @@ from mien.training.whole_head.unseen import Unseen
 
 
 @dataclass(frozen=True, eq=False)
-class SideView:
-    """One side view. All tensors but those of the face are on the CPU."""
+class SideViewPlan:
+    """A side view without the pictures that it is compared with."""
 
     face: FaceParams
     """The turned head, or the raised expression. It has no gradient."""
@@ -39,6 +39,18 @@ class SideView:
     """Whether the expression is raised."""
     camera: Camera
     background: Float[Tensor, " 3"]
+    """A colour, on the CPU."""
+    vertices: Float[Tensor, "v 3"]
+    """The posed mesh in world coordinates, on the CPU."""
+    up: Float[Tensor, " 3"]
+    """The head's upright axis in world coordinates, on the CPU."""
+
+
+@dataclass(frozen=True, eq=False)
+class SideView:
+    """A side view with its pictures, which are on the CPU."""
+
+    plan: SideViewPlan
     picture: Float[Tensor, "h w 3"]
     """The completed mesh over the background."""
     alpha: Float[Tensor, "h w"]
@@ -106,11 +118,11 @@ class SideViews:
             view: The view.
             progress: How far training is.
         """
-        like = view.face.expression
-        posed = avatar.pose(view.face, progress)
-        seen = rasterize(posed.gaussians.timestep(0), view.camera, view.background.to(like))
+        plan, like = view.plan, view.plan.face.expression
+        posed = avatar.pose(plan.face, progress)
+        seen = rasterize(posed.gaussians.timestep(0), plan.camera, plan.background.to(like))
         difference = (seen.image - view.picture.to(like)).abs()
-        if view.raised:
+        if plan.raised:
             free = WHOLE_HEAD.raised_free_difference
             difference = (difference - free).clamp_min(0) * view.compared.to(like)[..., None]
             return self.weight * difference.mean() + _held_back(avatar, posed, self.compared)
@@ -118,7 +130,7 @@ class SideViews:
         return self.weight * (difference.mean() + outline)
 
     @torch.no_grad()
-    def _made(self, plan: "SideViewPlan") -> SideView:
+    def _made(self, plan: SideViewPlan) -> SideView:
         """The view with the pictures that it is compared with."""
         camera, faces = plan.camera.to(self.colors), self.face_model.faces
         raised = plan.vertices + self.height[:, None] * vertex_normals(plan.vertices, faces)
@@ -131,7 +143,7 @@ class SideViews:
         colors = self.colors.index_select(0, triangle).view(*index.shape, 3)
         picture = plan.background + alpha[..., None] * (colors - plan.background)
         compared = self.compared.index_select(0, triangle).view(index.shape) & (alpha > 0)
-        return SideView(plan.face, plan.raised, plan.camera, plan.background, picture, alpha, compared)
+        return SideView(plan, picture, alpha, compared)
 
     def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""
@@ -141,20 +153,6 @@ class SideViews:
         result = expression.clone()
         result[0, chosen.to(expression.device)] = values.to(expression)
         return result
-
-
-@dataclass(frozen=True, eq=False)
-class SideViewPlan:
-    """A side view without the pictures that it is compared with."""
-
-    face: FaceParams
-    raised: bool
-    camera: Camera
-    background: Float[Tensor, " 3"]
-    vertices: Float[Tensor, "v 3"]
-    """The posed mesh in world coordinates, on the CPU."""
-    up: Float[Tensor, " 3"]
-    """The head's upright axis in world coordinates, on the CPU."""
 
 
 def side_views(
