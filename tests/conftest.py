@@ -1,22 +1,25 @@
-"""Share fixtures, divide the tests among processes, and list the skipped ones at the end."""
+"""Share fixtures, let calls be checked where tests ask for it, and list the skipped tests at the end."""
 
 import os
+import shutil
 import signal
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 import torch
+from filelock import FileLock
 from hypothesis import settings
 
+import checked_types  # before mien, see there
 from instruction_sets import ISAS
 from mien import _native
 from needs import NO_GPU, NO_TEST_DATA, find_test_data, is_strict, skipped_lines, unexpected, use_instructions
 
 # jaxtyping checks only modules that are imported after pytest has read this file, so fixtures import them at use.
 if TYPE_CHECKING:
+    from forked import ForkServer
     from mien.face import FaceModel
     from other_process import Holder
 
@@ -25,8 +28,8 @@ torch.set_num_threads(1)
 settings.register_profile("mien", deadline=None, derandomize=True)
 settings.load_profile("mien")
 
-MOST_WORKERS = 4
-"""Largest number of worker processes. More gain little, since the longest files take a quarter of the time."""
+MOST_WORKERS = 8
+"""Largest number of worker processes. More gain little, since things that are made once are waited for."""
 MEMORY_OF_A_WORKER = 3 << 30
 """Memory that a worker needs, in bytes."""
 
@@ -76,12 +79,49 @@ def short_films() -> Iterator[None]:
         yield
 
 
+MadeOnce = Callable[[str, Callable[[Path], object]], Path]
+
+
 @pytest.fixture(scope="session")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
+    """Return a function that makes a folder once for all workers of this run.
+
+    `made_once(name, make)` calls `make(folder)` in the first worker that asks for the name, without checks of types,
+    and returns the folder, which is for reading. The others wait for it. Nothing is kept for the next run.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if os.environ.get("PYTEST_XDIST_WORKER") else base) / "made_once"
+    shared.mkdir(exist_ok=True)
+
+    def folder(name: str, make: Callable[[Path], object]) -> Path:
+        place, done = shared / name, shared / f"{name}.done"
+        with FileLock(shared / f"{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(place, ignore_errors=True)  # of a worker that failed
+                place.mkdir()
+                with checked_types.unchecked():
+                    make(place)
+                done.touch()
+        return place
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def built(made_once: MadeOnce) -> Path:
     """Return a folder with a fresh build of the web runtime, for reading."""
     from web_case import build
 
-    return build(tmp_path_factory.mktemp("built"))
+    return made_once("web", build)
+
+
+@pytest.fixture(scope="session")
+def fork_server() -> "Iterator[ForkServer]":
+    """Return a process that has imported torch and forks commands, which start at once (tests/forked.py)."""
+    from forked import ForkServer
+
+    with ForkServer() as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
@@ -110,14 +150,16 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return max(1, min(len(os.sched_getaffinity(0)), MOST_WORKERS, memory // MEMORY_OF_A_WORKER))
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason=NO_GPU))
-    if hasattr(config, "workerinput"):
-        # Workers take whole files in this order. Long ones come first, so that all workers end at about the same time.
-        slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-        items.sort(key=lambda item: -slow[item.path])
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    # Before the fixtures of the test, so that what they make for others is checked or not by the same rule.
+    checked_types.check_types(item.get_closest_marker("unchecked") is None)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

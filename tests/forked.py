@@ -1,0 +1,174 @@
+"""Commands in processes of their own that start at once: forks of a server that has imported torch and the commands.
+
+For tests about processes: signals, kills, two commands at the same time. A process has no checks of types, as at users.
+Start-up, missing packages and other interpreters need a process that Python starts anew.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+
+class Forked:
+    """A process with its output in files, which behaves as `subprocess.Popen` where tests need it."""
+
+    def __init__(self, pid: int, folder: Path, ended: Path):
+        self.pid = pid
+        self._folder, self._ended = folder, ended
+
+    @property
+    def stdout(self) -> str:
+        """What the process has printed until now."""
+        return (self._folder / "stdout").read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def stderr(self) -> str:
+        """What the process has complained until now."""
+        return (self._folder / "stderr").read_text(encoding="utf-8", errors="replace")
+
+    def poll(self) -> int | None:
+        """Return the exit code, or minus the number of the signal that ended the process; None while it runs."""
+        return int(self._ended.read_text()) if self._ended.exists() else None
+
+    def wait(self, timeout: float = 600) -> int:
+        """Wait for the end, and return what `poll` does.
+
+        Raises:
+            TimeoutError: it has not ended after `timeout` seconds. It is killed.
+        """
+        waits = 0.0
+        while (code := self.poll()) is None:
+            if waits > timeout:
+                self.kill()
+                raise TimeoutError(f"process {self.pid} has not ended:\n{self.stdout}\n{self.stderr}")
+            time.sleep(0.01)
+            waits += 0.01
+        return code
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, if the process still runs."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+
+class ForkServer:
+    """A server for one worker. `with ForkServer() as server: server.mien("train", "out").wait()`."""
+
+    def __enter__(self) -> "ForkServer":
+        self._folder = Path(tempfile.mkdtemp(prefix="mien-forks-"))
+        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+        self._server = subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
+        self._count = 0
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.kill()
+        self._server.communicate()
+
+    def mien(self, *words: object, **options: Any) -> Forked:
+        """Start `mien WORDS`; options are those of `call`."""
+        return self.call("mien.cli:main", list(map(str, words)), exits=True, **options)
+
+    def call(
+        self,
+        function: str,
+        *arguments: Any,
+        cwd: Path | None = None,
+        env: dict[str, str] | None = None,
+        exits: bool = False,
+    ) -> Forked:
+        """Start a process that calls a function with arguments that json can carry.
+
+        Args:
+            function: Where it is, as in "module:name"; modules of tests are found.
+            arguments: Its arguments.
+            cwd: The folder of the process; that of the tests without it.
+            env: Variables that are set on top of today's.
+            exits: Whether what the function returns is the exit code.
+        """
+        self._count += 1
+        folder = self._folder / str(self._count)
+        folder.mkdir()
+        request = {"function": function, "arguments": arguments, "cwd": str(cwd or Path.cwd()), "exits": exits}
+        request |= {"env": {**os.environ, **(env or {})}, "folder": str(folder)}
+        assert self._server.stdin is not None
+        assert self._server.stdout is not None
+        print(json.dumps(request), file=self._server.stdin, flush=True)
+        return Forked(int(self._server.stdout.readline()), folder, folder / "ended")
+
+
+def run_forked(server: ForkServer, *words: object, **options: Any) -> "subprocess.CompletedProcess[str]":
+    """Run `mien WORDS` to its end, and return its exit code and output."""
+    process = server.mien(*words, **options)
+    code = process.wait()
+    return subprocess.CompletedProcess(list(words), code, process.stdout, process.stderr)
+
+
+def _serve() -> None:
+    """Fork a process for each line of json on stdin, and answer with its number."""
+    folders: dict[int, Path] = {}
+
+    def reap(*_: object) -> None:
+        while folders:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if pid == 0:
+                return
+            aside = folders[pid] / "ending"
+            aside.write_text(str(os.waitstatus_to_exitcode(status)))
+            aside.rename(folders.pop(pid) / "ended")
+
+    signal.signal(signal.SIGCHLD, reap)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    answers = os.dup(1)
+    while line := sys.stdin.readline():
+        request = json.loads(line)
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])
+        pid = os.fork()
+        if pid == 0:
+            os.close(answers)
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
+            _become(request)
+        folders[pid] = Path(request["folder"])
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
+        os.write(answers, f"{pid}\n".encode())
+
+
+def _become(request: dict[str, Any]) -> None:
+    """Turn this fork into the requested process, and end it as Python ends."""
+    import importlib
+
+    os.environ.clear()
+    os.environ.update(request["env"])
+    os.chdir(request["cwd"])
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(os.open(Path(request["folder"]) / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), number)
+    sys.argv = ["mien", *map(str, request["arguments"][0])] if request["exits"] else [request["function"]]
+    module, name = request["function"].split(":")
+    result = getattr(importlib.import_module(module), name)(*request["arguments"])
+    sys.exit(result if request["exits"] else 0)
+
+
+if __name__ == "__main__":
+    from mien import cli  # noqa: F401
+
+    tempfile.tempdir = None
+    _serve()
