@@ -4,6 +4,7 @@ For tests about processes: signals, kills, two commands at the same time. A proc
 Start-up, missing packages and other interpreters need a process that Python starts anew.
 """
 
+import importlib
 import json
 import os
 import signal
@@ -152,8 +153,6 @@ def _serve() -> None:
 
 def _become(request: dict[str, Any]) -> None:
     """Turn this fork into the requested process, and end it as Python ends."""
-    import importlib
-
     os.environ.clear()
     os.environ.update(request["env"])
     os.chdir(request["cwd"])
@@ -168,7 +167,7 @@ def _become(request: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    from mien import cli  # noqa: F401
-
+    for each in ("cli", "commands.stages.driving", "commands.stages.evaluating", "commands.stages.pictures"):
+        importlib.import_module(f"mien.{each}")
     tempfile.tempdir = None
     _serve()
