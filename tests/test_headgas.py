@@ -17,7 +17,7 @@ from mien.face import FaceModel, FaceParams, head_poses
 from mien.runtime import pose
 from mien.training import PRESETS
 from mien.training.adam import Adam
-from mien.training.density_control.gradient import _round_steps
+from mien.training.density_control.gradient import round_steps
 from toy_scene import runtime_face, toy_face, toy_face_model
 
 SMALL = HeadGasConfig(
@@ -211,7 +211,7 @@ def test_the_papers_schedule() -> None:
     config: Any = PRESETS["paper"].config("headgas")
     steps = PRESETS["paper"].settings_of("headgas").steps
     density = config.density
-    rounds = sorted(_round_steps(density.start, density.stop, density.rounds, steps))
+    rounds = sorted(round_steps(density.start, density.stop, density.rounds, steps))
     assert (steps, rounds) == (50_000, list(range(600, 15_000, 100)))
     assert (config.points, config.features, config.hidden, config.sh_degree, config.directions) == (2500, 32, 64, 3, 0)
     perceptual = PerceptualLoss(weight=0.1, start=0.2, every=1, blocks=3, region="person")

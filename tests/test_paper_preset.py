@@ -13,7 +13,7 @@ from mien.avatar import METHODS, GaussianAvatars, Progress, Rate
 from mien.camera import Camera
 from mien.training import PRESETS, TrainSettings, train
 from mien.training.adam import Adam
-from mien.training.density_control.gradient import _round_steps
+from mien.training.density_control.gradient import round_steps
 from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, camera_extent
 from paper_preset_page import PAGE, values_of
@@ -30,7 +30,7 @@ def resets(steps: int) -> list[int]:
 
 def rounds(steps: int) -> list[int]:
     density = PAPER.density
-    return sorted(_round_steps(density.start, density.stop, density.rounds, steps))
+    return sorted(round_steps(density.start, density.stop, density.rounds, steps))
 
 
 def test_schedule() -> None:

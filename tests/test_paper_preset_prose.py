@@ -18,7 +18,7 @@ from mien.face import FaceModel
 from mien.training import PRESETS, TrainSettings
 from mien.training.adam import Adam
 from mien.training.density_control import density_strategy
-from mien.training.density_control.gradient import _round_steps
+from mien.training.density_control.gradient import round_steps
 from mien.training.face_track import FaceTrack
 from mien.training.footage.constants import FOOTAGE
 from paper_preset_page import DOCS, PAGE, flat, rows_of
@@ -137,7 +137,7 @@ def test_no_round_or_reset_is_after_the_last_step() -> None:
     for method in ("gaussian_avatars", "headgas"):
         config: Any = PRESETS["paper"].config(method)
         steps, density = PRESETS["paper"].settings_of(method).steps, config.density
-        assert max(_round_steps(density.start, density.stop, density.rounds, steps)) < steps
+        assert max(round_steps(density.start, density.stop, density.rounds, steps)) < steps
         assert max(density.opacity_resets, default=0) < 1
     assert PAPER.density.reset_opacity == 0.01
 

@@ -9,7 +9,7 @@ import pytest
 from mien.avatar import METHODS, Rate
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.training import PRESETS
-from mien.training.density_control.gradient import _round_steps
+from mien.training.density_control.gradient import round_steps
 from paper_preset_page import PAGE, values_of
 
 # -- HeadGaS -----------------------------------------------------------------------------------------------------------
@@ -25,7 +25,7 @@ def test_docs_have_all_values_of_headgas() -> None:
     density, perceptual = paper.density, paper.photometric.perceptual
     start, stop, size_start, first = steps_of(steps, density.start, density.stop, density.size_start, perceptual.start)
     every = (stop - start) // (density.rounds - 1)
-    assert sorted(_round_steps(density.start, density.stop, density.rounds, steps)) == list(range(600, 15_000, 100))
+    assert sorted(round_steps(density.start, density.stop, density.rounds, steps)) == list(range(600, 15_000, 100))
     assert steps_of(steps, paper.sh_warmup) == [4 * 1_000], "one more degree every 1,000 steps"
     assert (paper.means_rate, paper.means_times_extent) == (Rate(1.6e-4, 1.6e-6), True)
     assert (paper.log_scales_rate, paper.quats_rate) == (Rate(5e-3), Rate(1e-3))

@@ -62,7 +62,7 @@ class GradientStrategy(DensityStrategy):
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
         """Add and prune Gaussians in rounds, and reset opacities at their times."""
         settings = self._density.settings
-        changed = progress.completes(_round_steps(settings.start, settings.stop, settings.rounds, progress.steps))
+        changed = progress.completes(round_steps(settings.start, settings.stop, settings.rounds, progress.steps))
         if changed:
             self._grow_and_prune(store, posed, progress, random())
             self._restart(len(store))
@@ -175,7 +175,7 @@ def observe_reference(
 
 
 @lru_cache
-def _round_steps(start: float, stop: float, rounds: int, steps: int) -> frozenset[int]:
+def round_steps(start: float, stop: float, rounds: int, steps: int) -> frozenset[int]:
     """The numbers of steps after which the rounds happen, evenly from `start` to `stop` (fractions of the run)."""
     gaps = max(rounds - 1, 1)
     return frozenset(max(1, round((start + (stop - start) * index / gaps) * steps)) for index in range(rounds))
