@@ -13,7 +13,7 @@ import torch
 from mien.cli import main
 from mien.commands.stages import driving
 from mien.errors import UserError
-from mien.face import available_face_models, cache, load_face_model, loading
+from mien.face import available_face_models, cache, listing, load_face_model, loading
 from small_face_model import make_small_face_model
 
 
@@ -27,8 +27,8 @@ def bakes(monkeypatch, tmp_path):
         counts.append(1)
         return make_small_face_model()
 
-    source = loading._Source("none", "an ellipsoid", bake, lambda: "r1-0.0.1")
-    monkeypatch.setitem(loading._SOURCES, "small", source)
+    source = listing.Source("none", "an ellipsoid", bake, lambda: "r1-0.0.1")
+    monkeypatch.setitem(listing.SOURCES, "small", source)
     return counts
 
 
@@ -41,7 +41,7 @@ def test_round_trip(bakes, tmp_path):
     baked, read = load_face_model("small"), load_face_model("small")
     assert len(bakes) == 1
     assert read.content_hash == baked.content_hash
-    for name in (*loading._TENSORS, *loading._LISTS, "name"):
+    for name in (*loading.TENSORS, *loading.LISTS, "name"):
         first, second = getattr(baked, name), getattr(read, name)
         if isinstance(first, torch.Tensor):
             assert first.dtype == second.dtype
@@ -147,7 +147,7 @@ def test_without_a_home_folder_models_are_baked_for_this_process(home, bakes, mo
     assert said.count("set MIEN_CACHE to keep them") == 1
     assert ("there is no home folder" if home is None else "/proc/nowhere/.cache/mien cannot be written to") in said
     (folder,) = tmp_path.glob("mien-cache-*")
-    assert loading._is_baked("small", loading._SOURCES["small"])
+    assert listing.is_baked("small", listing.SOURCES["small"])
     assert str(folder) in said
     cache._temporary_folder.cache_clear()
 

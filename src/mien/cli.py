@@ -4,7 +4,6 @@ import contextlib
 import difflib
 import errno
 import importlib
-import importlib.util
 import inspect
 import io
 import os
@@ -22,7 +21,7 @@ from mien.errors import UserError
 from mien.extras import missing_package
 from mien.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
 from mien.terminal import drop_output, open_closed_streams, printable, show, tell
-from mien.threads import asked_threads
+from mien.threads import asked_threads, use_one_torch_thread
 
 GROUPS = {
     "Make an avatar": ("demo", "create", "capture", "track", "align", "train", "import", "batch"),
@@ -199,8 +198,7 @@ def _run(name: str, rest: list[str]) -> int:
     asked_threads()
     command.check()
     with orderly_stops():
-        if getattr(module, "NEEDS_TORCH", True):
-            _use_one_torch_thread()
+        use_one_torch_thread()
         _check_instruction_set()
         command.run()
     return 0
@@ -218,17 +216,6 @@ def _check_instruction_set() -> None:
         _native.rasterize_isa()
     except ValueError as error:
         raise UserError(f"{error}; give one of these, or unset it") from None
-
-
-def _use_one_torch_thread() -> None:
-    """Limit torch to one thread and leave the cores to native code. Their two thread pools stall each other.
-
-    Without torch, commands that need it say so themselves.
-    """
-    if importlib.util.find_spec("torch") is not None:
-        import torch
-
-        torch.set_num_threads(1)
 
 
 def _overview() -> str:

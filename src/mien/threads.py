@@ -1,8 +1,12 @@
 """The number of threads. Only this module reads MIEN_THREADS in Python; `native/pool.cpp` reads it separately."""
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
 
 from mien.errors import UserError
 
@@ -48,3 +52,33 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def use_one_torch_thread() -> None:
+    """Keep torch on one thread from now on. What does not import torch does not wait for it."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+    elif not any(isinstance(finder, _OneTorchThread) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _OneTorchThread())
+
+
+class _OneTorchThread(MetaPathFinder):
+    """Limits torch to one thread when it is imported."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname != "torch":
+            return None
+        spec = PathFinder.find_spec(fullname, path, target)
+        if spec is None or spec.loader is None:
+            return spec
+        load = spec.loader.exec_module
+
+        def load_and_limit(module: ModuleType) -> None:
+            load(module)
+            module.set_num_threads(1)
+            sys.meta_path.remove(self)
+
+        spec.loader.exec_module = load_and_limit
+        return spec

@@ -21,7 +21,8 @@ from mien.export import in_world, write_gaussian_avatars_folder, write_ply
 from mien.face import Landmarks
 from mien.face.cache import cache_folder
 from mien.face.flame import flame_face_model, read_flame
-from mien.face.loading import _ADDED_RECIPE, load_face_model, write_face_model, write_landmarks
+from mien.face.listing import ADDED_RECIPE
+from mien.face.loading import load_face_model, write_face_model, write_landmarks
 from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
 from mien.runtime import write_portable
 from mien.storage import write_json
@@ -102,7 +103,7 @@ def _write_face_models(folder: Path) -> None:
         folder / "mine.source.json",
         "mien.face_model_source",
         1,
-        {"path": "/x.npz", "sha256": "0", "recipe": _ADDED_RECIPE},
+        {"path": "/x.npz", "sha256": "0", "recipe": ADDED_RECIPE},
     )
 
 

@@ -16,7 +16,7 @@ from mien.avatar.methods import method_of
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
-from mien.face.loading import available_face_models
+from mien.face.listing import available_face_models
 from mien.runtime import baked
 from mien.runtime.baked import About, Neutral, PortableAvatar, Rig
 

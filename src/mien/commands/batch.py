@@ -24,8 +24,6 @@ _TASKS = {
 """Options that a task has. Elsewhere they would change nothing."""
 _OF_ENGINES = ("out", "on", "shard", "retry", "jobs", "threads", "program")
 """Options that a batch has on every engine. `mien.batch.Engine` names others."""
-NEEDS_TORCH = False
-"""Rows run in processes of their own. Without torch, the driver of thousands stays small."""
 
 
 @dataclass(frozen=True)

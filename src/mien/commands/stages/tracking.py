@@ -91,7 +91,7 @@ def run_tracking_stage(
         say(f"{', '.join(finished)}: the tracking is current, nothing to do")
         return finished
     with hold(*(workspace.sequence_dir(name) for name in names)):
-        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings, hold_out)
+        fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
         trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model)
         if trackings is None:
             trackings = _track(workspace, names, face_model, settings, fingerprint, preview, hold_out)
@@ -152,7 +152,7 @@ def _finished_trackings(
 ) -> dict[str, Tracking] | None:
     """The trackings, if all results of the stage exist and are current. Without `overlay`, reports do not count."""
     try:
-        fingerprint = _tracking_fingerprint(workspace, names, face_model, settings, hold_out)
+        fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
         trackings = _current_trackings(workspace, names, fingerprint, face_model, tell=False)
         for name, tracking in (trackings or {}).items():
             folder = workspace.sequence_dir(name)
@@ -181,13 +181,14 @@ def _write_masks(
             write_scoring(folder / "scoring", made, capture_hash)
 
 
-def _tracking_fingerprint(
+def tracking_fingerprint(
     workspace: Workspace,
     names: list[str],
     face_model: FaceModel,
     settings: TrackingSettings,
     hold_out: Collection[str] = (),
 ) -> str:
+    """Return what trackings of these sequences depend on, as a short text that a tracking holds."""
     captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
     content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]
     content += [sorted(set(hold_out))] if hold_out else []

