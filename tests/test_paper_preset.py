@@ -1,57 +1,234 @@
-"""The preset `paper` of GaussianAvatars has the numbers of the paper, its supplement and its published code."""
+"""The preset `paper` has the numbers of the papers: code, docs/paper_preset.md and paper_preset.toml say the same."""
 
 import math
 import re
-from dataclasses import fields, replace
+import tomllib
+from dataclasses import fields, is_dataclass, replace
+from functools import cache
+from operator import attrgetter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import torch
 
 from mien.avatar import METHODS, GaussianAvatars, Progress, Rate
-from mien.camera import Camera
-from mien.training import PRESETS, TrainSettings, train
-from mien.training.adam import Adam
+from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.cli import main
+from mien.commands.stages import training
+from mien.face import FaceModel
+from mien.training import PRESETS, TrainSettings
 from mien.training.density_control.gradient import round_steps
 from mien.training.footage.constants import FOOTAGE
-from mien.training.footage.frames import Frame, camera_extent
-from paper_preset_page import PAGE, values_of
-from plain_settings import plain_gaussian_avatars, plain_run
-from toy_scene import toy_face, toy_face_model, toy_sequence
+from toy_scene import toy_face, toy_face_model
 
+HERE = Path(__file__).parent
+PAGE = (HERE.parent / "docs" / "paper_preset.md").read_text(encoding="utf-8")
+TABLE: dict[str, Any] = tomllib.loads((HERE / "paper_preset.toml").read_text(encoding="utf-8"))
+LOG = TABLE.pop("log")
 PAPER: Any = PRESETS["paper"].config("gaussian_avatars")
 STEPS = 600_000
 
-
-def resets(steps: int) -> list[int]:
-    return [round(time * steps) for time in PAPER.density.opacity_resets]
+# -- the table --------------------------------------------------------------------------------------------------------
 
 
-def rounds(steps: int) -> list[int]:
-    density = PAPER.density
-    return sorted(round_steps(density.start, density.stop, density.rounds, steps))
+def plain(text: str) -> str:
+    """A text in one line, with each number written in one way."""
+    text = re.sub(r"\bTrue\b", "yes", re.sub(r"\bFalse\b", "no", " ".join(text.split())))
+    return re.sub(r"[\d.,]*\d(?:e-?\d+)?", lambda found: f"{float(found[0].replace(',', '')):.6g}", text)
+
+
+def rows_of(section: str) -> dict[str, tuple[str, str, str]]:
+    """The columns "paper", "here" and "why different" of a method, by the names in the first column."""
+    (own,) = [text for text in re.split(r"^## ", PAGE, flags=re.MULTILINE) if text.startswith(f"{section}\n")]
+    lines = own[own.index("| setting | paper | here | why different |") :].split("\n\n")[0].splitlines()[2:]
+    cells = [[cell.strip() for cell in line.removeprefix("|").removesuffix("|").split(" | ")] for line in lines]
+    return {name.replace("`", ""): (paper, here, why) for name, paper, here, why in cells}
+
+
+def shown(value: Any, epochs: int) -> Any:
+    """Settings for braces. A rate is its start, its end if it has one, and the epoch in which it begins."""
+    if isinstance(value, Rate):
+        end = "" if value.end is None else f" to {value.end}"
+        return f"{value.start}{end}" + (f" from epoch {round(value.begin * epochs)}" if value.begin else "")
+    if is_dataclass(value):
+        return SimpleNamespace(**{each.name: shown(getattr(value, each.name), epochs) for each in fields(value)})
+    return value
+
+
+def rounds(config: Any, steps: int) -> list[int]:
+    return sorted(round_steps(config.density.start, config.density.stop, config.density.rounds, steps))
+
+
+def resets(config: Any, steps: int) -> list[int]:
+    return [round(time * steps) for time in config.density.opacity_resets]
+
+
+def of_density(config: Any, steps: int) -> dict[str, Any]:
+    """What the settings of density control mean for a run of so many steps."""
+    density, at, low = config.density, rounds(config, steps), resets(config, steps)
+    gaps = {after - before for before, after in zip(at, at[1:], strict=False)}
+    judged = min((step for step in low if step > at[0]), default=0)
+    found = {"rounds": len(at), "first_round": at[0], "last_round": at[-1], "unit": {"extent": "E"}[density.size_unit]}
+    found["judged_from"] = judged if density.size_start is None else round(density.size_start * steps)
+    (found["round_gap"],) = gaps
+    found |= {"resets": "some", "first_reset": low[0], "last_reset": low[-1]} if low else {"resets": "none"}
+    if low:
+        (found["reset_gap"],) = {after - before for before, after in zip(low[1:], low[2:], strict=False)}
+    return found
+
+
+def of_schedule(config: Any, steps: int) -> dict[str, Any]:
+    """What epochs mean for a run of so many steps, and lengths in metres and in those of the paper."""
+    frames = steps // config.epochs
+    found = {"frames": frames, "seconds": frames // 25, "paper_lengths": round(1 / LENGTH_UNIT)}
+    found["all_points"] = "all points" if config.face_points >= config.max_points else config.face_points
+    if hasattr(config, "late_epoch"):
+        at = config.late_epoch / config.epochs
+        late = {Schedule(name, 120, 400, late_epoch=101).sampling_length(at) for name in ("paper", "code")}
+        (found["late_length"],) = late
+        found["late_length_of_paper"] = found["late_length"] / LENGTH_UNIT
+        found["halvings"] = [round(config.epochs * time) for time in config.rate_halvings]
+        found["points_for_all_frames"] = config.points_per_step // config.frames_per_step
+    return found
+
+
+@cache
+def figures(method: str) -> dict[str, Any]:
+    """All that braces may name: the settings of a method by the preset `paper`, and what follows from them."""
+    config: Any = PRESETS["paper"].config(method)
+    steps = PRESETS["paper"].settings_of(method).steps
+    found = {**vars(shown(config, getattr(config, "epochs", 1))), "steps": steps}
+    if hasattr(config, "density"):
+        found |= of_density(config, steps)
+        found["short"] = SimpleNamespace(**of_density(config, 3_000))
+        found["times_extent"] = "times E" if config.means_times_extent else ""
+        found["degrees"] = [steps * config.sh_warmup * degree / (config.sh_degree + 1) for degree in (1, 2, 3)]
+        found["warmup_share"] = 1 / config.sh_warmup
+    if hasattr(config, "epochs"):
+        found |= of_schedule(config, steps)
+    if config.photometric.perceptual.weight:
+        perceptual = config.photometric.perceptual
+        found["perceptual_from"] = round(perceptual.start * steps)
+        found["blocks"] = ("no", "one", "two", "three", "four")[perceptual.blocks]
+    if method == "headgas":
+        having = sum(config.photometric.perceptual.due(step, steps) for step in range(steps))
+        found |= {"higher_share": 1 / config.sh_higher_share, "perceptual_steps": having}
+        found |= {"perceptual_hours": round(having * 2.4 / 3600), "other_hours": f"{steps * 0.25 / 3600:.1f}"}
+    tuning = found["face_tuning"]
+    found["tuning"] = "on" if tuning.enabled else "off"
+    found["face_rates"] = ", ".join(sorted({tuning.expression, tuning.joints, tuning.head_rotation}))
+    found["visits"] = {frames: round(moved_per_visit(frames, 1)) for frames in (250, 1_000, 2_000)}
+    found["most_visits"] = round(1 / math.sqrt(1 - 0.999))
+    least = FOOTAGE.least_extent
+    found["footage"] = FOOTAGE
+    if hasattr(config, "density"):
+        found |= {"least_split": 1e3 * least * config.density.split_size}
+        found |= {"least_prune": 1e2 * least * config.density.prune_size}
+    return found
+
+
+def check_section(section: str) -> None:
+    """Compare the rows of the table with those of the page, and both with the code."""
+    own, page = TABLE[section], rows_of(section)
+    assert [row[0] for row in own["rows"]] == list(page)
+    known = figures(own["method"])
+    for name, published, place, here, *of_paper in own["rows"]:
+        paper, found, why = page[name]
+        assert paper == published, name
+        assert place, f"{name}: where is this published?"
+        assert plain(found) == plain(here.format(**known)), name
+        for part in of_paper:
+            assert plain(part.format(**known)) in plain(paper), name
+        numbers = [set(re.findall(r"[\d.e-]*\d", plain(cell))) for cell in (paper, found)]
+        if not why and all(numbers) and "not stated" not in paper and "code" not in paper:
+            assert numbers[0] & numbers[1], f"{name}: a row that does not say why differs in nothing"
+    config = PRESETS["paper"].config(own["method"])
+    assert {name: attrgetter(name)(config) for name in own["also"]} == own["also"]
+    for sentence in own["says"]:
+        assert plain(sentence.format(**known)) in plain(PAGE)
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("section", ["GaussianAvatars", "HeadGaS", "MonoGaussianAvatar"])
+def test_docs_have_all_values(section: str) -> None:
+    check_section(section)
+
+
+def test_docs_have_all_values_of_point_avatar() -> None:
+    check_section("PointAvatar")
+
+
+def test_measured_figures_are_those_of_the_log(anny: FaceModel) -> None:
+    log = " ".join((HERE.parent / "docs" / "log.md").read_text(encoding="utf-8").split())
+    for sentence, source in LOG["measured"]:
+        assert sentence in " ".join(PAGE.split())
+        assert source in log
+    assert (anny.expression_bounds.min(), anny.expression_bounds.max()) == (0, 1.5)
+    assert "Coefficients of `anny` go from 0 to 1.5 at most." in PAGE
+
+
+def values(settings: Any, place: str = "") -> dict[str, Any]:
+    """All settings by their dotted names. A learning rate is one of them."""
+    found = {}
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        inside = is_dataclass(value) and not isinstance(value, Rate)
+        found |= values(value, f"{place}{field.name}.") if inside else {place + field.name: value}
+    return found
+
+
+@pytest.mark.parametrize("section", TABLE)
+def test_what_no_row_names_is_as_in_standard(section: str) -> None:
+    method = TABLE[section]["method"]
+    assert PRESETS["standard"].config(method) == METHODS[method].config()
+    named = {name for names, (_, _, why) in rows_of(section).items() for name in names.split(", ") + why.split("`")}
+    standard, paper = values(METHODS[method].config()), values(PRESETS["paper"].config(method))
+    for setting in paper:
+        parts = setting.split(".")
+        written = {".".join(parts[:end]) for end in range(1, len(parts) + 1)} | {parts[-1]}
+        assert paper[setting] == standard[setting] or written & named, setting
+
+
+def test_the_run_of_every_method_has_the_settings_of_the_first_table() -> None:
+    default = TrainSettings()
+    table = dict(re.findall(r"^\| `([a-z]+)` \| ([a-z]+ \| [a-z]+) \|$", PAGE, flags=re.MULTILINE))
+    assert table == {name: f"{getattr(default, name)} | {value}" for name, value in PRESETS["paper"].changes.items()}
+    with_preset = [name for name in METHODS if "paper" in METHODS[name].presets]
+    assert set(METHODS) - set(with_preset) == {"textured_mesh"}, "which repeats no paper"
+    for method in with_preset:
+        settings = PRESETS["paper"].settings_of(method)
+        assert settings == replace(default, steps=settings.steps, **PRESETS["paper"].changes)
+
+
+def test_commands_of_the_page_give_what_they_are_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("capture/capture.json", "tracking/tracking.json"):
+        (tmp_path / "sequences" / "clip" / name).parent.mkdir(parents=True)
+        (tmp_path / "sequences" / "clip" / name).touch()
+    asked: list[tuple[Any, Any]] = []
+    monkeypatch.setattr(training, "run_training_stage", lambda *given, **_: asked.append((given[3], given[4])))
+    for line in re.findall(r"^    mien train \S+ ([^#\n]*)", PAGE, flags=re.MULTILINE):
+        assert main(["train", str(tmp_path), *line.replace("--split gaussian-avatars", "").split()]) == 0, line
+    (whole, whole_run), (_, short_run), (lower, _), (without, _), (small, small_run) = asked
+    assert (whole, whole_run) == (PAPER, PRESETS["paper"].settings_of("gaussian_avatars"))
+    assert short_run.steps == 3_000
+    assert lower.face_tuning == replace(PAPER.face_tuning, expression=Rate(1e-3)), "the paper's own rate"
+    assert without.photometric.perceptual.weight == 0
+    assert small == PRESETS["paper-cpu"].config("mono_gaussian_avatar")
+    assert small_run == PRESETS["paper-cpu"].settings_of("mono_gaussian_avatar")
+
+
+# -- schedules and rates ----------------------------------------------------------------------------------------------
 
 
 def test_schedule() -> None:
-    assert PRESETS["paper"].settings_of("gaussian_avatars") == plain_run(steps=STEPS)
-    assert rounds(STEPS) == list(range(12_000, 600_000, 2_000))
-    assert resets(STEPS) == [10_000, *range(60_000, 600_000, 60_000)]
-    assert PAPER.density.reset_opacity == 0.01
-
-
-def test_a_shorter_run_has_the_same_schedule() -> None:
-    assert rounds(3_000) == list(range(60, 3_000, 10))
-    assert resets(3_000) == [50, *range(300, 3_000, 300)]
-
-
-def test_density_control() -> None:
-    density = PAPER.density
-    assert density.grow_gradient == 2e-4
-    assert (density.size_unit, density.split_size, density.prune_size) == ("extent", 0.01, 0.1)
-    assert density.prune_opacity == 0.005
-    assert (density.prune_radius, density.rules.prune_wide) == (20, False), "the code never prunes by the radius"
-    assert density.max_gaussians >= 200_000
+    assert rounds(PAPER, STEPS) == list(range(12_000, 600_000, 2_000))
+    assert resets(PAPER, STEPS) == [10_000, *range(60_000, 600_000, 60_000)]
+    assert rounds(PAPER, 3_000) == list(range(60, 3_000, 10)), "a shorter run has the same schedule"
+    assert resets(PAPER, 3_000) == [50, *range(300, 3_000, 300)]
+    headgas: Any = PRESETS["paper"].config("headgas")
+    assert rounds(headgas, PRESETS["paper"].settings_of("headgas").steps) == list(range(600, 15_000, 100))
 
 
 def test_colors_gain_a_degree_every_thousand_steps() -> None:
@@ -59,29 +236,19 @@ def test_colors_gain_a_degree_every_thousand_steps() -> None:
     steps = (0, 999, 1_000, 1_999, 2_000, 2_999, 3_000, 599_999)
     counts = [avatar.pose(toy_face(5)[0], Progress(step, STEPS)).gaussians.sh.shape[-2] for step in steps]
     assert counts == [1, 1, 4, 4, 9, 9, 16, 16]
-    assert PAPER.sh_frame == "world"
 
 
-def test_rates_and_losses() -> None:
+def test_rates_of_gaussian_avatars() -> None:
     avatar = GaussianAvatars(PAPER, toy_face_model(), toy_face(5))
     groups = {group.name: group for group in avatar.parameter_groups()}
     first, last = Progress(0, STEPS, extent=2.0), Progress(STEPS, STEPS, extent=2.0)
     assert (groups["means"].rate_at(first), groups["means"].rate_at(last)) == pytest.approx((2 * 5e-3, 2 * 5e-5))
-    expected = {
-        "sh_constant": 2.5e-3,
-        "sh_rest": 2.5e-3 / 20,
-        "opacity_logits": 0.05,
-        "log_scales": 0.017,
-        "quats": 1e-3,
-    }
-    for name, rate in expected.items():
+    expected = {"sh_constant": 2.5e-3, "sh_rest": 2.5e-3 / 20, "opacity_logits": 0.05, "log_scales": 0.017}
+    for name, rate in (expected | {"quats": 1e-3}).items():
         assert groups[name].rate_at(first) == groups[name].rate_at(last) == pytest.approx(rate), name
-    photometric = PAPER.photometric
-    assert (photometric.l1_weight, photometric.ssim_weight, photometric.alpha_weight) == (0.8, 0.2, 0)
-    assert (PAPER.position_weight, PAPER.position_threshold) == (0.01, 1)
-    assert (PAPER.scale_weight, PAPER.scale_threshold) == (1, 0.6)
 
 
+@cache
 def moved_per_visit(frames: int, rate: float) -> float:
     """How far a dense Adam moves a value between two visits of its frame, whose gradient is always 1 then."""
     first = second = moved = 0.0
@@ -95,159 +262,68 @@ def moved_per_visit(frames: int, rate: float) -> float:
 
 
 def test_face_rates_do_per_visit_what_the_papers_dense_optimiser_does() -> None:
-    tuning = PAPER.face_tuning
+    for frames in (30, 60, 100):
+        assert moved_per_visit(frames, 1) == pytest.approx(math.sqrt(frames), rel=0.05)
+    assert all(moved_per_visit(frames, 1) < 32 for frames in (1_000, 2_000, 8_000))
+    factor = round(moved_per_visit(2_000, 1))
     papers = {"head_rotation": 1e-5, "joints": 1e-5, "head_translation": 1e-6, "expression": 1e-3}
-    assert tuning.enabled
     for name, rate in papers.items():
-        ours = getattr(tuning, name)
-        assert ours.end is None
-        assert ours.start == pytest.approx(moved_per_visit(2_000, rate), rel=0.1)
-    # The factors that docs/paper_preset.md names.
-    assert [round(moved_per_visit(frames, 1)) for frames in (250, 1_000, 2_000)] == [15, 25, 30]
+        ours = getattr(PAPER.face_tuning, name)
+        assert (ours.start, ours.end, ours.begin) == (pytest.approx(factor * rate), None, 0), name
 
 
-def names_in(changes: dict[str, Any], place: str = "") -> list[str]:
-    """The dotted names of all settings that a preset changes. A learning rate is one of them."""
-    rate = {field.name for field in fields(Rate)}
-    groups = {name: value for name, value in changes.items() if isinstance(value, dict) and not rate >= value.keys()}
-    inside = [one for name, value in groups.items() for one in names_in(value, f"{place}{name}.")]
-    return inside + [place + name for name in changes if name not in groups]
+# -- MonoGaussianAvatar ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("method", "section"),
-    [
-        ("gaussian_avatars", "GaussianAvatars"),
-        ("headgas", "HeadGaS"),
-        ("mono_gaussian_avatar", "MonoGaussianAvatar"),
-        ("point_avatar", "PointAvatar"),
-    ],
-)
-def test_docs_name_every_setting_that_differs_from_the_default(method: str, section: str) -> None:
-    rows = re.split(r"^## ", PAGE.read_text(), flags=re.MULTILINE)
-    (own,) = [text for text in rows if text.startswith(f"{section}\n")]
-    named = set(re.findall(r"`([a-z_.]+)`", "\n".join(line for line in own.splitlines() if line.startswith("| "))))
-    paper = METHODS[method].presets["paper"]
-    assert "method" in paper
-    for setting in names_in(paper["method"]):
-        parts = setting.split(".")
-        written = {".".join(parts[:end]) for end in range(1, len(parts) + 1)} | {parts[-1]}
-        assert named & written, setting
+def test_mono_gaussian_avatar_has_the_papers_sizes_rates_and_schedules() -> None:
+    """A head model of four times life size: radius .5, scales .025, rate 1e-4."""
+    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
+    assert (4 * paper.sphere_radius, 4 * paper.scale_gain, 4 * paper.means_rate.start) == (0.5, 0.025, 1e-4)
+    check_section("MonoGaussianAvatar")
 
 
-def test_docs_have_values_that_differ_from_the_default() -> None:
-    page = PAGE.read_text()
-    own = page[: page.index("## HeadGaS")]
-    table = dict(re.findall(r"^\| `([a-z_.]+)` \|(.*)\|$", own, flags=re.MULTILINE))
-    for name, words in (("density.max_gaussians", "200,000"), ("density.rounds", "294"), ("density.split_size", ".01")):
-        assert words in table[name]
-    default = TrainSettings()
-    assert PRESETS["paper"].changes
-    for name, value in PRESETS["paper"].changes.items():
-        assert table[name].split(" | ") == [f" {getattr(default, name)}", f"{value} "], name
+def test_epochs_and_units_of_mono_gaussian_avatar() -> None:
+    known = figures("mono_gaussian_avatar")
+    assert (known["epochs"], known["frames"], known["paper_lengths"]) == (120, 2_500, 4)
+    assert (known["points_for_all_frames"], known["halvings"]) == (12_800, [80, 100])
 
 
-def test_every_method_of_a_paper_has_the_preset() -> None:
-    without = [name for name, method in METHODS.items() if "paper" not in method.presets]
-    assert without == ["textured_mesh"], "which repeats no paper"
+def test_docs_have_the_counts_and_radii_of_both_schedules() -> None:
+    rows = re.findall(r"^\| (\d+) \| ([\d,]+) \| (\S+) \| ([\d,]+) \| (\S+) \|$", PAGE, flags=re.MULTILINE)
+    assert len(rows) == 9
+    for epoch, *cells in rows:
+        names: tuple[ScheduleName, ...] = ("paper", "code")
+        for name, count, radius in zip(names, cells[::2], cells[1::2], strict=True):
+            schedule, at = Schedule(name, 120, 400), int(epoch) / 120
+            assert f"{schedule.points_at(at):,}" == count, (epoch, name)
+            assert f"{4 * schedule.rendering_radius(at):.1e}".replace("e-0", "e-") == radius, (epoch, name)
 
 
-def test_docs_have_all_values_of_gaussian_avatars() -> None:
-    density, tuning = PAPER.density, PAPER.face_tuning
-    all_rounds, all_resets = rounds(STEPS), resets(STEPS)
-    judged_from = min(step for step in all_resets if step > all_rounds[0])
+def updates_of(paper: Any, steps: int) -> int:
+    """The number of optimiser steps of a run, whose frames a step are fewer the more points there are."""
+    schedule, done, updates = Schedule(paper.schedule, paper.epochs, paper.points), 0, 0
+    times = schedule.rounds()
+    points = [paper.points, *(min(paper.max_points, schedule.points_at(time)) for time in times)]
+    frames = [max(1, min(paper.frames_per_step, paper.points_per_step // count)) for count in points]
+    for end, some in zip([*(max(1, round(time * steps)) for time in times), steps], frames, strict=True):
+        more = max(0, -(-(end - done) // some))
+        done, updates = done + more * some, updates + more
+    return updates
 
-    def number(value: float) -> str:
-        return f"{value:g}".replace("0.", ".")
 
-    def power(rate: Rate) -> str:
-        assert rate.end is None
-        return f"{rate.start:.0e}".replace("e-0", "e-")
-
-    assert (PAPER.means_rate, PAPER.sh_degree, PAPER.sh_warmup) == (Rate(5e-3, 5e-5), 3, 4 / 600)
-    assert (PAPER.means_times_extent, density.size_unit) == (True, "extent")
-    assert density.size_start is None, "sizes are judged from the first reset after the first round"
-    assert (tuning.keep_mean_pose, tuning.keep_turns) == (False, False)
-    expected = {
-        "steps": f"{STEPS:,}",
-        "sh_degree": f"{PAPER.sh_degree}",
-        "sh_warmup": "1/150 of the run: degrees 1, 2, 3 from steps 1,000, 2,000, 3,000",
-        "means_rate": "5e-3 to 5e-5, log-linear",
-        "means_times_extent": "rate times E",
-        "density.start": f"step {all_rounds[0]:,}",
-        "density.rounds": f"{len(all_rounds)} rounds, one every {all_rounds[1] - all_rounds[0]:,} steps",
-        "density.stop": f"step {all_rounds[-1]:,}",
-        "density.grow_gradient": f"{density.grow_gradient:.0e}".replace("e-0", "e-"),
-        "density.size_unit": "extent",
-        "density.split_size": f"{number(density.split_size)} E",
-        "density.prune_size": f"{number(density.prune_size)} E, from step {judged_from:,}",
-        "density.prune_radius, density.rules.prune_wide": f"{density.prune_radius:g} pixels, "
-        + ("yes" if density.rules.prune_wide else "no"),
-        "density.prune_opacity": number(density.prune_opacity),
-        "density.opacity_resets": f"the same, to step {all_resets[-1]:,}",
-        "density.max_gaussians": f"{density.max_gaussians:,}",
-        "photometric": "the same",
-        "expression_rank": f"{PAPER.expression_rank}",
-        "appearance": PAPER.appearance,
-        "position_weight, position_threshold": f"{number(PAPER.position_weight)}, {PAPER.position_threshold:g}",
-        "scale_weight, scale_threshold": f"{PAPER.scale_weight:g}, {number(PAPER.scale_threshold)}",
-        "face_tuning.expression": power(tuning.expression),
-        "face_tuning.joints": power(tuning.joints),
-        "face_tuning.head_rotation": power(tuning.head_rotation),
-        "face_tuning.head_translation": power(tuning.head_translation),
-        "face_tuning.keep_mean_pose, face_tuning.keep_turns": "no",
+def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_points() -> None:
+    method, small, paper = "mono_gaussian_avatar", PRESETS["paper-cpu"], PRESETS["paper"]
+    config: Any = small.config(method)
+    assert replace(config, max_points=100_000) == paper.config(method)
+    settings = small.settings_of(method)
+    assert replace(settings, steps=300_000) == paper.settings_of(method)
+    assert [name for name in METHODS if "paper-cpu" in METHODS[name].presets] == [method]
+    own = PAGE.split("\n### On a processor\n")[1].split("\n## ")[0]
+    frames = settings.steps // config.epochs
+    assert dict(re.findall(r"^\| `([a-z_]+)` \| (.*) \|$", own, flags=re.MULTILINE)) == {
+        "steps": f"300,000: 2,500 frames an epoch | {settings.steps:,}: {frames} frames an epoch",
+        "max_points": f"100,000 | {config.max_points:,}",
     }
-    assert values_of("GaussianAvatars") == expected
-
-
-# -- the extent of the cameras ----------------------------------------------------------------------------------------
-
-
-def camera_at(*center: float) -> Camera:
-    viewmat = torch.eye(4)
-    viewmat[:3, 3] = -torch.tensor(center)
-    return Camera(torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), viewmat, 16, 16)
-
-
-def test_extent_is_that_of_the_training_cameras() -> None:
-    _, sequence = toy_sequence(2, 16)
-    cameras = (camera_at(0, 0, 0), camera_at(4, 0, 0), camera_at(2, 30, 0))
-    rig = replace(sequence, tracking=replace(sequence.tracking, cameras=cameras))
-    assert camera_extent([rig], [Frame(0, 0, 0), Frame(0, 1, 0), Frame(0, 0, 1)]) == pytest.approx(1.1 * 2)
-    assert camera_extent([rig], [Frame(0, 0, 0)]) == FOOTAGE.least_extent == 0.5
-    angles = torch.linspace(-math.pi / 4, math.pi / 4, 16).tolist()
-    ring = tuple(camera_at(math.sin(angle), 0, math.cos(angle)) for angle in angles)
-    arc = replace(sequence, tracking=replace(sequence.tracking, cameras=ring))
-    assert camera_extent([arc], [Frame(0, 0, index) for index in range(16)]) == pytest.approx(0.8, abs=0.02)
-    assert (PAPER.density.split_size, PAPER.density.prune_size) == (0.005 / FOOTAGE.least_extent, 0.05 / 0.5)
-    near = replace(sequence, tracking=replace(sequence.tracking, cameras=(camera_at(0, 0, 0), camera_at(0.1, 0, 0))))
-    assert camera_extent([near], [Frame(0, 0, 0), Frame(0, 0, 1)]) == FOOTAGE.least_extent
-
-
-def test_extent_reaches_rates_in_its_unit_only() -> None:
-    for config, factor in ((plain_gaussian_avatars(), 1), (plain_gaussian_avatars(means_times_extent=True), 3)):
-        moved = []
-        for extent in (1.0, 3.0):
-            torch.manual_seed(0)
-            avatar = GaussianAvatars(config, toy_face_model(), toy_face(5))
-            store = avatar.gaussian_store()
-            (store["means"].sum() + store["log_scales"].sum()).backward()
-            Adam().step(avatar.parameter_groups(), Progress(0, 10, extent=extent))
-            moved.append((float(store["means"].detach().abs().max()), float(store["log_scales"].detach().abs().max())))
-        assert moved[1][0] == pytest.approx(factor * moved[0][0])
-        assert moved[1][1] == moved[0][1]
-
-
-def test_a_stopped_run_of_the_preset_ends_as_if_it_had_not_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mien.training.trainer.camera_extent", lambda *_: 1.7)
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    settings = plain_run(steps=60, checkpoint_every=20, split="none")
-    whole = train([sequence], face_model, PAPER, settings, tmp_path / "whole")
-    train([sequence], face_model, PAPER, settings, tmp_path / "stopped")
-    for file in (*(tmp_path / "stopped" / "checkpoints").glob("*60.safetensors"), tmp_path / "stopped/training.json"):
-        file.unlink()
-    again = train([sequence], face_model, PAPER, settings, tmp_path / "stopped")
-    for name, tensor in whole.state_dict().items():
-        assert torch.equal(tensor, again.state_dict()[name]), name
+    ((written, of_paper),) = re.findall(r"about ([\d,]+) updates instead of about ([\d,]+)", own)
+    assert updates_of(config, settings.steps) == pytest.approx(int(written), rel=0.01)
+    assert updates_of(paper.config(method), 300_000) == pytest.approx(int(of_paper.replace(",", "")), rel=0.01)
