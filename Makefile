@@ -1,4 +1,4 @@
-# make setup | web-packages | chromium | web | demo | test | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | release | elsewhere | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | web-packages | chromium | web | demo | test | test-long | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | release | elsewhere | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
@@ -11,7 +11,7 @@ UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
+.PHONY: setup landmarker web-packages chromium web build demo test test-long test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -71,10 +71,22 @@ web: web/node_modules/.installed
 demo: setup
 	$(BIN)/mien demo --out out/demo
 
-# One process a core, each with one thread (tests/conftest.py says how many). Tests that follow a clock come last, with nothing beside them.
+# Everything that a change can break: one process a core, each with one thread (tests/conftest.py says how many).
 test: setup web-packages chromium
-	MIEN_THREADS=1 $(BIN)/pytest -n auto -m "not alone"
-	MIEN_THREADS=1 $(BIN)/pytest -m alone
+	MIEN_THREADS=1 $(BIN)/pytest -n auto -m "not long"
+
+# Campaigns, which take hours. SAMPLE=1 runs a sample of each, as CI does; its seed is the date unless SEED says otherwise.
+SAMPLE ?=
+SEED ?= $(if $(SAMPLE),$(shell date -u +%Y%m%d),1)
+test-long: setup web-packages chromium batch-engines
+	@echo "test-long: one again with SEED=$(SEED)$(if $(SAMPLE), SAMPLE=$(SAMPLE))"
+	$(MAKE) sanitize
+	$(MAKE) fuzz SEED=$(SEED) $(if $(SAMPLE),MINUTES=1 CALLS=3000)
+	$(MAKE) kills SEED=$(SEED) $(if $(SAMPLE),KILLS=4)
+	$(MAKE) mutate SEED=$(SEED) $(if $(SAMPLE),MUTATIONS=4)
+	$(MAKE) test-exact
+	$(MAKE) test-312
+	MIEN_SEED=$(SEED) MIEN_THREADS=1 $(BIN)/pytest -n auto -m long
 
 # A broad and fast part of the suite on Python 3.12, in an environment of its own. All of it: make test VENV=.venv312 PYTHON=python3.12
 PART := needs places arrays files startup cli rasterize rasterize_contract training_native training_resume runtime export motion
@@ -99,7 +111,6 @@ sanitize:
 
 # Every native function with random arguments under AddressSanitizer and UndefinedBehaviorSanitizer.
 CALLS ?= 50000
-SEED ?= 1
 SANITIZED := build/sanitize-native
 fuzz-native: setup
 	$(BIN)/cmake -S . -B $(SANITIZED) -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja) -DCMAKE_BUILD_TYPE=Debug -DMIEN_SANITIZE=ON \
@@ -127,8 +138,10 @@ kills: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing.kills --kills $(KILLS) --seed $(SEED) --findings out/fuzz/kills.jsonl
 
 # Mistakes put into copies of the code, one at a time: the tests must catch 95 % of them. About ten minutes on two free cores.
+# MUTATIONS tries that many of them, drawn by SEED.
+MUTATIONS ?=
 mutate: setup web-packages
-	PYTHONPATH=tests $(BIN)/python -m mutations --workers 2 --json out/mutate/verdicts.json
+	PYTHONPATH=tests $(BIN)/python -m mutations --workers 2 --json out/mutate/verdicts.json $(if $(MUTATIONS),--sample $(MUTATIONS) --seed $(SEED))
 
 # pyright's wrapper asks the package index for a newer version unless it is told not to.
 lint: setup

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import random
 import re
 import shutil
 import sys
@@ -24,10 +25,14 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose file or text has this")
     parser.add_argument("--workers", type=int, default=1, help="copies of the project that are mutated at once")
     parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write all verdicts here")
+    parser.add_argument("--sample", type=int, default=None, metavar="N", help="try only N of them, drawn by --seed")
+    parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     cases = [case for case in read_cases() if asked.only in f"{case.file} {case.old}"]
     if not cases:
         parser.error(f"--only {asked.only}: no mutation has this in its file or text")
+    if asked.sample is not None:
+        cases = random.Random(asked.seed).sample(cases, min(asked.sample, len(cases)))
     folder = Path(tempfile.mkdtemp(prefix="mien-mutate-"))
     try:
         verdicts = _try_all(cases, folder, asked.workers)
