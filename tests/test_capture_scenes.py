@@ -1,54 +1,99 @@
-"""Drawn people are captured on the command line: two in one picture, and three scenes with two cuts."""
+"""Videos with cuts or several people are divided into parts, and each face is followed by itself.
+
+Drawn people stand in front of plain walls, so that the true landmarks are known.
+"""
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from capture_helpers import face_picture, tree_bytes
 from mien.avatar import DEFAULT_METHOD
-from mien.capture import read_capture
+from mien.capture import CaptureSettings, capture_video, capture_video_parts, read_capture
+from mien.capture.crop import Crop
+from mien.capture.faces import MAX_FACES, LandmarkDetector
+from mien.capture.parts import find_cuts
+from mien.capture.people import choose_person
+from mien.capture.process import LandmarkFollower
+from mien.capture.survey import Survey
 from mien.capture.video import write_video
 from mien.cli import main
+from mien.commands.stages.capturing import run_capture_stage
+from mien.errors import UserError
 from mien.lab.synthetic import SyntheticRecipe, SyntheticScene
+from mien.workspace import Workspace
 
-FPS = 10.0
+FPS, FRAMES = 10.0, 11
 WIDTH, HEIGHT = 400, 240
 RECIPE = SyntheticRecipe(fps=FPS, supersample=1, texture_size=256, rotation=(12.0, 6.0, 4.0))
 
 
 class Actor:
-    """Drawn person that can be put in front of any wall."""
+    """Drawn person that can be put in front of any wall. After the last of its frames it goes back to the first."""
 
-    def __init__(self, seed: int, seconds: float, side: int = 192) -> None:
+    def __init__(self, seed: int, side: int = 192) -> None:
         self.side = side
-        recipe = replace(RECIPE, seconds=seconds, width=side, height=side)
-        scene = SyntheticScene(recipe, seed)
+        scene = SyntheticScene(replace(RECIPE, seconds=FRAMES / FPS, width=side, height=side), seed)
         self.frames = list(scene.frames())
         self.landmarks = scene.landmarks()
 
     def put(self, picture: np.ndarray, timestep: int, left: int, top: int) -> np.ndarray:
         """Draw the person onto a picture, also beyond its border, and return the true landmarks in it."""
+        timestep = abs((timestep - FRAMES + 1) % (2 * FRAMES - 2) - FRAMES + 1)
         frame = self.frames[timestep]
         first, last = max(0, -left), min(self.side, picture.shape[1] - left)
         if first < last:
             place = (slice(top, top + self.side), slice(left + first, left + last))
             alpha = frame.matte[:, first:last, None] / 255
-            mixed = frame.image[:, first:last] * alpha + picture[place] * (1 - alpha)
-            picture[place] = np.rint(mixed).astype(np.uint8)
+            picture[place] = np.rint(frame.image[:, first:last] * alpha + picture[place] * (1 - alpha))
         return self.landmarks[timestep] + [left, top]
 
 
-def wall(level: tuple[int, int, int]) -> np.ndarray:
+def wall(*level: int) -> np.ndarray:
     """Return a plain wall that is darker below."""
     shade = np.linspace(1.1, 0.8, HEIGHT)[:, None, None]
     return np.rint(np.broadcast_to(np.array(level) * shade, (HEIGHT, WIDTH, 3))).clip(0, 255).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
-def ann() -> Actor:
-    return Actor(3, 3.3)
+def films(made_once: Callable[..., Path]) -> Path:
+    """Return a folder with clip.mp4, which has shots of 11, 3, 11 and 10 frames, the last of them without a face, and
+    two.mp4 with two people, and the true landmarks of both."""
+
+    def make(folder: Path) -> None:
+        ann, bob = Actor(3), Actor(8, side=96)
+        pictures, truth = [], []
+        for count, level, left, top in (
+            (FRAMES, (180, 170, 150), 20, 30), (3, (60, 80, 110), 190, 44), (FRAMES, (120, 150, 110), 100, 10),
+        ):  # fmt: skip
+            for _ in range(count):
+                picture = wall(*level)
+                truth.append(ann.put(picture, len(pictures), left, top))
+                pictures.append(picture)
+        write_video(folder / "clip.mp4", iter(pictures + [wall(40, 90, 160)] * 10), FPS, crf=12)
+        np.save(folder / "clip.npy", truth)
+        pictures, truth = [], []
+        # She walks out to the left, stays away for half a second, and comes back; Bob, who is smaller, stays.
+        lefts = [10] * 6 + [10 - 50 * step for step in range(1, 5)] + [-200] * 5
+        for timestep, left in enumerate([*lefts, *(-190 + 50 * step for step in range(5)), *[10] * 4]):
+            picture = wall(120, 130, 140)
+            bob.put(picture, timestep, 270, 100)
+            truth.append(ann.put(picture, timestep, left, 24))
+            pictures.append(picture)
+        write_video(folder / "two.mp4", iter(pictures), FPS, crf=12)
+        np.save(folder / "two.npy", truth)
+
+    return made_once("capture_films", make)
+
+
+@pytest.fixture(scope="module")
+def shots(films: Path) -> Path:
+    return films / "clip.mp4"
 
 
 def misses(capture_dir: Path, truth: np.ndarray) -> np.ndarray:
@@ -59,77 +104,194 @@ def misses(capture_dir: Path, truth: np.ndarray) -> np.ndarray:
     return np.median(np.linalg.norm(found - truth, axis=-1), axis=1)
 
 
-@pytest.mark.slow
-def test_of_two_people_the_nearer_is_followed_and_nobody_else_while_she_is_away(
-    ann: Actor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bob = Actor(8, 2.4, side=96)
-    pictures, truth = [], []
-    # She walks out to the left, stays away for half a second, and comes back; Bob, who is smaller, stays.
-    lefts = [10] * 6 + [10 - 50 * step for step in range(1, 5)] + [-200] * 5 + [-190 + 50 * step for step in range(5)]
-    for timestep, left in enumerate(lefts + [10] * 4):
-        picture = wall((120, 130, 140))
-        bob.put(picture, timestep, 270, 100)
-        truth.append(ann.put(picture, timestep, left, 24))
-        pictures.append(picture)
-    write_video(tmp_path / "two.mp4", iter(pictures), FPS, crf=12)
-    # Uncropped, Bob is in all of the captured pictures.
-    whole = ("--capture.crop", "none", "--capture.size", "400")
-    assert main(["capture", str(tmp_path / "two.mp4"), "--out", str(tmp_path / "out"), *whole]) == 0
+def test_each_long_shot_becomes_a_sequence(shots, tmp_path, capsys, monkeypatch):
+    workspace, settings, names = Workspace(tmp_path), CaptureSettings(size=160), ["clip-1", "clip-2"]
+    assert run_capture_stage(workspace, shots, None, settings) == names
     said = capsys.readouterr().err
-    assert "several faces in" in said
-    capture = read_capture(tmp_path / "out/sequences/two/capture")
-    away = slice(9, 16)
-    assert not capture.valid[away].any()
-    here = [*range(7), *range(19, len(pictures))]
-    assert capture.valid[here].all()
-    wrong = misses(tmp_path / "out/sequences/two/capture", np.array(truth))
-    assert np.nanmax(wrong) < 5, wrong
-
-
-@pytest.fixture(scope="module")
-def three_scenes(ann: Actor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """Write eleven frames (1.1 s) in each of three rooms, at three places. Return the path and the true landmarks."""
-    pictures, truth = [], []
-    for level, left, top in (((180, 170, 150), 20, 30), ((60, 80, 110), 190, 44), ((120, 150, 110), 100, 10)):
-        for _ in range(11):
-            picture = wall(level)
-            truth.append(ann.put(picture, len(pictures), left, top))
-            pictures.append(picture)
-    path = tmp_path_factory.mktemp("scenes") / "scenes.mp4"
-    write_video(path, iter(pictures), FPS, crf=12)
-    return path, np.array(truth)
-
-
-@pytest.mark.slow
-def test_three_scenes_become_three_sequences(
-    three_scenes: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    video, truth = three_scenes
-    assert main(["capture", str(video), "--out", str(tmp_path / "out"), "--capture.size", "160"]) == 0
-    assert "cuts to another shot at 1.1, 2.2 s: scenes-1, scenes-2, scenes-3" in capsys.readouterr().err
-    folders = sorted((tmp_path / "out/sequences").iterdir())
-    assert [folder.name for folder in folders] == ["scenes-1", "scenes-2", "scenes-3"]
-    for part, folder in enumerate(folders):
-        capture = read_capture(folder / "capture")
-        assert capture.timesteps == 11
+    assert "cuts to another shot at 1.1, 1.4, 2.5 s" in said
+    assert "1 parts shorter than 1 s are left out, at 1.1 s" in said
+    assert "1 parts without a face are left out, at 2.5 s" in said
+    assert workspace.sequence_names() == names
+    assert sorted(entry.name for entry in (tmp_path / "sequences").iterdir()) == names
+    truth, crops = np.load(shots.with_suffix(".npy")), []
+    for name, first in zip(names, (0, 14), strict=True):
+        folder = workspace.sequence_dir(name) / "capture"
+        capture = read_capture(folder)
+        assert capture.timesteps == FRAMES
         assert capture.valid.all()
-        assert (capture.source["first_frame"], capture.timestamps[0]) == (11 * part, 0)
+        assert (capture.source["first_frame"], capture.timestamps[0]) == (first, 0)
         # No picture belongs to the next scene: the corners of the crop show only this scene's wall.
-        corners = capture.images[:, 0, 2:8, 2:8].reshape(11, -1)
-        assert np.ptp(np.median(corners, axis=1)) < 6
-        assert np.nanmax(misses(folder / "capture", truth[11 * part : 11 * (part + 1)])) < 5
+        assert np.ptp(np.median(capture.images[:, 0, 2:8, 2:8].reshape(FRAMES, -1), axis=1)) < 6
+        assert np.nanmax(misses(folder, truth[first : first + FRAMES])) < 5
+        crops.append(capture.source["crop"])
+    assert crops[0] != crops[1]
+    # Functions that would work again are not called.
+    monkeypatch.setattr("mien.capture.from_video.survey_source", None)
+    assert run_capture_stage(workspace, shots, None, settings) == names
 
 
-@pytest.mark.slow
+def test_cuts_can_be_ignored_and_short_parts_kept(shots, tmp_path, capsys):
+    (whole,) = capture_video_parts(shots, tmp_path, CaptureSettings(size=64, cuts=False, max_frames=17))
+    assert (whole.name, whole.timesteps) == ("clip", 17)
+    assert "left over" not in capsys.readouterr().err
+    parts = capture_video_parts(shots, tmp_path, CaptureSettings(size=64, shortest_part=0.2, max_frames=17))
+    assert [(part.name, part.timesteps) for part in parts] == [("clip-1", 11), ("clip-2", 3), ("clip-3", 3)]
+    assert "left over from an earlier capture of clip" in capsys.readouterr().err
+    with pytest.raises(UserError, match=r"--capture.shortest-part, or --capture.no-cuts"):
+        capture_video_parts(shots, tmp_path / "none", CaptureSettings(shortest_part=5.0, max_frames=17))
+    assert not (tmp_path / "none").exists()
+    capture_video(shots, tmp_path / "one", CaptureSettings(size=64, max_frames=17))
+    assert "tracking may fail there" in capsys.readouterr().err
+
+
+def test_interrupted_parts_go_on_to_the_same_bytes(shots, tmp_path, monkeypatch):
+    settings = CaptureSettings(size=64, shortest_part=0.2, max_frames=17)
+    capture_video_parts(shots, tmp_path / "straight", settings)
+    from mien.capture import from_video
+
+    original, calls = from_video.process_part, []
+
+    def stop_at_the_second(*arguments, **options):
+        calls.append(arguments[1].name)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(from_video, "process_part", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        capture_video_parts(shots, tmp_path / "interrupted", settings)
+    capture_video_parts(shots, tmp_path / "interrupted", settings)
+    assert calls == ["clip-1", "clip-2", "clip-2", "clip-3"]
+    assert tree_bytes(tmp_path / "interrupted") == tree_bytes(tmp_path / "straight")
+
+
+@pytest.mark.unchecked
 @pytest.mark.usefixtures("short_films")
-def test_a_clip_with_cuts_becomes_an_avatar(three_scenes: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    arguments = ["create", str(three_scenes[0]), "--out", str(tmp_path / "out"), "--capture.size", "128"]
+def test_a_clip_with_cuts_becomes_an_avatar(shots, tmp_path):
+    arguments = ["create", str(shots), "--out", str(tmp_path / "out"), "--capture.size", "96"]
     # test_subject_commands tracks several scenes together by their pixels.
-    arguments += ["--tracking.schedule", "landmarks", "--tracking.keyframes", "4", "--overlay", "none"]
-    assert main([*arguments, "--steps", "5", "--preset", "draft", "--hold-out", "scenes-2"]) == 0
+    arguments += ["--tracking.schedule", "landmarks", "--tracking.keyframes", "2", "--overlay", "none"]
+    assert main([*arguments, "--steps", "2", "--preset", "draft", "--hold-out", "clip-2"]) == 0
     run = tmp_path / "out/runs" / DEFAULT_METHOD
     trained = json.loads((run / "config.json").read_text())["data"]
-    assert [entry["sequence"] for entry in trained] == ["scenes-1", "scenes-2", "scenes-3"]
+    assert [entry["sequence"] for entry in trained] == ["clip-1", "clip-2"]
     metrics = json.loads((run / "metrics.json").read_text())
-    assert metrics["protocols"]["self_reenactment_sequence"]["frames"] == 11
+    assert metrics["protocols"]["self_reenactment_sequence"]["frames"] == FRAMES
+
+
+def thumbnails_of(pictures: list[np.ndarray]) -> np.ndarray:
+    return np.stack([cv2.resize(picture, (32, 18), interpolation=cv2.INTER_AREA) for picture in pictures])
+
+
+def scene(face: np.ndarray, left: int, top: int, level: int) -> np.ndarray:
+    picture = np.full((270, 480, 3), level, np.uint8)
+    picture[top : top + face.shape[0], left : left + face.shape[1]] = face
+    return picture
+
+
+def test_flashes_motion_and_light_are_no_cuts(test_data):
+    face = face_picture(test_data, 150)
+    still = [scene(face, 20, 50, 120)] * 20
+    other = [scene(face, 200, 60, 60)] * 20
+    flash = [np.full((270, 480, 3), 250, np.uint8)] * 2
+    blended = [((still[0].astype(int) + other[0]) // 2).astype(np.uint8)]
+    fast = [scene(face, 20 + 30 * t, 50, 120) for t in range(8)]
+    brighter = [np.clip(picture * 1.3, 0, 255).astype(np.uint8) for picture in still]
+    assert find_cuts(thumbnails_of(still + other)) == [20]
+    assert find_cuts(thumbnails_of(still + flash + still)) == []
+    assert set(find_cuts(thumbnails_of(still + blended + other))) & {20, 21}
+    assert find_cuts(thumbnails_of(still + fast + [fast[-1]] * 10)) == []
+    assert find_cuts(thumbnails_of(still + brighter)) == []
+    assert find_cuts(thumbnails_of(still[:1])) == []
+
+
+def survey_of(frames: list[list[tuple[float, float, float, float]]]) -> Survey:
+    """Return a survey of faces given as (centre x, centre y, side, colour), at 25 frames a second."""
+    count = len(frames)
+    boxes, looks = np.full((count, MAX_FACES, 4), np.nan), np.full((count, MAX_FACES, 27), np.nan)
+    for frame, faces in enumerate(frames):
+        for place, (x, y, side, color) in enumerate(faces):
+            boxes[frame, place] = [x - side / 2, y - side / 2, x + side / 2, y + side / 2]
+            looks[frame, place] = color
+    numbers = np.arange(count, dtype=np.int64)
+    thumbnails = np.zeros((count, 18, 32, 3), np.uint8)
+    plain = np.zeros(count, bool), np.full(count, np.nan)
+    return Survey(numbers, numbers / 25, boxes, looks, thumbnails, *plain, np.array([640, 360], np.int64))
+
+
+ANN, BOB = (0.3, 0.5, 0.3, 0.7), (0.75, 0.5, 0.2, 0.4)
+
+
+def centers(person) -> list[float]:
+    return np.round((person.boxes[:, 0] + person.boxes[:, 2]) / 2, 2).tolist()
+
+
+def test_the_largest_and_most_persistent_is_followed():
+    assert centers(choose_person(survey_of([[BOB, ANN]] * 10))) == [0.3] * 10
+    # A larger face that passes by does not win.
+    passing = (0.5, 0.5, 0.45, 0.5)
+    person = choose_person(survey_of([[ANN]] * 40 + [[passing, ANN]] * 4 + [[ANN]] * 10))
+    assert centers(person) == [0.3] * 54
+    assert np.flatnonzero(person.crowded).tolist() == [40, 41, 42, 43]
+    # A false detection, in a single frame, is nobody.
+    person = choose_person(survey_of([[ANN]] * 20 + [[ANN, (0.9, 0.1, 0.05, 0.1)]] + [[ANN]] * 20))
+    assert not person.crowded.any()
+
+
+def test_nobody_takes_the_place_of_who_is_away():
+    frames = [[ANN, BOB]] * 30 + [[BOB]] * 40 + [[ANN, BOB]] * 30
+    person = choose_person(survey_of(frames))
+    assert person.seen.tolist() == [True] * 30 + [False] * 40 + [True] * 30
+    assert person.crowded.all()
+    # Bob moves to where Ann was; he was seen beside her, so he is not her.
+    moved = [[(0.75 - 0.025 * step, *BOB[1:])] for step in range(18)]
+    person = choose_person(survey_of([[ANN, BOB]] * 30 + moved))
+    assert person.seen.tolist() == [True] * 30 + [False] * 18
+    # A stranger who comes later to the same place has other colours.
+    stranger = (*ANN[:3], 0.3)
+    person = choose_person(survey_of([[ANN]] * 40 + [[]] * 40 + [[stranger]] * 20))
+    assert person.seen.tolist() == [True] * 40 + [False] * 60
+    person = choose_person(survey_of([[ANN]] * 40 + [[]] * 40 + [[ANN]] * 20))
+    assert person.seen.tolist() == [True] * 40 + [False] * 40 + [True] * 20
+    assert not person.crowded.any()
+
+
+class _ScriptedDetector(LandmarkDetector):
+    """Detector that finds what its script says."""
+
+    def __init__(self, script: Sequence[Sequence[float]]) -> None:
+        self._script = iter(script)
+
+    def detect(self, image: np.ndarray) -> np.ndarray:
+        square = np.array([[-40.0, -40.0], [40.0, 40.0]])
+        found = [square + [x, 180] for x in next(self._script)]
+        return np.array(found).reshape(-1, 2, 2)
+
+
+def test_landmarks_of_others_are_refused():
+    """Landmarks on another person are refused.
+
+    Ann's centre is at 192 pixels, Bob's at 480; Ann is sometimes not found.
+    """
+    survey = survey_of([[ANN, BOB], [BOB], [BOB], [ANN, BOB], [BOB], [ANN, BOB]])
+    script = [[480, 190], [480], [185, 480], [480], [193], [480, 250]]
+    follower = LandmarkFollower(
+        _ScriptedDetector(script), survey, choose_person(survey), Crop(0, 0, 640, 360, 640, 360)
+    )
+    found = [follower.find(timestep, np.zeros((360, 640, 3), np.uint8)) for timestep in range(6)]
+    middles = [None if face is None else float(face[:, 0].mean()) for face in found]
+    assert middles == [190, None, 185, None, 193, 250]
+
+
+def test_of_two_people_the_nearer_is_followed_and_nobody_else_while_she_is_away(films, tmp_path, capsys):
+    # Uncropped, Bob is in all of the captured pictures.
+    whole = ("--capture.crop", "none", "--capture.size", "400")
+    assert main(["capture", str(films / "two.mp4"), "--out", str(tmp_path / "out"), *whole]) == 0
+    assert "several faces in" in capsys.readouterr().err
+    folder = tmp_path / "out/sequences/two/capture"
+    valid = read_capture(folder).valid
+    assert not valid[9:16].any()
+    assert valid[:7].all()
+    assert valid[19:].all()
+    wrong = misses(folder, np.load(films / "two.npy"))
+    assert np.nanmax(wrong) < 5, wrong
