@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,7 @@ class ForkServer:
         *arguments: Any,
         cwd: Path | None = None,
         env: dict[str, str] | None = None,
+        path: Sequence[Path] = (),
         exits: bool = False,
     ) -> Forked:
         """Start a process that calls a function with arguments that json can carry.
@@ -97,13 +99,14 @@ class ForkServer:
             arguments: Its arguments.
             cwd: The folder of the process; that of the tests without it.
             env: Variables that are set on top of today's.
+            path: Folders in which Python finds more modules and packages, as PYTHONPATH names them.
             exits: Whether what the function returns is the exit code.
         """
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()
         request = {"function": function, "arguments": arguments, "cwd": str(cwd or Path.cwd()), "exits": exits}
-        request |= {"env": {**os.environ, **(env or {})}, "folder": str(folder)}
+        request |= {"env": {**os.environ, **(env or {})}, "folder": str(folder), "path": list(map(str, path))}
         assert self._server.stdin is not None
         assert self._server.stdout is not None
         print(json.dumps(request), file=self._server.stdin, flush=True)
@@ -144,6 +147,7 @@ def _serve() -> None:
             os.close(answers)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup lets the server ignore it
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
             _become(request)
         folders[pid] = Path(request["folder"])
@@ -156,6 +160,7 @@ def _become(request: dict[str, Any]) -> None:
     os.environ.clear()
     os.environ.update(request["env"])
     os.chdir(request["cwd"])
+    sys.path[:0] = request["path"]
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     for number, name in ((1, "stdout"), (2, "stderr")):

@@ -27,7 +27,7 @@ def test_a_head_of_gnm_gets_landmarks_and_regions_by_the_detector(
     shutil.copytree(cache_folder() / "face_models", tmp_path / "cache" / "face_models")
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     # The usual 320 pictures of 512 pixels, and the search over all triangles in 16 of them, take minutes.
-    monkeypatch.setattr(stage, "_FIRST_PICTURES", 10)
+    monkeypatch.setattr(stage, "FIRST_PICTURES", 10)
     monkeypatch.setattr(stage, "EmbeddingSettings", partial(EmbeddingSettings, pictures=14, size=320))
     few = replace(embedding.TRACKING.embedding, coarse_views=4, coarse_subdivisions=1)
     monkeypatch.setattr(embedding, "TRACKING", replace(embedding.TRACKING, embedding=few))

@@ -25,7 +25,7 @@ from tracking_case import capture_of, make_tracking_case
 @pytest.fixture
 def tiny_limit(monkeypatch: pytest.MonkeyPatch) -> int:
     """Limit the memory of mapped pictures to a mebibyte."""
-    monkeypatch.setattr(picture_files, "_MAX_KEPT_BYTES", MIB)
+    monkeypatch.setattr(picture_files, "MAX_KEPT_BYTES", MIB)
     return MIB
 
 
@@ -89,7 +89,7 @@ def test_few_pictures_stay_in_memory_and_many_are_the_same(tmp_path: Path, monke
     pictures = np.random.default_rng(0).integers(0, 256, (3, 2, 20, 31), dtype=np.uint8)
     arrays = []
     for kept in (1 << 20, 100):
-        monkeypatch.setattr(picture_files, "_MAX_KEPT_BYTES", kept)
+        monkeypatch.setattr(picture_files, "MAX_KEPT_BYTES", kept)
         stack = PictureStack(pictures.shape, tmp_path)
         for timestep, camera in ((2, 1), (0, 0), (1, 1), (0, 1), (1, 0), (2, 0)):
             stack.write(timestep, camera, pictures[timestep, camera])
@@ -114,10 +114,10 @@ def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytes
             return original(self, state, *arguments, **options)
 
         monkeypatch.setattr(LandmarkModel, name, watched)
-    monkeypatch.setattr(term, "_PROJECTED", 16)
-    monkeypatch.setattr(term, "_CHUNK", 14)
-    monkeypatch.setattr(stages, "_FRAMES_AT_ONCE", 18)
-    monkeypatch.setattr(solver, "_SEGMENT", 5)
+    monkeypatch.setattr(term, "PROJECTED", 16)
+    monkeypatch.setattr(term, "CHUNK", 14)
+    monkeypatch.setattr(stages, "FRAMES_AT_ONCE", 18)
+    monkeypatch.setattr(solver, "SEGMENT", 5)
     found = track(case.capture, model)
     assert largest == {"project": 16, "linearize": 14}
     for name, tensor in expected.face.tensors().items():
@@ -125,7 +125,7 @@ def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytes
 
 
 def test_the_chain_holds_the_factors_of_one_segment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solver, "_SEGMENT", 4)
+    monkeypatch.setattr(solver, "SEGMENT", 4)
     alive: weakref.WeakSet[torch.Tensor] = weakref.WeakSet()
     most = 0
     cholesky = torch.linalg.cholesky
@@ -148,6 +148,6 @@ def test_the_chain_holds_the_factors_of_one_segment(monkeypatch: pytest.MonkeyPa
     for index in range(blocks - 1):
         here, there = slice(size * index, size * (index + 1)), slice(size * (index + 1), size * (index + 2))
         dense[here, there], dense[there, here] = upper[index], upper[index].T
-    solution = solver._solve_tridiagonal(own.__getitem__, upper.__getitem__, right)
+    solution = solver.solve_tridiagonal(own.__getitem__, upper.__getitem__, right)
     torch.testing.assert_close(dense @ solution.flatten(), right.flatten())
     assert most <= 6, most

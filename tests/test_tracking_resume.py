@@ -28,14 +28,14 @@ def case() -> PhotometricCase:
 
 @pytest.fixture(autouse=True)
 def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages, "_FRAMES_AT_ONCE", 5)
+    monkeypatch.setattr(stages, "FRAMES_AT_ONCE", 5)
     monkeypatch.setattr(refine, "_FRAMES_AT_ONCE", 3)
 
 
 @pytest.fixture(scope="module")
 def expected(case: PhotometricCase) -> Tracking:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(stages, "_FRAMES_AT_ONCE", 5)
+        patched.setattr(stages, "FRAMES_AT_ONCE", 5)
         patched.setattr(refine, "_FRAMES_AT_ONCE", 3)
         return track_subject([case.capture], case.model, FAST)[0]
 

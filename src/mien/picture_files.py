@@ -20,7 +20,7 @@ from mien.errors import UserError
 from mien.files import cannot_write, write_atomically
 from mien.inside import open_to_read
 
-_MAX_KEPT_BYTES = 256 << 20
+MAX_KEPT_BYTES = 256 << 20
 """Number of bytes that a map hands out before it gives its pages back, and largest stack that is held in memory."""
 _PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _MAX_PNG_HEADER_BYTES = 1 << 16
@@ -55,7 +55,7 @@ class PictureMap(np.memmap):
         found = super().__getitem__(index)
         if isinstance(found, np.ndarray) and self._tally is not None:
             self._tally.handed_out += found.nbytes
-            if self._tally.handed_out > _MAX_KEPT_BYTES:
+            if self._tally.handed_out > MAX_KEPT_BYTES:
                 self._tally.handed_out = 0
                 self._give_back()
         return found
@@ -89,7 +89,7 @@ class PictureStack:
         """
         self._shape, self._folder = shape, folder or Path(tempfile.gettempdir())
         self._file = None
-        if math.prod(shape) <= _MAX_KEPT_BYTES:
+        if math.prod(shape) <= MAX_KEPT_BYTES:
             self._array = np.zeros(shape, np.uint8)
             return
         try:

@@ -37,7 +37,7 @@ _KINDS: dict[int, type[BaseException]] = {
 }
 _REPEAT_SECONDS = 0.05
 """Time after which a stop that a library has dropped is repeated."""
-_DEAF_SECONDS = 10.0
+DEAF_SECONDS = 10.0
 """Time after a stop in which signals are ignored. Later ones count, since a library may have swallowed the first."""
 
 
@@ -84,7 +84,7 @@ def orderly_stops() -> Iterator[None]:
 
     def stop(number: int, frame: object) -> None:
         now = time.monotonic()
-        if not asked or now - asked[-1][1] > _DEAF_SECONDS:
+        if not asked or now - asked[-1][1] > DEAF_SECONDS:
             asked.append((number, now))
             raise _KINDS[number]
 

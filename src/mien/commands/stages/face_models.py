@@ -16,7 +16,7 @@ from mien.progress import say
 from mien.storage import file_digest
 from mien.tracking.landmarks import EmbeddingSettings, embed_landmarks, with_regions_by_landmarks
 
-_FIRST_PICTURES = 80
+FIRST_PICTURES = 80
 """Number of pictures in the first round, when lips and brows are not known. The second round paints these, and uses the
 number in `EmbeddingSettings`."""
 
@@ -83,7 +83,7 @@ def _calibrated(model: FaceModel) -> FaceModel:
         f"{len(model.expression_basis)} expression directions; placing its landmarks, once"
     )
     settings = EmbeddingSettings()
-    model = replace(model, landmarks=embed_landmarks(model, replace(settings, pictures=_FIRST_PICTURES))[0])
+    model = replace(model, landmarks=embed_landmarks(model, replace(settings, pictures=FIRST_PICTURES))[0])
     model = with_regions_by_landmarks(model)
     landmarks, errors = embed_landmarks(model, settings)
     say(f"{model.name}: landmarks placed with a median error of {float(errors.median()):.2f} pixels")

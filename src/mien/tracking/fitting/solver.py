@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _START_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-7, 1e7
-_SEGMENT = 1024
+SEGMENT = 1024
 """Number of blocks of a chain whose factors are in memory at once: about 120 MB for pairs of frames with 60 parameters.
 """
 
@@ -235,10 +235,10 @@ def solve_chain(
         tie = torch.diag(first[2 * block + 1])
         return torch.cat([torch.cat([here, torch.zeros_like(here)], 1), torch.cat([tie, next_], 1)])
 
-    return -_solve_tridiagonal(own, upper, gradient.reshape(-1, 2 * p)).reshape(-1, p)[:t]
+    return -solve_tridiagonal(own, upper, gradient.reshape(-1, 2 * p)).reshape(-1, p)[:t]
 
 
-def _solve_tridiagonal(
+def solve_tridiagonal(
     own: Callable[[int], Tensor], upper: Callable[[int], Tensor], right: Float[Tensor, "n q"]
 ) -> Float[Tensor, "n q"]:
     """Solve a symmetric positive definite block-tridiagonal system. `upper(i)` couples block i to block i + 1.
@@ -246,15 +246,15 @@ def _solve_tridiagonal(
     Only the factors of one segment of blocks are in memory. A system of several segments is eliminated twice: first to
     find the reduced block at the start of each segment, then from the last segment to the first, for substitution.
     """
-    starts = range(0, len(right), _SEGMENT)
+    starts = range(0, len(right), SEGMENT)
     begins = [(own(0), right[0])]
     for start in starts[:-1]:
-        steps = _eliminate(own, upper, right, begins[-1], range(start, start + _SEGMENT + 1))
+        steps = _eliminate(own, upper, right, begins[-1], range(start, start + SEGMENT + 1))
         _, block, side = deque(steps, maxlen=1).pop()
         begins.append((block, side))
     solution = torch.zeros_like(right)
     for start, begin in zip(reversed(starts), reversed(begins), strict=True):
-        segment = range(start, min(start + _SEGMENT, len(right)))
+        segment = range(start, min(start + SEGMENT, len(right)))
         steps = list(_eliminate(own, upper, right, begin, segment))
         for index, (factor, _, side) in zip(reversed(segment), reversed(steps), strict=True):
             if index + 1 < len(right):

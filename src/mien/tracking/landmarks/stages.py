@@ -33,7 +33,7 @@ from mien.tracking.landmarks.shared_fit import fit_bias, fit_shared
 from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, unknown_subject
 from mien.tracking.settings import TrackingSettings
 
-_FRAMES_AT_ONCE = 512
+FRAMES_AT_ONCE = 512
 """Number of timesteps fitted in one batch, which takes about 100 MB of memory."""
 _LINE_SEARCH = (1.0, 0.5, 0.25, 0.1)
 _COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
@@ -171,7 +171,7 @@ def fit_frames(
         )  # fmt: skip
         return {"state": state}
 
-    for index, rows in enumerate(torch.arange(len(own.state)).split(_FRAMES_AT_ONCE)):
+    for index, rows in enumerate(torch.arange(len(own.state)).split(FRAMES_AT_ONCE)):
         parts.append(cache.get_or_compute(f"{name}-{index}", partial(fitted, rows))["state"])
         advance(len(rows))
     return replace(own, state=torch.cat(parts))

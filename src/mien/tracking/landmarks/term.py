@@ -15,9 +15,9 @@ from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_
 from mien.tracking.landmarks.model import LandmarkModel, Linearization
 from mien.tracking.settings import TrackingSettings
 
-_CHUNK = 48
+CHUNK = 48
 """Number of pictures linearised at once, which takes about 100 MB of memory."""
-_PROJECTED = 512
+PROJECTED = 512
 """Number of pictures projected at once, which takes about as much memory."""
 
 
@@ -75,8 +75,8 @@ class LandmarkTerm:
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
     ) -> Iterator[tuple[Float[Tensor, "m l 2"], Views]]:
         """Yield the offsets from detected to projected landmarks, and their pictures, a bounded number at a time."""
-        for start in range(0, len(self.views.row), _PROJECTED):
-            pictures = self.views.some(slice(start, start + _PROJECTED))
+        for start in range(0, len(self.views.row), PROJECTED):
+            pictures = self.views.some(slice(start, start + PROJECTED))
             # Landmarks of a timestep are posed once for all of its cameras.
             seen, place = pictures.row.unique(return_inverse=True)
             batch = cameras[pictures.camera]
@@ -96,8 +96,8 @@ class LandmarkTerm:
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
     ) -> "Iterator[WeightedLinearization]":
         """Yield linearisations of all pictures, a bounded number at a time."""
-        for start in range(0, len(self.views.row), _CHUNK):
-            pictures = self.views.some(slice(start, start + _CHUNK))
+        for start in range(0, len(self.views.row), CHUNK):
+            pictures = self.views.some(slice(start, start + CHUNK))
             seen, place = pictures.row.unique(return_inverse=True)
             batch = cameras[pictures.camera]
             at = self.model.linearize(state[seen], subject.identity, subject.bias, batch, place, with_identity)
