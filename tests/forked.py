@@ -7,6 +7,7 @@ Start-up, missing packages and other interpreters need a process that Python sta
 import importlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -78,6 +79,7 @@ class ForkServer:
     def __exit__(self, *_: object) -> None:
         self._server.kill()
         self._server.communicate()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def mien(self, *words: object, **options: Any) -> Forked:
         """Start `mien WORDS`; options are those of `call`."""
@@ -117,7 +119,7 @@ def run_forked(server: ForkServer, *words: object, **options: Any) -> "subproces
     """Run `mien WORDS` to its end, and return its exit code and output."""
     process = server.mien(*words, **options)
     code = process.wait()
-    return subprocess.CompletedProcess(list(words), code, process.stdout, process.stderr)
+    return subprocess.CompletedProcess(list(map(str, words)), code, process.stdout, process.stderr)
 
 
 def _serve() -> None:
@@ -172,7 +174,9 @@ def _become(request: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    for each in ("cli", "commands.stages.driving", "commands.stages.evaluating", "commands.stages.pictures"):
-        importlib.import_module(f"mien.{each}")
+    for each in ("driving", "evaluating", "exporting", "pictures", "training"):
+        importlib.import_module(f"mien.commands.stages.{each}")
+    for each in ("mien.cli", "mien.avatar.gaussian_avatars.avatar", "tyro"):
+        importlib.import_module(each)
     tempfile.tempdir = None
     _serve()

@@ -6,19 +6,20 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import pytest
 
 from capture_helpers import tree_bytes
+from forked import ForkServer
 from mien.cli import main
 from mien.locks import lock_file
 from other_process import Holder
-from two_commands import RANK, Outcome, Pair, Studio, pair, toy_studio, waits_to_meet
+from two_commands import RANK, Studio, beside, toy_studio
 
-ROUNDS, MOST_ROUNDS = 12, 120
+pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
 TWO_RUNS = ["--runs", "alone", "twin"]
-MEETINGS = ROUNDS // 4  # a pair that meets less often goes on, up to ten times as many rounds
 
 
 @pytest.fixture(scope="module")
@@ -30,20 +31,13 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def studio(cache: Path, both: Pair, tmp_path_factory: pytest.TempPathFactory) -> Studio:
+def studio(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Studio:
     """Return a workspace with a run that was trained and evaluated alone."""
     made = toy_studio(tmp_path_factory.mktemp("studio") / "it", cache)
     assert main(["create", str(made.video), "--out", str(made.root), "--run", "alone", *made.create_options]) == 0
     folder = ["--out", str(made.avatar_folder), "--format", "gaussian-avatars"]
     assert main(["export", str(made.root), "--run", "alone", *folder]) == 0
     return made
-
-
-@pytest.fixture(scope="module")
-def both(cache: Path) -> Iterator[Pair]:
-    """Start two processes before anything else, since their imports take some seconds."""
-    with pair(cache) as processes:
-        yield processes
 
 
 @contextmanager
@@ -163,7 +157,7 @@ def test_the_command_after_a_kill_goes_on_at_once(
     assert_same_run(studio, "killed")
 
 
-# Real processes, at the same moment.
+# Two commands at once: the first waits beside a lock, or with it, until the second has ended.
 
 
 def assert_same_run(studio: Studio, name: str) -> None:
@@ -175,90 +169,78 @@ def assert_same_run(studio: Studio, name: str) -> None:
     assert not lock_file(run).exists()
 
 
-def assert_apart(outcomes: list[Outcome], name: str) -> bool:
-    """Check that only one command worked at a time, and that the other named it. Return whether one had to."""
-    intervals = sorted((began, ended, what) for one in outcomes for what, began, ended in one.worked)
-    for before, after in zip(intervals, intervals[1:], strict=False):
-        assert before[1] <= after[0], f"{name}: {before[2]} and {after[2]} at once"
-    for one, other in (outcomes, outcomes[::-1]):
-        assert one.code in (0, 2), one
-        if one.code == 2:
-            line = one.told.splitlines()[-1]
-            assert f"{name}: is being written by another command (process {other.pid} on " in line
-            assert not one.worked
-            assert other.code == 0, other
-    return any(one.code == 2 for one in outcomes)
+def assert_told(pid: int, name: str, told: CompletedProcess[str]) -> None:
+    """Check that a command was refused, since a process writes a place, and did nothing."""
+    assert told.returncode == 2, told
+    assert f"{name}: is being written by another command (process {pid} on " in told.stderr.splitlines()[-1]
 
 
-@pytest.mark.slow
-def test_two_trainings_of_one_run(studio: Studio, both: Pair) -> None:
+@pytest.fixture(params=["within", "before"])
+def where(request: pytest.FixtureRequest) -> str:
+    """Whether the first command waits with the lock, or just before it takes it."""
+    return request.param
+
+
+def test_two_trainings_of_one_run(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
     """One of two trainings of a run works, and the run is that of a single training."""
-    told = 0
-    for index in range(MOST_ROUNDS):
-        if index >= ROUNDS and told > MEETINGS:
-            break
-        command = ["train", str(studio.root), "--run", f"t{index}", "--steps", "3", "--split", "tail", *RANK]
-        outcomes = both.run(command, command)
-        told += assert_apart(outcomes, f"t{index}")
-        assert sum(len(one.worked) for one in outcomes) == 1, "trained once"
-        assert_same_run(studio, f"t{index}")
-    assert told > MEETINGS, "they hardly met"
+    train = ["train", str(studio.root), "--run", where, "--steps", "3", "--split", "tail", *RANK]
+    pid, first, second = beside(fork_server, tmp_path / "wait", (where, where), train, train)
+    assert first.returncode == 0, first.stderr
+    trained = ["training: 3/3" in each.stderr for each in (first, second)]
+    assert trained == ([True, False] if where == "within" else [False, True])
+    if where == "within":
+        assert_told(pid, where, second)
+    assert_same_run(studio, where)
 
 
-def test_two_captures_of_one_video(studio: Studio, both: Pair, tmp_path: Path) -> None:
+def test_two_captures_of_one_video(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
     """One of two captures of a video works, and the result is that of a single one."""
+    root = tmp_path / "root"
+    capture = ["capture", str(studio.video), "--out", str(root), "--name", "clip", *studio.capture_options]
+    pid, first, second = beside(fork_server, tmp_path / "wait", (where, "clip"), capture, capture)
+    assert first.returncode == 0, first.stderr
+    captured = ["capture clip: 5/5" in each.stderr for each in (first, second)]
+    assert captured == ([True, False] if where == "within" else [False, True])
+    if where == "within":
+        assert_told(pid, "clip", second)
     expected = tree_bytes(studio.root / "sequences" / "clip" / "capture")
-    told = 0
-    for index in range(MOST_ROUNDS):
-        if index >= ROUNDS and told > MEETINGS:
-            break
-        root = tmp_path / str(index)
-        command = ["capture", str(studio.video), "--out", str(root), "--name", "clip", *studio.capture_options]
-        outcomes = both.run(command, command)
-        told += assert_apart(outcomes, "clip")
-        assert sum(len(one.worked) for one in outcomes) == 1, "captured once"
-        assert tree_bytes(root / "sequences") == {f"clip/capture/{name}": data for name, data in expected.items()}
-    assert told > MEETINGS, "they hardly met"
+    assert tree_bytes(root / "sequences") == {f"clip/capture/{name}": data for name, data in expected.items()}
 
 
-def test_two_imports_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> None:
+def test_two_imports_of_one_run(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
     """One of two imports of a run works. The other one names it, or says that the run is there."""
-    told = 0
-    for index in range(MOST_ROUNDS):
-        if index >= ROUNDS and told > MEETINGS:
-            break
-        out = tmp_path / str(index)
-        command = ["import", str(studio.avatar_folder), "--out", str(out)]
-        outcomes = sorted(both.run(command, command), key=lambda outcome: outcome.code)
-        assert [outcome.code for outcome in outcomes] == [0, 2], outcomes
-        assert [len(outcome.worked) for outcome in outcomes] == [1, 0], "imported once"
-        line = outcomes[1].told.splitlines()[-1]
-        busy = f"is being written by another command (process {outcomes[0].pid} on " in line
-        assert busy or "is there already; give the imported run another name" in line
-        told += busy
-        files = tree_bytes(out / "runs" / "gaussian_avatars")
-        assert {"avatar/avatar.safetensors", "config.json", "face_track.safetensors"} <= files.keys()
-    assert told > 0, "they never met"
+    words = ["import", str(studio.avatar_folder), "--out", str(tmp_path / "out")]
+    stop = (where, "gaussian_avatars")
+    pid, first, second = beside(fork_server, tmp_path / "wait", stop, words, words)
+    if where == "within":
+        assert first.returncode == 0, first.stderr
+        assert_told(pid, "gaussian_avatars", second)
+    else:
+        assert (first.returncode, second.returncode) == (2, 0), second.stderr
+        assert "is there already; give the imported run another name" in first.stderr
+    files = tree_bytes(tmp_path / "out" / "runs" / "gaussian_avatars")
+    assert {"avatar/avatar.safetensors", "config.json", "face_track.safetensors"} <= files.keys()
 
 
-def test_two_analyses_of_one_run(studio: Studio, both: Pair, tmp_path: Path) -> None:
+def test_two_analyses_of_one_run(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
     """One of two analyses works at a time, and nothing is measured twice."""
-    told = 0
-    for index in range(MOST_ROUNDS // 2):
-        if index >= ROUNDS // 2 and told > 0:
-            break
-        out = tmp_path / str(index)
-        command = ["analyze", "gaussian-avatars", str(studio.root), "--run", "alone", "--parts", "growth"]
-        outcomes = both.run([*command, "--out", str(out)], [*command, "--out", str(out)])
-        told += assert_apart(outcomes, str(index))
-        assert json.loads((out / "analysis.json").read_text())["parts"].keys() == {"growth"}
-        assert (out / "analysis.html").is_file()
-        assert not lock_file(out).exists()
-    assert told > 0, "they never met"
+    out = tmp_path / "out"
+    words = ["analyze", "gaussian-avatars", str(studio.root), "--run", "alone", "--parts", "growth", "--out", str(out)]
+    pid, first, second = beside(fork_server, tmp_path / "wait", (where, "out"), words, words)
+    assert first.returncode == 0, first.stderr
+    if where == "within":
+        assert_told(pid, "out", second)
+    else:
+        assert second.returncode == 0, second.stderr
+    assert ("growth: measured before" in first.stderr) == (where == "before")
+    assert json.loads((out / "analysis.json").read_text())["parts"].keys() == {"growth"}
+    assert (out / "analysis.html").is_file()
+    assert not lock_file(out).exists()
 
 
-def figures_of_both(content: dict[str, Any]) -> dict[str, Any]:
-    """The figures of a protocol that both commands compute. `create` judges the avatar alone by ST-LPIPS."""
+def figures_of_both(run: Path) -> dict[str, Any]:
+    """The figures that both commands compute. `create` judges the avatar alone by ST-LPIPS."""
+    content = json.loads((run / "metrics.json").read_text())["protocols"]["self_reenactment_tail"]
     others = {name: without_perceptual(content[name]) for name in ("as_tracked", "baselines")}
     return {key: value for key, value in content.items() if key != "seconds_per_frame"} | others
 
@@ -270,33 +252,30 @@ def without_perceptual(content: Any) -> Any:
     return {key: without_perceptual(value) for key, value in content.items() if key != "perceptual"}
 
 
-@pytest.mark.slow
-def test_create_beside_evaluate(studio: Studio, both: Pair) -> None:
-    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first.
-
-    Each needs its own time until it writes, so the quicker one waits by what the rounds before measured.
-    """
-    runs, told, figures = studio.root / "runs", 0, []
-    waits: dict[bool, tuple[float, float]] = {True: (0, 0), False: (0, 0)}
-    for index in range(MOST_ROUNDS):
-        if index >= ROUNDS and told > MEETINGS:
-            break
-        name, run = f"e{index}", runs / f"e{index}"
-        shutil.copytree(runs / "alone", run, ignore=shutil.ignore_patterns("metrics.json", "report.html", "videos"))
-        trained = index % 3 != 2
-        if not trained:
-            (run / "training.json").unlink()
-        create = ["create", str(studio.video), "--out", str(studio.root), "--run", name, *studio.create_options]
-        outcomes = both.run(create, ["evaluate", str(studio.root), "--run", name], waits=waits[trained])
-        if all(outcome.code == 0 for outcome in outcomes):
-            waits[trained] = waits_to_meet(waits[trained], outcomes)
-        if "its training was not finished" in outcomes[1].told:  # it came first, and there was nothing to evaluate
-            assert outcomes[0].code == 0
-        else:
-            told += assert_apart(outcomes, name)
-        assert_same_run(studio, name)
-        content = json.loads((run / "metrics.json").read_text())["protocols"]["self_reenactment_tail"]
-        figures.append(figures_of_both(content))
-        shutil.rmtree(run)
-    assert all(one == figures[0] for one in figures)
-    assert told > MEETINGS, "they hardly met"
+@pytest.mark.parametrize(
+    ("first_is", "trained"),
+    [("create", True), ("evaluate", True), ("create", False)],
+    ids=["create", "evaluate", "new"],
+)
+def test_create_beside_evaluate(
+    first_is: str, trained: bool, where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path
+) -> None:
+    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first."""
+    name, runs = f"{first_is}-{where}-{trained}", studio.root / "runs"
+    shutil.copytree(runs / "alone", runs / name, ignore=shutil.ignore_patterns("metrics.json", "report.html", "videos"))
+    if not trained:
+        (runs / name / "training.json").unlink()
+    create = ["create", str(studio.video), "--out", str(studio.root), "--run", name, *studio.create_options]
+    lines = [create, ["evaluate", str(studio.root), "--run", name]]
+    if first_is == "evaluate":
+        lines.reverse()
+    pid, first, second = beside(fork_server, tmp_path / "wait", (where, name), *lines)
+    assert first.returncode == 0, first.stderr
+    if where == "within":
+        assert_told(pid, name, second)
+    elif trained:
+        assert second.returncode == 0, second.stderr
+    else:
+        assert "its training was not finished" in second.stderr
+    assert_same_run(studio, name)
+    assert figures_of_both(runs / name) == figures_of_both(runs / "alone")
