@@ -14,7 +14,8 @@ _PREFIX = "camera"
 _FORMATS: dict[str, CameraFormat] = {"linux": "v4l2", "darwin": "avfoundation", "win32": "dshow"}
 _FIRST: dict[CameraFormat, str] = {"v4l2": "/dev/video0", "avfoundation": "0", "dshow": "video=0"}
 """The device that `camera` alone means."""
-_DEVICES = Path("/dev")
+DEVICES = Path("/dev")
+"""The folder of the devices of Linux."""
 _STREAM = re.compile(r"(rtsp|rtsps|rtmp|http|https|udp|rtp|srt|tcp)://", re.IGNORECASE)
 
 
@@ -71,7 +72,7 @@ def camera_named(by: str, camera_format: CameraFormat | None) -> CameraName:
 
 def devices() -> list[str]:
     """The video devices of this machine with their names, as far as the system lists them as files (Linux)."""
-    found = sorted(_DEVICES.glob("video[0-9]*"), key=lambda path: (len(path.name), path.name))
+    found = sorted(DEVICES.glob("video[0-9]*"), key=lambda path: (len(path.name), path.name))
     return [f"{path}{_title(path.name)}" for path in found]
 
 
@@ -88,7 +89,7 @@ def remedy() -> str:
 
 def _first_device(camera_format: CameraFormat) -> str:
     if camera_format == "v4l2":
-        found = sorted(_DEVICES.glob("video[0-9]*"), key=lambda path: (len(path.name), path.name))
+        found = sorted(DEVICES.glob("video[0-9]*"), key=lambda path: (len(path.name), path.name))
         return str(found[0]) if found else _FIRST["v4l2"]
     return _FIRST[camera_format]
 

@@ -40,7 +40,7 @@ class LiveFrame:
     number: int
     """Number of frames before it."""
     seconds: float
-    """Time of `time.monotonic` at which the frame came."""
+    """Time of the camera's clock at which the frame came."""
     picture: UInt8[np.ndarray, "h w 3"]
 
 
@@ -50,19 +50,29 @@ class LiveCamera:
     If the camera vanishes, the thread says so, waits, and takes it up again. A file ends, or starts again.
     """
 
-    def __init__(self, name: CameraName, again: bool, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(
+        self,
+        name: CameraName,
+        again: bool,
+        say: Callable[[str], None] = lambda text: None,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[threading.Event, float], object] = threading.Event.wait,
+    ) -> None:
         """Prepare to read a camera.
 
         Args:
             name: The camera.
             again: Whether a file starts again at its end.
             say: Is called with one line when the camera vanishes and when it is back.
+            clock: Returns the time in seconds.
+            wait: Waits for an event, at most so many seconds: between the frames of a file, and for a camera that has
+                vanished.
         """
         self.name = name
-        self._again, self._say = again, say
+        self._again, self._say, self._clock, self._wait = again, say, clock, wait
         self._changed = threading.Condition()
         self._newest: LiveFrame | None = None
-        self._stopping = False
+        self._stopping = threading.Event()
         self.ended = False
         """Whether a file has ended, or an error has ended the thread."""
         self.is_lost = False
@@ -89,8 +99,8 @@ class LiveCamera:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self._stopping.set()
         with self._changed:
-            self._stopping = True
             self._changed.notify_all()
         if self._thread.is_alive():
             # A device may block in its driver; the thread is a daemon, and ends with the process.
@@ -99,7 +109,7 @@ class LiveCamera:
     def newest(self, after: int, seconds: float) -> LiveFrame | None:
         """The newest frame whose number is above `after`. Wait for it; None if none comes in time."""
         with self._changed:
-            self._changed.wait_for(lambda: self._is_new(after) or self.ended or self._stopping, seconds)
+            self._changed.wait_for(lambda: self._is_new(after) or self.ended or self._stopping.is_set(), seconds)
             return self._newest if self._is_new(after) else None
 
     def _is_new(self, after: int) -> bool:
@@ -113,7 +123,7 @@ class LiveCamera:
     def _run(self) -> None:
         try:
             opened = self._opened
-            while not self._stopping:
+            while not self._stopping.is_set():
                 if opened is None:
                     opened = self._reopen()
                     continue
@@ -132,16 +142,15 @@ class LiveCamera:
 
     def _reopen(self) -> "contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]] | None":
         if not self.name.is_file:
-            with self._changed:
-                self._changed.wait_for(lambda: self._stopping, _RETRY_SECONDS)
+            self._wait(self._stopping, _RETRY_SECONDS)
         try:
-            return None if self._stopping else self._open()
+            return None if self._stopping.is_set() else self._open()
         except UserError:
             return None
 
     def _lose(self) -> None:
         """Say once that the camera is away."""
-        if not self.is_lost and not self._stopping:
+        if not self.is_lost and not self._stopping.is_set():
             self.is_lost = True
             self._say(f"{self.name}: gives no more pictures; mien waits until it is back")
 
@@ -152,13 +161,12 @@ class LiveCamera:
         began: float | None = None
         with contextlib.suppress(av.error.FFmpegError, OSError):
             for due, frame in frames:
-                now = time.monotonic()
+                now = self._clock()
                 if self.name.is_file:
                     began = now - due if began is None else began
-                    with self._changed:
-                        self._changed.wait_for(lambda: self._stopping, max(0.0, began + due - now))
+                    self._wait(self._stopping, max(0.0, began + due - now))
                     now = max(now, began + due)
-                if self._stopping:
+                if self._stopping.is_set():
                     return
                 self._keep(LiveFrame(self.frames, now, np.ascontiguousarray(display.show(frame))))
 

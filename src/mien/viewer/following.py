@@ -35,6 +35,7 @@ class CameraSwitch:
         session: Session,
         open_camera: Callable[[], "mien.capture.live_camera.LiveCamera"],
         make: Callable[[], "mien.driving.live.Follower"],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Prepare to follow; nothing is opened before `start`.
 
@@ -42,8 +43,9 @@ class CameraSwitch:
             session: What shows the avatar.
             open_camera: Returns the camera, not opened yet.
             make: Returns a new follower.
+            clock: Returns the time in seconds; it is the camera's clock.
         """
-        self._session, self._open, self._make = session, open_camera, make
+        self._session, self._open, self._make, self._clock = session, open_camera, make, clock
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
@@ -100,7 +102,7 @@ class CameraSwitch:
 
     def shown(self, seen: Seen) -> None:
         """Take account of a picture that went out."""
-        now = time.monotonic()
+        now = self._clock()
         self.meters.count("drawing", now)
         self.meters.delay(now - seen.seconds)
 
@@ -111,7 +113,7 @@ class CameraSwitch:
             return ["The camera is off."]
         if camera.is_lost:
             return ["The camera is away. mien waits for it."]
-        return [_WORDS[follower.state], *self.meters.words(time.monotonic())]
+        return [_WORDS[follower.state], *self.meters.words(self._clock())]
 
     def _run(self, camera: "mien.capture.live_camera.LiveCamera", follower: "mien.driving.live.Follower") -> None:
         from mien.capture.faces import LandmarkDetector
@@ -138,7 +140,7 @@ class CameraSwitch:
                 if camera.ended:
                     return
                 if last is not None and camera.is_lost:
-                    self._show(follower, None, last, time.monotonic())
+                    self._show(follower, None, last, self._clock())
                 continue
             number, last = frame.number, frame
             for _ in range(camera.frames - frames if frames else 1):
@@ -146,7 +148,7 @@ class CameraSwitch:
             frames = camera.frames
             faces = detector.detect(frame.picture)
             self._show(follower, faces[0] if len(faces) else None, frame, frame.seconds)
-            self.meters.count("tracking", time.monotonic())
+            self.meters.count("tracking", self._clock())
 
     def _show(
         self,

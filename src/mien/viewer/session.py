@@ -54,7 +54,7 @@ class Seen:
 
     picture: UInt8[np.ndarray, "_ _ 3"]
     seconds: float
-    """Time of `time.monotonic` at which the frame came."""
+    """Time of the camera's clock at which the frame came."""
 
 
 class Session:
