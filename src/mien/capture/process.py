@@ -27,7 +27,7 @@ from mien.errors import UserError
 from mien.progress import Advance, progress_bar
 from mien.storage import expect_whole, read_arrays, write_arrays
 
-_CHUNK = 256
+CHUNK = 256
 """Frames after which progress is saved. Detectors start again at each chunk, even if nothing is interrupted."""
 
 
@@ -197,7 +197,7 @@ def _read(path: Path) -> Chunk:
     with expect_whole(path, "delete its folder and run `mien capture` again"):
         t = len(arrays["landmarks"])
         if (
-            not 0 < t <= _CHUNK
+            not 0 < t <= CHUNK
             or arrays["landmarks"].shape[1:] != (LANDMARKS, 2)
             or arrays["quality"].shape != (t, MEASURES)
         ):
@@ -227,7 +227,7 @@ def process_part(
         OSError: the frames cannot be written.
     """
     work.mkdir(exist_ok=True)
-    paths = {start: work / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, _CHUNK)}
+    paths = {start: work / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, CHUNK)}
     chunks = [_read(path) for path in itertools.takewhile(Path.exists, paths.values())]
     done = sum(len(chunk.valid) for chunk in chunks)
     if done == layout.timesteps:
@@ -235,7 +235,7 @@ def process_part(
     processor = PartProcessor(reel, part, given, done, detector)
     with FrameWriter(layout, camera) as writer, progress_bar(f"capture {part.name}", layout.timesteps, done) as advance:
         for start, path in itertools.islice(paths.items(), len(chunks), None):
-            chunk = processor.process(start, min(_CHUNK, layout.timesteps - start), writer, camera, advance)
+            chunk = processor.process(start, min(CHUNK, layout.timesteps - start), writer, camera, advance)
             write_arrays(path, vars(chunk))
             chunks.append(chunk)
     return chunks
