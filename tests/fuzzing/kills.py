@@ -4,14 +4,10 @@ A chain begins with the files that an uninterrupted command found. The command i
 SIGKILL, SIGTERM or SIGINT, and then runs to its end. All files must have the bytes of the uninterrupted command.
 """
 
-import os
-
-os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1", MIEN_THREADS="1")
-
 import argparse
-import contextlib
 import itertools
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -24,8 +20,9 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from fuzzing.run_lines import Server
+from forked import Forked, ForkServer
 from fuzzing.same_bytes import differing_files, hidden_files
+from mien.lab.synthetic import RECIPES, write_synthetic_video
 
 CLIP, FRAMES, SIDE = "clip.mp4", 10, 192
 TRACK = (
@@ -83,19 +80,12 @@ class Tally:
 class Place:
     """A folder in which commands run, always under the same path, and the files of the uninterrupted commands."""
 
-    def __init__(self, folder: Path) -> None:
-        self.box, self.told, self._kept = folder / "box", folder / "told.txt", folder / "kept"
+    def __init__(self, folder: Path, server: ForkServer) -> None:
+        self.box, self._kept, self._server = folder / "box", folder / "kept", server
         self.seconds: dict[str, float] = {}
-        self._server = Server()
-
-    def close(self) -> None:
-        """Stop the server of forks."""
-        self._server.close()
 
     def make_reference(self) -> None:
         """Draw a clip and run all stages undisturbed; keep the files before and after each."""
-        from mien.lab.synthetic import RECIPES, write_synthetic_video
-
         recipe = RECIPES["demo"]
         self.box.mkdir(parents=True)
         small = replace(recipe, seconds=FRAMES / recipe.fps, width=SIDE, height=SIDE, supersample=1, texture_size=256)
@@ -103,9 +93,9 @@ class Place:
         for stage in STAGES:
             shutil.copytree(self.box, self._kept / f"before {stage}")
             began = time.monotonic()
-            code, _ = self.run(stage, apart=False)
+            code, told, _ = self.run(stage, apart=False)
             self.seconds[stage] = time.monotonic() - began
-            assert code == 0, f"{stage}: exit code {code}\n{self.told.read_text()[-2000:]}"
+            assert code == 0, f"{stage}: exit code {code}\n{told[-2000:]}"
             shutil.copytree(self.box, self._kept / f"after {stage}")
 
     def begin(self, stage: str) -> None:
@@ -118,75 +108,42 @@ class Place:
         return differing_files(self._kept / f"after {stage}", self.box)
 
     def run(
-        self, stage: str, apart: bool, number: int | None = None, moment: float = _TO_FINISH
-    ) -> tuple[int | None, float]:
-        """Run a stage's command; return its exit code (None if it hangs) and its seconds after the signal.
+        self, stage: str, apart: bool, number: int = signal.SIGKILL, moment: float = _TO_FINISH
+    ) -> tuple[int | None, str, float]:
+        """Run a stage's command, which gets a signal at a moment.
 
         Args:
             stage: name of the stage.
             apart: whether the command is a new process.
-            number: signal that the command gets at the moment.
-            moment: seconds from the start; a command that has not ended by then and gets no signal hangs.
+            number: the signal.
+            moment: seconds from the start.
+
+        Returns:
+            The exit code (None if it hangs), what it told, and its seconds after the signal (-1 without one).
         """
-        self.told.write_text("")
-        command = _Alone(self) if apart else _Forked(self, self._server)
-        command.start(list(STAGES[stage]))
-        if command.ended(moment):
-            return command.code(), -1.0
+        start = self._server.call("fuzzing.kills:run_anew", STAGES[stage], cwd=self.box, exits=True) if apart else None
+        command = start or self._server.mien(*STAGES[stage], cwd=self.box)
+        if _ended(command, moment):
+            return command.poll(), command.stdout + command.stderr, -1.0
         sent = time.monotonic()
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(command.pid, number or signal.SIGKILL)
-        in_time = command.ended(_TO_END)
-        if not in_time:
-            with contextlib.suppress(OSError), self.told.open("a") as told:
-                state = Path(f"/proc/{command.pid}/status").read_text().splitlines()[2]
-                told.write(f"hangs: {state}, {Path(f'/proc/{command.pid}/stat').read_text().split()[13:15]} ticks\n")
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(command.pid, signal.SIGKILL)
-        code = command.code()
-        return (code if in_time and number is not None else None), time.monotonic() - sent
+        command.send_signal(number)
+        hangs = not _ended(command, _TO_END)
+        command.kill()
+        code = command.wait()
+        return None if hangs else code, command.stdout + command.stderr, time.monotonic() - sent
 
 
-class _Forked:
-    """A command as a fork of a process that has imported everything."""
-
-    def __init__(self, place: Place, server: Server) -> None:
-        self._place, self._server, self.pid = place, server, 0
-
-    def start(self, words: list[str]) -> None:
-        told = str(self._place.told)
-        request = {"words": words, "env": dict(os.environ), "folder": str(self._place.box), "stdin": os.devnull}
-        self.pid = self._server.start(request | {"stdout": told, "stderr": told})
-
-    def ended(self, seconds: float) -> bool:
-        return self._server.ended(seconds)
-
-    def code(self) -> int:
-        return self._server.result()[0]
+def run_anew(words: list[str]) -> None:
+    """Become a new Python that runs a command."""
+    os.execv(sys.executable, [sys.executable, "-c", _ALONE, *words])
 
 
-class _Alone:
-    """A command as a process of its own, as a shell starts it."""
-
-    def __init__(self, place: Place) -> None:
-        self._place, self.pid = place, 0
-
-    def start(self, words: list[str]) -> None:
-        with self._place.told.open("w") as told:
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", _ALONE, *words], cwd=self._place.box, stdin=subprocess.DEVNULL, stdout=told,
-                stderr=told, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), start_new_session=True,
-            )  # fmt: skip
-        self.pid = self._process.pid
-
-    def ended(self, seconds: float) -> bool:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(seconds)
-            return True
-        return False
-
-    def code(self) -> int:
-        return self._process.wait()
+def _ended(command: Forked, seconds: float) -> bool:
+    """Wait at most so long for the end of a command; return whether it has ended."""
+    until = time.monotonic() + seconds
+    while command.poll() is None and time.monotonic() < until:
+        time.sleep(0.002)
+    return command.poll() is not None
 
 
 def run_chain(case: str, stage: str, place: Place, tally: Tally) -> None:
@@ -197,8 +154,7 @@ def run_chain(case: str, stage: str, place: Place, tally: Tally) -> None:
     for _ in range(dice.randint(1, 5)):
         number, apart = dice.choice(list(SIGNALS)), dice.random() < _APART
         moment = dice.uniform(0, _LATE * (place.seconds[stage] + (place.seconds["start"] if apart else 0)))
-        code, after = place.run(stage, apart, number, moment)
-        text = place.told.read_text(errors="replace")
+        code, text, after = place.run(stage, apart, number, moment)
         told.append(f"{signal.Signals(number).name} after {moment:.2f} s{', apart' * apart}: {code}; {text[-1500:]}")
         if code == 0:
             # It took less time than the last one: other programs may have used the cores then.
@@ -211,14 +167,11 @@ def run_chain(case: str, stage: str, place: Place, tally: Tally) -> None:
             tally.slowest = max(tally.slowest, after)
         faults += _faults(number, code, text)
     began = time.monotonic()
-    code, _ = place.run(stage, apart=False)
+    code, text, _ = place.run(stage, apart=False)
     place.seconds[stage] = max(place.seconds[stage], time.monotonic() - began)
-    told.append(f"then: {code}; {place.told.read_text(errors='replace')[-1500:]}")
+    told.append(f"then: {code}; {text[-1500:]}")
     tally.chains[stage] += 1
-    if code != 0:
-        faults.append("does not go on")
-    else:
-        faults += [f"other bytes: {name}" for name in place.differences(stage)]
+    faults += [f"other bytes: {name}" for name in place.differences(stage)] if code == 0 else ["does not go on"]
     left = hidden_files(place.box)
     tally.leftovers += len(left) if hard else 0
     if left and not hard:
@@ -247,10 +200,11 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", choices=list(STAGES), default=list(STAGES), help="stages that are killed")
     parser.add_argument("--findings", type=Path, default=None, help="file of json lines for what is found")
     asked = parser.parse_args()
-    folder = Path(tempfile.mkdtemp(prefix="mien-kills-"))
-    tally, place = Tally(), Place(folder)
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1", MIEN_THREADS="1")
+    tally = Tally()
     until = None if asked.minutes is None else time.monotonic() + 60 * asked.minutes
-    try:
+    with tempfile.TemporaryDirectory(prefix="mien-kills-") as folder, ForkServer() as server:
+        place = Place(Path(folder), server)
         place.make_reference()
         place.seconds["start"] = _seconds_of_start()
         for chain in itertools.count():
@@ -260,9 +214,6 @@ def main() -> int:
             run_chain(f"{stage}:{asked.seed}:{chain}", stage, place, tally)
             if chain % 5 == 0:
                 print(f"{sum(tally.kills.values())} kills, {len(tally.findings)} findings", file=sys.stderr, flush=True)
-    finally:
-        place.close()
-        shutil.rmtree(folder, ignore_errors=True)
     if asked.findings is not None:
         asked.findings.parent.mkdir(parents=True, exist_ok=True)
         asked.findings.write_text("".join(json.dumps(each) + "\n" for each in tally.findings))
