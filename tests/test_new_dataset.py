@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from forked import ForkServer
 from fuzzing import uses
 from mien.capture import read_capture_hash
 from mien.datasets import Dataset, TrackedSequence, datasets, write_sequence
@@ -61,12 +62,12 @@ def write(path: Path, arrays: dict[str, np.ndarray]) -> Path:
     return path
 
 
-def test_a_dataset_is_imported_and_trained_on(tmp_path: Path, cache: str) -> None:
+def test_a_dataset_is_imported_and_trained_on(fork_server: ForkServer, tmp_path: Path, cache: str) -> None:
     follow(tmp_path)
     arrays, out = puppet(), tmp_path / "out"
     path = write(tmp_path / f"me.{WORD}9", arrays)
     line = ("import", str(path), "--out", str(out), "--face-model", "mine")
-    done = mien(tmp_path, *line, MIEN_CACHE=cache)
+    done = mien(fork_server, tmp_path, *line, MIEN_CACHE=cache)
     assert done.returncode == 0, done.stderr
     assert f"me.{WORD}9: a {WORD}9" in done.stderr
     folder = out / "sequences/me"
@@ -93,9 +94,9 @@ def test_a_dataset_is_imported_and_trained_on(tmp_path: Path, cache: str) -> Non
     settings = sequence.tracking.settings
     assert settings["imported"] == {"dataset": f"{WORD}9", "from": str(path)}
     assert len(settings["fingerprint"]) == 16
-    trained = mien(tmp_path, "train", str(out), "--steps", "2", "--split", "tail", MIEN_CACHE=cache)
+    trained = mien(fork_server, tmp_path, "train", str(out), "--steps", "2", "--split", "tail", MIEN_CACHE=cache)
     assert trained.returncode == 0, trained.stderr
-    again = mien(tmp_path, *line, MIEN_CACHE=cache)
+    again = mien(fork_server, tmp_path, *line, MIEN_CACHE=cache)
     assert (again.returncode, "sequences/me: is there already; delete it" in again.stderr) == (2, True)
     assert [each.name for each in (out / "sequences").iterdir() if not each.name.startswith(".me.lock")] == ["me"]
 
@@ -113,13 +114,15 @@ FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], object], str]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_damage_is_told_in_one_line_and_leaves_nothing(fault: str, tmp_path: Path, cache: str) -> None:
+def test_damage_is_told_in_one_line_and_leaves_nothing(
+    fork_server: ForkServer, fault: str, tmp_path: Path, cache: str
+) -> None:
     follow(tmp_path)
     arrays = puppet()
     damage, told = FAULTS[fault]
     damage(arrays)
     path, out = write(tmp_path / f"me.{WORD}9", arrays), tmp_path / "out"
-    done = mien(tmp_path, "import", str(path), "--out", str(out), "--face-model", "mine", MIEN_CACHE=cache)
+    done = mien(fork_server, tmp_path, "import", str(path), "--out", str(out), "--face-model", "mine", MIEN_CACHE=cache)
     assert done.returncode == 2, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("mien: ")]
     assert told in line
@@ -142,16 +145,16 @@ def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "I/sequences/toy/scoring/scoring.json").is_file()
 
 
-def test_what_is_not_recognised_is_told(tmp_path: Path) -> None:
+def test_what_is_not_recognised_is_told(fork_server: ForkServer, tmp_path: Path) -> None:
     follow(tmp_path)
     (tmp_path / "a.txt").touch()
     path = write(tmp_path / f"me.{WORD}9", puppet())
     out = ("--out", str(tmp_path / "out"))
-    unknown = mien(tmp_path, "import", str(tmp_path / "a.txt"), *out)
+    unknown = mien(fork_server, tmp_path, "import", str(tmp_path / "a.txt"), *out)
     assert unknown.returncode == 2
     assert "is no dataset that mien knows; give one of gaussian-avatars (" in unknown.stderr
     assert f"{WORD}9 (a .{WORD}9 file)" in unknown.stderr
-    run = mien(tmp_path, "import", str(path), *out, "--run", "a")
+    run = mien(fork_server, tmp_path, "import", str(path), *out, "--run", "a")
     assert (run.returncode, "holds sequences, which are no run; leave --run out" in run.stderr) == (2, True)
 
 
@@ -166,11 +169,11 @@ TWICE = "from mien.datasets import Dataset\n{} = Dataset({!r}, 'twice', 'avatar'
         (TWICE.format("TOY", "toy"), "is recognised as gaussian-avatars and toy; choose one with --dataset NAME"),
     ],
 )
-def test_a_package_that_is_wrong_is_named(code: str, told: str, tmp_path: Path) -> None:
+def test_a_package_that_is_wrong_is_named(fork_server: ForkServer, code: str, told: str, tmp_path: Path) -> None:
     install(tmp_path, "mien_toy", code, "[mien.datasets]\ntoy = mien_toy:TOY\n")
     (tmp_path / "F").mkdir()
     (tmp_path / "F/point_cloud.ply").touch()
-    done = mien(tmp_path, "import", str(tmp_path / "F"), "--out", str(tmp_path / "out"))
+    done = mien(fork_server, tmp_path, "import", str(tmp_path / "F"), "--out", str(tmp_path / "out"))
     assert done.returncode == 2
     assert told in done.stderr
 

@@ -1,10 +1,10 @@
 """Follow a recipe of CONTRIBUTING.md, and install what it makes as a package that other people wrote."""
 
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
+
+from forked import ForkServer, run_forked
 
 _PAGE = Path(__file__).parents[1] / "CONTRIBUTING.md"
 
@@ -30,7 +30,11 @@ def install(folder: Path, module: str, code: str, points: str) -> None:
     (about / "entry_points.txt").write_text(points)
 
 
-def mien(folder: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def mien(server: ForkServer, folder: Path, *words: str, **environment: str) -> "subprocess.CompletedProcess[str]":
     """Run a command where the packages of a folder are installed."""
-    changed = {**os.environ, **environment, "PYTHONPATH": str(folder)}
-    return subprocess.run([sys.executable, "-m", "mien.cli", *words], env=changed, capture_output=True, text=True)
+    return run_forked(server, *words, path=[folder], env=environment)
+
+
+def help_of(server: ForkServer, folder: Path, command: str) -> str:
+    """Return a command's help, with single spaces and without frames, where the packages of a folder are installed."""
+    return " ".join(mien(server, folder, command, "--help").stdout.replace("\u2502", " ").split())
