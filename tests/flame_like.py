@@ -146,18 +146,22 @@ def _regressor(template: np.ndarray, weights: np.ndarray, hinge: np.ndarray) -> 
 
 
 def _expression_basis(anny: FaceModel, order: np.ndarray) -> np.ndarray:
-    """Return principal directions of unit variance, fitted to random expressions without jaw and gaze."""
-    random = np.random.default_rng(6)
+    """Return principal directions of random expressions without jaw and gaze."""
     names = anny.expression_names
     use = [i for i, n in enumerate(names) if not n.startswith(("jaw", "eyeLook", "mouthClose", "tongue"))]
-    deltas = anny.expression_basis.double().numpy()[use][:, order].reshape(len(use), -1)
-    strength = random.uniform(0, 1, (600, len(use))) * (random.uniform(0, 1, (600, len(use))) < 0.3)
+    return principal_directions(anny.expression_basis.double().numpy()[use][:, order], EXPRESSIONS, 6)
+
+
+def principal_directions(offsets: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Return directions of unit variance [count, v, 3] of random mixtures of offsets [n, v, 3]."""
+    random, deltas = np.random.default_rng(seed), offsets.reshape(len(offsets), -1)
+    strength = random.uniform(0, 1, (600, len(deltas))) * (random.uniform(0, 1, (600, len(deltas))) < 0.3)
     values, vectors = np.linalg.eigh(deltas @ deltas.T)
     roots = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T  # symmetric root of the Gram matrix
     _, sizes, directions = np.linalg.svd(strength @ roots, full_matrices=False)
-    mixtures = directions[:EXPRESSIONS] @ np.linalg.pinv(roots, rcond=1e-6)
-    mixtures *= (sizes[:EXPRESSIONS] / np.sqrt(600))[:, None]
-    return (mixtures @ deltas).reshape(EXPRESSIONS, -1, 3)
+    mixtures = directions[:count] @ np.linalg.pinv(roots, rcond=1e-6)
+    mixtures *= (sizes[:count] / np.sqrt(600))[:, None]
+    return (mixtures @ deltas).reshape(count, -1, 3)
 
 
 def shaped_as_flame(arrays: dict[str, np.ndarray], shape: np.ndarray, offsets: np.ndarray | float = 0.0) -> np.ndarray:
@@ -166,12 +170,9 @@ def shaped_as_flame(arrays: dict[str, np.ndarray], shape: np.ndarray, offsets: n
 
 
 def posed_as_flame(
-    arrays: dict[str, np.ndarray],
-    pose: np.ndarray,
-    shape: np.ndarray,
-    shift: np.ndarray,
+    arrays: dict[str, np.ndarray], pose: np.ndarray, shape: np.ndarray, shift: np.ndarray,
     offsets: np.ndarray | float = 0.0,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return vertices [v, 3] by the formulas of GaussianAvatars (methods.md A.1), in float64.
 
     `pose` [5, 3] holds the axis-angles of root, neck, jaw and eyes; `shape` holds all coefficients. Joints are

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from flame_like import principal_directions
 from mien.face import FaceModel, Landmarks
 from mien.rotation import matrix_from_axis_angle
 
@@ -114,18 +115,10 @@ def _correctives(anny: FaceModel) -> np.ndarray:
 
 
 def _expressions(anny: FaceModel) -> np.ndarray:
-    """Principal directions of unit variance of random expressions, with the jaw and its teeth, without gaze."""
-    random = np.random.default_rng(9)
+    """Principal directions of random expressions, with the jaw and its teeth, without gaze."""
     use = [i for i, n in enumerate(anny.expression_names) if not n.startswith(("eyeLook", "mouthClose", "tongue"))]
     one = anny.neutral(len(use))
     expression = torch.zeros_like(one.expression)
     expression[torch.arange(len(use)), torch.tensor(use)] = 1
     moved = anny.head_vertices(type(one)(**{**one.tensors(), "expression": expression})) - anny.template
-    deltas = moved.double().numpy().reshape(len(use), -1)
-    strength = random.uniform(0, 1, (600, len(use))) * (random.uniform(0, 1, (600, len(use))) < 0.3)
-    values, vectors = np.linalg.eigh(deltas @ deltas.T)
-    roots = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
-    _, sizes, directions = np.linalg.svd(strength @ roots, full_matrices=False)
-    mixtures = directions[:EXPRESSIONS] @ np.linalg.pinv(roots, rcond=1e-6)
-    mixtures *= (sizes[:EXPRESSIONS] / np.sqrt(600))[:, None]
-    return (mixtures @ deltas).reshape(EXPRESSIONS, -1, 3)
+    return principal_directions(moved.double().numpy(), EXPRESSIONS, 9)
