@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-import dataset_scene
 import dataset_writers
 from capture_helpers import tree_bytes
+from dataset_layouts import draw_at, write_larger, write_masked, write_tracker_output
 from dataset_scene import Scene, scene_of
-from dataset_variants import write_larger, write_masked, write_tracker_output
 from dataset_writers import (
     FRONTAL,
     write_benchmark,
@@ -87,7 +86,7 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     "insta, image_mask": write_masked,
     "insta, images.HQ": write_larger,
     "imavatar": write_imavatar,
-    "vhap": lambda folder, scene: write_vhap(folder, scene, size=(SIDE, SIDE + 8)),
+    "vhap": write_vhap,
     "nerface": write_nerface,
     "nerf-blendshape": write_nerf_blendshape,
     COEFFICIENTS: lambda folder, scene: write_nerf_blendshape(folder, scene, 7.0, True),
@@ -115,22 +114,19 @@ class NoDetector:
         return np.zeros((0, 478, 2))
 
 
+def unfound(images: np.ndarray) -> np.ndarray:
+    """Return landmarks of pictures in which a detector finds no face."""
+    return np.full((*images.shape[:2], 478, 2), 5, np.float32)
+
+
 def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the networks and the capture of videos, and draw small pictures."""
-
-    def found(images: np.ndarray) -> np.ndarray:
-        return np.full((*images.shape[:2], 478, 2), 5, np.float32)
-
+    """Replace the networks and the capture of videos, and draw pictures of a quarter of the size."""
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
-    monkeypatch.setattr(sequences, "detected_landmarks", found)
+    monkeypatch.setattr(sequences, "detected_landmarks", unfound)
     monkeypatch.setattr(matting, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
     monkeypatch.setattr(import_footage, "capture_video", _film_is_read)
     monkeypatch.setattr(import_footage, "capture_cameras", _rig_is_read)
-    K = np.array([[40.0, 0, 16.6], [0, 40.0, 15.5], [0, 0, 1]])
-    for module in (dataset_scene, dataset_writers):
-        monkeypatch.setattr(module, "SIDE", SIDE)
-    monkeypatch.setattr(dataset_writers, "OFF_CENTRE", K)
-    monkeypatch.setattr(dataset_writers, "UNEQUAL", K * [[1.05], [1.0], [1.0]])
+    draw_at(SIDE / dataset_writers.SIDE, monkeypatch)
 
 
 def _film_is_read(video: Path, out: Path, settings: CaptureSettings, name: str) -> None:

@@ -1,4 +1,4 @@
-"""Checks of imported datasets: cameras, vertices and silhouettes against the writer's own, and independent decoders."""
+"""Checks of imported datasets: cameras, vertices, pictures and silhouettes against the writer's own."""
 
 from pathlib import Path
 from typing import Any
@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from av.video.reformatter import Interpolation
 
-from dataset_scene import projected
+from dataset_layouts import Layout, View
+from dataset_scene import Scene, draw, projected
 from mien.camera import Camera
-from mien.datasets import TrackedSequence
+from mien.datasets import Findings, TrackedSequence, recognised
 from mien.render import rasterize_mesh
 
 PIXELS = 1e-3
@@ -23,6 +24,8 @@ CAMERA = 1e-6
 
 Captures hold float32, whose neighbours at 150 pixels are 1.5e-5 apart, so no absolute bound of 1e-6 can hold there.
 """
+LANDMARKS = 4e-5
+"""Largest error of a landmark, as a part of the height of the picture."""
 _SURE = 99
 """Per cent of an outline that have to be exact. A vertex between two pixels may fall to either on other processors."""
 
@@ -47,14 +50,7 @@ def filmed_camera(sequence: Any, camera: int = 0) -> Camera:
     return calibration[camera]
 
 
-def seen_by(sequence: TrackedSequence, timestep: int, camera: int = 0) -> np.ndarray:
-    """Return the imported mesh [v, 3] in the axes of the imported camera, in float64."""
-    viewmat = sequence.tracking.cameras[camera].viewmat.double().numpy()
-    mesh = sequence.face_model(sequence.tracking.face[timestep])[0].double().numpy()
-    return mesh @ viewmat[:3, :3].T + viewmat[:3, 3]
-
-
-def motion_between(points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _motion_between(points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rotation and translation that carry points onto others best (Kabsch 1976)."""
     middle, middle_moved = points.mean(0), moved.mean(0)
     u, _, vt = np.linalg.svd((points - middle).T @ (moved - middle_moved))
@@ -63,8 +59,8 @@ def motion_between(points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, n
 
 
 def check_projection(
-    sequence: TrackedSequence, timestep: int, vertices: np.ndarray, view: tuple[np.ndarray, np.ndarray, np.ndarray],
-    camera: int = 0, scale: float = 1.0,
+    sequence: TrackedSequence, timestep: int, vertices: np.ndarray, view: View, camera: int = 0, scale: float = 1.0,
+    which: np.ndarray | slice = slice(None),
 ) -> None:  # fmt: skip
     """Check the imported face and camera against the writer's vertices and camera.
 
@@ -77,6 +73,7 @@ def check_projection(
         view: The writer's intrinsics, rotation and translation.
         camera: Index of the camera.
         scale: Size of the writer's world in metres' units.
+        which: The vertices that are compared.
     """
     K, rotation, translation = view
     found = sequence.tracking.cameras[camera]
@@ -84,26 +81,15 @@ def check_projection(
     assert torch.equal(stored.K, found.K)
     assert torch.equal(stored.viewmat, found.viewmat)
     check_intrinsics(found, K)
-    seen = seen_by(sequence, timestep, camera) * scale
-    assert np.abs(seen - (vertices @ rotation.T + translation)).max() < METRES
-    found_rotation, found_translation = motion_between(vertices, seen)
+    mesh = sequence.face_model(sequence.tracking.face[timestep])[0]
+    viewmat = found.viewmat.double().numpy()
+    seen = (mesh.double().numpy() @ viewmat[:3, :3].T + viewmat[:3, 3]) * scale
+    assert np.abs(seen - (vertices @ rotation.T + translation))[which].max() < METRES
+    found_rotation, found_translation = _motion_between(vertices[which], seen[which])
     assert np.abs(found_rotation - rotation).max() < CAMERA
     assert np.abs(found_translation - translation).max() < CAMERA
-    pixels = found.project(sequence.face_model(sequence.tracking.face[timestep])[0])[0].double().numpy()
-    assert np.abs(pixels - projected(vertices, K, rotation, translation)).max() < PIXELS
-
-
-def edges_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the distance in pixels from each pixel of the outline of one silhouette to that of the other, both ways.
-
-    Args:
-        one: A silhouette [h, w] of booleans.
-        other: Another one.
-    """
-    lines = [_outline(each) for each in (one, other)]
-    assert all(line.any() for line in lines)
-    far = [cv2.distanceTransform((~line).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for line in lines]
-    return np.concatenate([far[1][lines[0]], far[0][lines[1]]])
+    pixels = found.project(mesh)[0].double().numpy()
+    assert np.abs(pixels - projected(vertices, K, rotation, translation))[which].max() < PIXELS
 
 
 def _outline(silhouette: np.ndarray) -> np.ndarray:
@@ -113,8 +99,11 @@ def _outline(silhouette: np.ndarray) -> np.ndarray:
 
 
 def check_edges(one: np.ndarray, other: np.ndarray) -> None:
-    """Check that two outlines are less than a pixel apart."""
-    apart = edges_apart(one, other)
+    """Check that the outlines of two silhouettes [h, w] are less than a pixel apart, both ways."""
+    lines = [_outline(each) for each in (one, other)]
+    assert all(line.any() for line in lines)
+    far = [cv2.distanceTransform((~line).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for line in lines]
+    apart = np.concatenate([far[1][lines[0]], far[0][lines[1]]])
     assert np.percentile(apart, _SURE) < 1
     assert apart.max() < 2
 
@@ -133,6 +122,48 @@ def check_pictures(sequence: Any, timestep: int, drawn: tuple[np.ndarray, np.nda
     image, matte = drawn
     assert np.array_equal(sequence.capture.images[timestep, camera], image)
     assert np.array_equal(sequence.capture.mattes[timestep, camera], matte)
+
+
+def read(path: Path, name: str, model: Any = None) -> list[Any]:
+    """Return what the importer of this name reads, which has to recognise the folder by itself."""
+    dataset, _ = recognised(path)
+    assert dataset.name == name
+    return list(dataset.read(path, model))  # type: ignore[arg-type]
+
+
+def read_pictures(path: Path) -> Any:
+    """Return the pictures of a dataset, for them to be tracked again."""
+    dataset, _ = recognised(path)
+    assert dataset.read_pictures is not None
+    (found,) = dataset.read_pictures(path)
+    return found
+
+
+def surveyed(path: Path) -> Findings:
+    """Return what is told of a dataset before it is read."""
+    dataset, _ = recognised(path)
+    assert dataset.survey is not None
+    return dataset.survey(path)
+
+
+def check_import(found: list[Any], layout: Layout, scene: Scene) -> None:
+    """Check sequences that were read: names, faces, cameras, pictures, landmarks and what is held out."""
+    shown = layout.shown(scene)
+    for sequence, (name, timesteps), split in zip(found, layout.clips.items(), layout.splits, strict=True):
+        assert isinstance(sequence, TrackedSequence)
+        assert (sequence.capture.name, sequence.capture.camera_ids) == (name, layout.cameras)
+        assert sequence.own_split == split
+        assert sequence.capture.timesteps == len(timesteps)
+        for row, timestep in enumerate(timesteps):
+            vertices = layout.vertices(shown, timestep)
+            for camera in range(len(layout.cameras)):
+                view = layout.view(timestep, camera)
+                check_projection(sequence, row, vertices, view, camera)
+                check_pictures(sequence, row, draw(shown, vertices, *view, layout.size), camera)
+                marks = sequence.capture.landmarks[row, camera]
+                apart = np.abs(marks - projected(shown.marks(vertices), *view)).max()
+                assert apart < LANDMARKS * sequence.capture.images.shape[2]
+        check_silhouette(sequence)
 
 
 def decoded(video: Path) -> np.ndarray:

@@ -3,7 +3,9 @@
 Vertices come from `posed_as_flame`, a forward pass of its own, in float64. Nothing here calls the importers.
 """
 
+import tempfile
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ import torch
 
 from flame_like import exact_landmarks, flame_like, posed_as_flame, write_npz
 from mien.camera import Camera
-from mien.face import FaceModel
+from mien.face import FaceModel, load_face_model
 from mien.face.flame import flame_face_model, read_flame
 from mien.render import render_mesh
 from mien.rotation import matrix_from_axis_angle
@@ -61,6 +63,13 @@ def make_scene(anny: FaceModel, folder: Path, timesteps: int = 6) -> Scene:
     arrays = flame_like(anny)
     model = flame_face_model(read_flame(write_npz(folder / "flame.npz", arrays)), "flame")
     return scene_of(arrays, replace(model, landmarks=exact_landmarks(anny)), timesteps)
+
+
+@cache
+def drawn_person(timesteps: int = 6) -> Scene:
+    """Return such a head, made once a process."""
+    with tempfile.TemporaryDirectory() as folder:
+        return make_scene(load_face_model("anny"), Path(folder), timesteps)
 
 
 def scene_of(arrays: dict[str, np.ndarray], model: FaceModel, timesteps: int, seed: int = 3) -> Scene:

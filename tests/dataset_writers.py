@@ -151,10 +151,9 @@ def npz(arrays: dict[str, Any]) -> bytes:
 
 def write_vhap(
     folder: Path, scene: Scene, from_below: bool = False, cameras: tuple[str, ...] = ("222200036", "222200037"),
-    size: tuple[int, int] = (SIDE, 136),
 ) -> Path:  # fmt: skip
     """Write an export of VHAP with calibrated cameras. The last camera and the last timesteps are not trained on."""
-    frames = []
+    frames, size = [], (SIDE, SIDE + SIDE // 16)
     held = -(-7 * len(scene) // 10)
     for timestep in range(len(scene)):
         row = {

@@ -11,28 +11,25 @@ import numpy as np
 import pytest
 
 from dataset_cases import NoDetector
-from dataset_scene import SIDE, Scene, head_view, make_scene, projected
+from dataset_scene import SIDE, Scene, drawn_person, head_view, projected
 from dataset_writers import BENCHMARK_SCALE, UNEQUAL, benchmark_vertices, write_benchmark
 from mien.avatar import DEFAULT_METHOD, FaceTuning
 from mien.cli import main
+from mien.datasets import overlay
 from mien.datasets.submission import monocular_tasks
 from mien.face import add_face_model, load_face_model
 from mien.training import read_sequence, train
 from plain_settings import plain_config, plain_run
+from toy_workspace import write_toy_workspace
 
+pytestmark = pytest.mark.unchecked
 TESTED = ("222200037", "222200046", "220700191", "222200039")
 """Cameras of the monocular task, frontal one first."""
 
 
 @pytest.fixture(scope="module")
-def patch() -> Iterator[pytest.MonkeyPatch]:
-    with pytest.MonkeyPatch.context() as patch:
-        yield patch
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return make_scene(load_face_model("anny"), tmp_path_factory.mktemp("flame"), 3)
+def scene() -> Scene:
+    return drawn_person(3)
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +39,9 @@ def person(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def workspace(scene: Scene, person: Path, patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(scene: Scene, person: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Import the person and train two steps."""
-    from mien.datasets import overlay
-
+    patch = pytest.MonkeyPatch()
     patch.setattr(overlay, "LandmarkDetector", NoDetector)
     patch.setenv("MIEN_CACHE", str(tmp_path_factory.mktemp("cache")))
     add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
@@ -55,17 +51,16 @@ def workspace(scene: Scene, person: Path, patch: pytest.MonkeyPatch, tmp_path_fa
     config = plain_config(DEFAULT_METHOD, face_tuning=FaceTuning(enabled=False))
     settings = plain_run(steps=2, record_every=1, checkpoint_every=2, split="none")
     train([sequence], load_face_model("flame"), config, settings, root / "runs" / "a")
-    return root
+    yield root
+    patch.undo()
 
 
 def frames_of(video: Path) -> tuple[np.ndarray, float]:
     """Return the pictures of a video and its rate, by PyAV alone, as the benchmark reads them."""
     with av.open(str(video)) as container:
-        stream = container.streams.video[0]
-        assert stream.average_rate is not None
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]), float(
-            stream.average_rate
-        )
+        rate = container.streams.video[0].average_rate
+        assert rate is not None
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]), float(rate)
 
 
 def inside(pictures: np.ndarray, mattes: np.ndarray, shift: int = 0) -> list[float]:
@@ -92,7 +87,6 @@ def test_faces_and_cameras_are_those_of_the_benchmark(scene: Scene, person: Path
             assert np.abs(found - wanted).max() < 0.02, serial
 
 
-@pytest.mark.slow
 def test_test_sequences_are_rendered_from_their_four_cameras(
     scene: Scene, person: Path, workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,7 +113,6 @@ def test_test_sequences_are_rendered_from_their_four_cameras(
     assert "393: is there already; delete it" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_novel_views_are_rendered_from_the_hidden_cameras(
     person: Path, workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -148,8 +141,6 @@ def test_novel_views_are_rendered_from_the_hidden_cameras(
 
 
 def test_mistakes_are_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from toy_workspace import write_toy_workspace
-
     root, person = tmp_path / "W", tmp_path / "393"
     write_toy_workspace(root)
     (person / "calibration").mkdir(parents=True)

@@ -3,107 +3,68 @@
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from dataset_checks import (
-    CAMERA,
-    PIXELS,
-    check_edges,
-    check_intrinsics,
-    check_projection,
-    check_silhouette,
-    check_view,
-    decoded,
-    filmed_camera,
-)
-from dataset_scene import Scene, draw, head_view, make_scene, projected
-from dataset_writers import (
-    BENCHMARK_SCALE,
-    FRONTAL,
-    UNEQUAL,
-    benchmark_vertices,
-    write_benchmark,
-    write_insta,
-    write_nerf_blendshape,
-    write_nerface,
-    write_nersemble,
-)
+import dataset_checks as checks
+import dataset_writers as writers
+from dataset_cases import unfound
+from dataset_scene import Scene, draw, drawn_person, head_view, projected
 from mien.capture import CaptureSettings
 from mien.capture.calibration import read_calibration
 from mien.capture.video import write_video
 from mien.commands.stages import import_footage
-from mien.datasets import Clip, FilmedSequence, Footage, TrackedSequence, datasets, find_dataset, recognised, sequences
+from mien.datasets import Clip, FilmedSequence, Footage, TrackedSequence, datasets, find_dataset, sequences
+from mien.datasets.nerface import viewmats_from_nerface
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.render import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
-from recordings import live_link_face
 
-
-@pytest.fixture(scope="module")
-def scene(anny, tmp_path_factory) -> Scene:
-    return make_scene(anny, tmp_path_factory.mktemp("flame"))
+pytestmark = pytest.mark.unchecked
 
 
 @pytest.fixture
-def undetected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the detector, which finds no face in drawings this small."""
-
-    def found(images: np.ndarray) -> np.ndarray:
-        return np.full((*images.shape[:2], 478, 2), 5, np.float32)
-
-    monkeypatch.setattr(sequences, "detected_landmarks", found)
-
-
-def read(path: Path, name: str, model: Any = None) -> list[Any]:
-    dataset, _ = recognised(path)
-    assert dataset.name == name
-    return list(dataset.read(path, model))  # type: ignore[arg-type]
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """Return the drawn person. The detector is left out, since it finds no face in drawings this small."""
+    monkeypatch.setattr(sequences, "detected_landmarks", unfound)
+    return drawn_person()
 
 
 def check_pose(
     sequence: FilmedSequence, row: int, timestep: int, scene: Scene, person: np.ndarray, scale: float = 1.0
 ) -> None:
-    """Check a picture's head-to-camera matrix, in a world of another scale.
-
-    Args:
-        sequence: The import.
-        row: Index of the picture.
-        timestep: Its timestep in the scene.
-        scene: The scene.
-        person: The pixels [h, w] of the person by the imported picture.
-        scale: Size of the dataset's world in metres' units.
-    """
+    """Check a picture's head-to-camera matrix, in a world of another scale. `person` [h, w] are the pixels of it."""
     rotation, translation = head_view(timestep)
     matrix = sequence.foreign["head_to_camera"][row].astype(np.float64)
-    assert np.abs(matrix[:3, :3] - rotation).max() < CAMERA
-    assert np.abs(matrix[:3, 3] - translation * scale).max() < CAMERA
+    assert np.abs(matrix[:3, :3] - rotation).max() < checks.CAMERA
+    assert np.abs(matrix[:3, 3] - translation * scale).max() < checks.CAMERA
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1, abs=1e-5)
     vertices = scene.vertices(timestep, root=False)
     placed = (vertices * scale) @ matrix[:3, :3].T + matrix[:3, 3]
-    camera = filmed_camera(sequence)
-    check_intrinsics(camera, UNEQUAL)
-    check_view(camera, np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    camera = checks.filmed_camera(sequence)
+    checks.check_intrinsics(camera, writers.UNEQUAL)
+    checks.check_view(camera, np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     K, still = camera.K.double().numpy(), (np.eye(3), np.zeros(3))
-    assert np.abs(projected(placed, K, *still) - projected(vertices, UNEQUAL, rotation, translation)).max() < PIXELS
-    check_edges(draw(scene, placed, K, *still)[1] > 127, person)
+    assert (
+        np.abs(projected(placed, K, *still) - projected(vertices, writers.UNEQUAL, rotation, translation)).max()
+        < checks.PIXELS
+    )
+    checks.check_edges(draw(scene, placed, K, *still)[1] > 127, person)
 
 
-@pytest.mark.usefixtures("undetected")
 def test_nerface(scene: Scene, tmp_path: Path) -> None:
-    folder = write_nerface(tmp_path / "person_1", scene)
-    train, test = read(folder, "nerface")
+    folder = writers.write_nerface(tmp_path / "person_1", scene)
+    train, test = checks.read(folder, "nerface")
     assert isinstance(train, FilmedSequence)
     assert (train.capture.name, test.capture.name) == ("train", "test")
     assert train.foreign["expression"][:, 0].tolist() == [0, 1, 2, 3], "the order of time"
     for sequence, timesteps in ((train, range(4)), (test, [5])):
         for index, timestep in enumerate(timesteps):
             vertices = scene.vertices(timestep, root=False)
-            image, _ = draw(scene, vertices, UNEQUAL, *head_view(timestep))
+            image, _ = draw(scene, vertices, writers.UNEQUAL, *head_view(timestep))
             assert np.array_equal(sequence.capture.images[index, 0], image)
             person = sequence.capture.images[index, 0].min(-1) < 245  # before a white wall
             check_pose(sequence, index, timestep, scene, person, 0.6)
@@ -114,21 +75,18 @@ def test_nerface(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_nerface_that_is_not_mirrored_is_plain_opengl() -> None:
-    from mien.datasets.nerface import viewmats_from_nerface
-
-    rotation, translation = head_view(1)
     view = np.eye(4)
-    view[:3, :3], view[:3, 3] = rotation, translation
+    view[:3, :3], view[:3, 3] = head_view(1)
     pose = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
     assert np.abs(viewmats_from_nerface(pose[None], 100.0)[0] - view).max() < 1e-12
 
 
 def test_nerf_blendshape(scene: Scene, tmp_path: Path) -> None:
-    folder = write_nerf_blendshape(tmp_path / "id1", scene)
-    (sequence,) = read(folder, "nerf-blendshape")
+    folder = writers.write_nerf_blendshape(tmp_path / "id1", scene)
+    (sequence,) = checks.read(folder, "nerf-blendshape")
     for timestep in range(len(scene)):
         vertices = scene.vertices(timestep, root=False)
-        image, matte = draw(scene, vertices, UNEQUAL, *head_view(timestep))
+        image, matte = draw(scene, vertices, writers.UNEQUAL, *head_view(timestep))
         assert np.array_equal(sequence.capture.mattes[timestep, 0], (matte > 127) * np.uint8(255))
         stored = Image.open(folder / f"ori_imgs/{7 + timestep + (timestep > 2)}.jpg")
         assert np.array_equal(sequence.capture.images[timestep, 0], np.asarray(stored))
@@ -141,8 +99,11 @@ def test_nerf_blendshape(scene: Scene, tmp_path: Path) -> None:
 
 def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: Scene, tmp_path: Path) -> None:
     """Their axes and unit are found by landmarks. The person differs from the mean head by some millimetres."""
-    folder, model = write_nerf_blendshape(tmp_path / "id1", scene, 7.0, True), load_face_model("coefficients-46")
-    (sequence,) = read(folder, "nerf-blendshape", model)
+    folder, model = (
+        writers.write_nerf_blendshape(tmp_path / "id1", scene, 7.0, True),
+        load_face_model("coefficients-46"),
+    )
+    (sequence,) = checks.read(folder, "nerf-blendshape", model)
     assert isinstance(sequence, TrackedSequence)
     face, camera = sequence.tracking.face, sequence.tracking.cameras[0]
     assert np.allclose(face.expression[:, 45], np.arange(6) / 10)
@@ -151,7 +112,7 @@ def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: 
     mattes, mesh, above = sequence.capture.mattes, model(face), model.faces[~model.region_mask("neck")]
     for timestep in range(len(scene)):
         marks = scene.marks(scene.vertices(timestep, root=False, neck=False))
-        expected = projected(marks, UNEQUAL, *head_view(timestep))
+        expected = projected(marks, writers.UNEQUAL, *head_view(timestep))
         apart = np.linalg.norm(drawn[timestep] - expected, axis=1)
         assert np.median(apart) < 0.12 * np.linalg.norm(expected[33] - expected[263]), timestep
         covered = (rasterize_mesh(mesh[timestep], above, camera).face_index >= 0).numpy()
@@ -162,77 +123,74 @@ def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: 
         views = [np.diag([1.0, -1, -1]) @ head_view(each)[0] for each in (0, timestep)]
         assert np.abs(turned[timestep] @ turned[0].T - views[1] @ views[0].T).max() < 1e-4
     with pytest.raises(UserError, match="has 46 coefficients, and --face-model coefficients-76 has 76; give"):
-        read(folder, "nerf-blendshape", load_face_model("coefficients-76"))
+        checks.read(folder, "nerf-blendshape", load_face_model("coefficients-76"))
     file = folder / "transforms.json"
     content = json.loads(file.read_text())
     for index, frame in enumerate(content["frames"]):
         frame["transform_matrix"][0][3] += (-1) ** index * 1.5  # no place of the head fits places that jump by 40 cm
     file.write_text(json.dumps(content))
     with pytest.raises(UserError, match="by its poses, landmarks are"):
-        read(folder, "nerf-blendshape", model)
+        checks.read(folder, "nerf-blendshape", model)
 
 
 def test_benchmark_of_one_camera(scene: Scene, tmp_path: Path) -> None:
-    folder = write_benchmark(tmp_path / "393", scene)
-    (sequence,) = read(folder, "nersemble-benchmark", scene.model)
+    folder = writers.write_benchmark(tmp_path / "393", scene)
+    (sequence,) = checks.read(folder, "nersemble-benchmark", scene.model)
     assert isinstance(sequence, TrackedSequence)
     assert sequence.capture.name == "EXP-2-eyes"
     truth = np.load(folder / "truth.npz")
-    view = (UNEQUAL, *head_view(2, 1.0))
-    films = [decoded(folder / f"sequences/EXP-2-eyes/{part}/cam_{FRONTAL}.mp4") for part in ("images", "alpha_maps")]
+    view = (writers.UNEQUAL, *head_view(2, 1.0))
+    films = [
+        checks.decoded(folder / f"sequences/EXP-2-eyes/{part}/cam_{writers.FRONTAL}.mp4")
+        for part in ("images", "alpha_maps")
+    ]
     assert np.array_equal(sequence.capture.images[:, 0], films[0])
     assert np.array_equal(sequence.capture.mattes[:, 0], films[1][..., 0])
     for timestep in range(len(scene)):
-        vertices = benchmark_vertices(scene, timestep, truth["angles"][timestep], truth["shifts"][timestep])
-        check_projection(sequence, timestep, vertices, view, scale=BENCHMARK_SCALE)
+        vertices = writers.benchmark_vertices(scene, timestep, truth["angles"][timestep], truth["shifts"][timestep])
+        checks.check_projection(sequence, timestep, vertices, view, scale=writers.BENCHMARK_SCALE)
         image, matte = draw(scene, vertices, *view)
         assert np.abs(films[0][timestep].astype(int) - image).mean() < 4
         assert np.abs(films[1][timestep, ..., 0].astype(int) - matte).max() < 4
-    check_silhouette(sequence)
-    survey = recognised(folder)[0].survey
-    assert survey is not None
-    assert any("pictures of FREE, which are hidden" in each for each in survey(folder).missing)
-
-
-def test_benchmark_with_euler_angles_of_another_order_is_refused(scene: Scene, tmp_path: Path) -> None:
-    folder = write_benchmark(tmp_path / "393", scene)
+    checks.check_silhouette(sequence)
+    assert any("pictures of FREE, which are hidden" in each for each in checks.surveyed(folder).missing)
+    # Euler angles of another order are refused.
     file = folder / "sequences/EXP-2-eyes/tracking/flame2023_tracking_v2.npz"
     arrays = dict(np.load(file))
     arrays["rotation"] = arrays["rotation"][:, ::-1]
     np.savez(file, **arrays)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="'rotation' and 'rotation_matrices' differ"):
-        read(folder, "nersemble-benchmark", scene.model)
+        checks.read(folder, "nersemble-benchmark", scene.model)
 
 
-@pytest.mark.usefixtures("undetected")
 def test_benchmark_of_novel_views(scene: Scene, tmp_path: Path) -> None:
-    folder = write_benchmark(tmp_path / "388", scene, ("222200042", "222200044"), tracked=False)
-    (sequence,) = read(folder, "nersemble-benchmark")
+    folder = writers.write_benchmark(tmp_path / "388", scene, ("222200042", "222200044"), tracked=False)
+    (sequence,) = checks.read(folder, "nersemble-benchmark")
     assert sequence.capture.camera_ids == ("222200042", "222200044")
     truth = np.load(folder / "truth.npz")
     for camera, serial in enumerate(sequence.capture.camera_ids):
         view = head_view(2 + camera, 1.0)
-        check_intrinsics(filmed_camera(sequence, camera), UNEQUAL)
-        check_view(filmed_camera(sequence, camera), *view)
+        checks.check_intrinsics(checks.filmed_camera(sequence, camera), writers.UNEQUAL)
+        checks.check_view(checks.filmed_camera(sequence, camera), *view)
         place = folder / "sequences/EXP-2-eyes"
-        assert np.array_equal(sequence.capture.images[:, camera], decoded(place / f"images/cam_{serial}.mp4"))
-        mattes = decoded(place / f"alpha_maps/cam_{serial}.mp4")[..., 0]
+        assert np.array_equal(sequence.capture.images[:, camera], checks.decoded(place / f"images/cam_{serial}.mp4"))
+        mattes = checks.decoded(place / f"alpha_maps/cam_{serial}.mp4")[..., 0]
         assert np.array_equal(sequence.capture.mattes[:, camera], mattes)
         for timestep in range(len(scene)):
-            vertices = benchmark_vertices(scene, timestep, truth["angles"][timestep], truth["shifts"][timestep])
-            image, matte = draw(scene, vertices, UNEQUAL, *view)
+            vertices = writers.benchmark_vertices(scene, timestep, truth["angles"][timestep], truth["shifts"][timestep])
+            image, matte = draw(scene, vertices, writers.UNEQUAL, *view)
             assert np.abs(sequence.capture.images[timestep, camera].astype(int) - image).mean() < 4
-            check_edges(matte > 127, mattes[timestep] > 127)
+            checks.check_edges(matte > 127, mattes[timestep] > 127)
 
 
 def test_nersemble_is_captured_with_its_cameras_and_clean_plates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = write_nersemble(tmp_path / "017")
-    (footage,) = read(folder, "nersemble")
+    folder = writers.write_nersemble(tmp_path / "017")
+    (footage,) = checks.read(folder, "nersemble")
     assert isinstance(footage, Footage)
     assert footage.stride == 3
-    asked: list[Any] = []
+    names, asked = ("222200036", writers.FRONTAL), []
 
     def capture(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
         assert settings.clean_plate is not None
@@ -244,7 +202,6 @@ def test_nersemble_is_captured_with_its_cameras_and_clean_plates(
 
     monkeypatch.setattr(import_footage, "capture_cameras", capture)
     import_footage.write_footage(tmp_path / "out", footage, find_dataset("nersemble"), folder)
-    names = ["222200036", FRONTAL]
     assert asked == [([f"{name}.mp4" for name in names], [f"{name}.jpg" for name in names])]
     assert (tmp_path / "out/dataset.json").is_file()
 
@@ -260,30 +217,27 @@ def test_nersemble_is_captured_with_its_cameras_and_clean_plates(
     assert not (tmp_path / "out2").exists()
 
 
-def test_videos_of_nersemble_are_counted_before_they_are_read(scene: Scene, tmp_path: Path) -> None:
+def test_videos_of_nersemble_are_counted_before_they_are_read(tmp_path: Path) -> None:
     """Every third frame is taken. A video that leads nowhere is refused when it is read, with its name."""
 
     def seven(path: Path, serial: str) -> None:
         write_video(path, iter(np.zeros((7, 32, 32, 3), np.uint8)), 73.0)
 
-    folder = write_nersemble(tmp_path / "017", film=seven)
-    dataset = find_dataset("nersemble")
-    assert dataset.survey is not None
-    assert dataset.survey(folder).clips == (Clip("EMO-1-shout+laugh", 3, 2),)
+    folder = writers.write_nersemble(tmp_path / "017", film=seven)
+    assert checks.surveyed(folder).clips == (Clip("EMO-1-shout+laugh", 3, 2),)
     video = folder / "sequences/EMO-1-shout+laugh/images/cam_222200036.mp4"
     video.unlink()
     video.symlink_to(video)
-    assert dataset.survey(folder).clips == (Clip("EMO-1-shout+laugh", 3, 2),)
+    assert checks.surveyed(folder).clips == (Clip("EMO-1-shout+laugh", 3, 2),)
     with pytest.raises(UserError, match=r"cam_222200036.mp4: is missing, or no file"):
-        read(folder, "nersemble")
+        checks.read(folder, "nersemble")
 
 
 def test_a_benchmark_person_without_its_mattes_is_no_raw_recording(scene: Scene, tmp_path: Path) -> None:
-    folder = write_benchmark(tmp_path / "393", scene, ("222200036", FRONTAL), False)
-    survey = find_dataset("nersemble-benchmark").survey
-    assert survey is not None
-    assert [(clip.frames, clip.cameras) for clip in survey(folder).clips] == [(len(scene), 2)]
-    (hidden,) = (each for each in survey(folder).missing if "hidden" in each)
+    folder = writers.write_benchmark(tmp_path / "393", scene, ("222200036", writers.FRONTAL), False)
+    found = checks.surveyed(folder)
+    assert [(clip.frames, clip.cameras) for clip in found.clips] == [(len(scene), 2)]
+    (hidden,) = (each for each in found.missing if "hidden" in each)
     assert hidden == "the cameras 222200046, 222200039, which are hidden"
     mattes = folder / "sequences/EXP-2-eyes/alpha_maps"
     shutil.rmtree(mattes)
@@ -291,44 +245,36 @@ def test_a_benchmark_person_without_its_mattes_is_no_raw_recording(scene: Scene,
         mattes.symlink_to(target)
         assert [each.name for each in datasets() if each.recognises(folder)] == ["nersemble-benchmark"]
         with pytest.raises(UserError, match="is missing, the mattes of cam_222200037.mp4"):
-            read(folder, "nersemble-benchmark")
+            checks.read(folder, "nersemble-benchmark")
         mattes.unlink()
     for video in (folder / "sequences/EXP-2-eyes/images").iterdir():
         video.unlink()
         video.symlink_to(video)
     mattes.mkdir()
     with pytest.raises(UserError, match="images: none of its videos"):
-        read(folder, "nersemble-benchmark")
-
-
-TAKE = "Timecode,BlendshapeCount,"
+        checks.read(folder, "nersemble-benchmark")
 
 
 def test_a_take_of_live_link_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "20240131_Me_3"
-    folder.mkdir()
-    live_link_face(folder, [{"jawOpen": 0.1 * index} for index in range(5)]).rename(folder / "Me_3_iPhone_cal.csv")
-    (folder / "Me_3_iPhone_raw.csv").write_text(TAKE)
-    (folder / "Me_3_iPhone.mov").write_bytes(b"0")
-    (folder / "take.json").write_text("{}")
-    (footage,) = read(folder, "live-link-face")
+    folder = writers.write_take(tmp_path / "20240131_Me_3")
+    (folder / "Me_3_iPhone_raw.csv").write_text("Timecode,BlendshapeCount,")
+    (footage,) = checks.read(folder, "live-link-face")
     assert (footage.name, footage.videos[0].name) == ("20240131_Me_3", "Me_3_iPhone.mov")
     assert footage.files["driving.csv"] == (folder / "Me_3_iPhone_cal.csv").read_bytes()
     monkeypatch.setattr(import_footage, "capture_video", lambda video, out, settings, name: out.mkdir(parents=True))
     import_footage.write_footage(tmp_path / "out", footage, find_dataset("live-link-face"), folder)
     assert (tmp_path / "out/driving.csv").is_file()
-    (folder / "Me_3_iPhone_cal.csv").write_text(TAKE + "EyeBlinkLeft\nnothing\n")
+    (folder / "Me_3_iPhone_cal.csv").write_text("Timecode,BlendshapeCount,EyeBlinkLeft\nnothing\n")
     with pytest.raises(UserError):
-        read(folder, "live-link-face")
+        checks.read(folder, "live-link-face")
 
 
-@pytest.mark.usefixtures("undetected")
 def test_insta_without_checkpoints_is_pictures(scene: Scene, tmp_path: Path) -> None:
-    folder = write_insta(tmp_path / "me", scene, checkpoints=False)
-    (sequence,) = read(folder, "insta")
+    folder = writers.write_insta(tmp_path / "me", scene, checkpoints=False)
+    (sequence,) = checks.read(folder, "insta")
     assert isinstance(sequence, FilmedSequence)
     view = np.linalg.inv(sequence.foreign["camera_to_head"][1])
     assert np.abs(view[:3, :3] - head_view(1)[0]).max() < 1e-6
     shutil.rmtree(folder / "images")
     with pytest.raises(UserError, match=r"images/00000.png: is missing"):
-        read(folder, "insta")
+        checks.read(folder, "insta")

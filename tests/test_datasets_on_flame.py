@@ -1,182 +1,238 @@
 """Datasets that are tracked on FLAME: what independent writers wrote is imported, and lies on its pictures."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from dataset_checks import check_pictures, check_projection, check_silhouette, check_view
-from dataset_scene import SIDE, Scene, draw, head_view, make_scene, projected
-from dataset_writers import (
-    IMAVATAR_PLACE,
-    OFF_CENTRE,
-    UNEQUAL,
-    imavatar_classes,
-    seen_by_tracker,
-    write_flash_avatar,
-    write_imavatar,
-    write_insta,
-    write_vhap,
-)
-from mien.commands.stages import importing
-from mien.datasets import Dataset, Findings, TrackedSequence, find_dataset, recognised
+import dataset_checks as checks
+import dataset_layouts as layouts
+import dataset_writers as writers
+from dataset_cases import NoDetector, unfound
+from dataset_scene import SIDE, Scene, draw, drawn_person
+from flame_like import write_npz
+from mien.datasets import find_dataset, insta, matting, overlay, sequences, write_sequence
 from mien.datasets.pictures import read_picture
 from mien.errors import UserError
+from mien.face import FaceModel, teeth
+from mien.face.flame import flame_face_model, read_flame
+from mien.training import OwnSplit
 from mien.training.footage import clothes_mask
-from mien.workspace import Workspace
 
-MIRROR = np.diag([1.0, -1.0, -1.0])
-
-
-@pytest.fixture(scope="module")
-def scene(anny, tmp_path_factory) -> Scene:
-    return make_scene(anny, tmp_path_factory.mktemp("flame"))
+pytestmark = pytest.mark.unchecked
 
 
-def read(path: Path, scene: Scene, name: str) -> list[TrackedSequence]:
-    dataset, _ = recognised(path)
-    assert dataset.name == name
-    found = list(dataset.read(path, scene.model))  # type: ignore[arg-type]
-    assert all(isinstance(each, TrackedSequence) for each in found)
-    return found  # type: ignore[return-value]
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """Return the drawn person. The detector is left out, since it finds no face in drawings this small."""
+    monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
+    monkeypatch.setattr(sequences, "detected_landmarks", unfound)
+    return drawn_person()
 
 
-def surveyed(path: Path) -> Findings:
-    dataset: Dataset = recognised(path)[0]
-    assert dataset.survey is not None
-    return dataset.survey(path)
+def refused(folder: Path, scene: Scene, words: str, name: str = "insta") -> None:
+    with pytest.raises(UserError, match=words):
+        checks.read(folder, name, scene.model)
 
 
-def check_landmarks(sequence: TrackedSequence, vertices: Callable[[int], np.ndarray], view: tuple) -> None:
-    """Check the imported landmarks against triangles of the writer's vertices."""
-    marks, faces = sequence.face_model.landmarks["mediapipe"], sequence.face_model.faces
-    for timestep in range(sequence.capture.timesteps):
-        points = torch.from_numpy(vertices(timestep))[faces[marks.faces]]
-        expected = projected((points * marks.barycentric.double()[..., None]).sum(1).numpy(), *view)
-        assert np.abs(sequence.capture.landmarks[timestep, 0] - expected).max() < 0.005
+@pytest.mark.parametrize("name", layouts.TRACKED)
+def test_what_was_written_comes_back(name: str, scene: Scene, tmp_path: Path) -> None:
+    layout = layouts.TRACKED[name]
+    folder = layout.write(tmp_path / "me", scene)
+    checks.check_import(checks.read(folder, layout.reads, scene.model), layout, scene)
+    found = checks.surveyed(folder)
+    assert sum(clip.frames or 0 for clip in found.clips) == sum(map(len, layout.clips.values()))
+    assert not any("mattes" in each for each in found.missing)
+    if layout.retracked:
+        check_retracked(folder, name, scene)
 
 
-def test_insta(scene: Scene, tmp_path: Path) -> None:
-    folder = write_insta(tmp_path / "me", scene)
-    (sequence,) = read(folder, scene, "insta")
-    assert sequence.capture.name == "me"
+def check_retracked(folder: Path, name: str, scene: Scene) -> None:
+    """Check what is tracked again: the tracker's camera, pictures and mattes."""
+    sequence, layout = checks.read_pictures(folder), layouts.TRACKED[name]
+    checks.check_view(checks.filmed_camera(sequence), layouts.MIRROR, np.zeros(3))
     for timestep in range(len(scene)):
-        vertices = scene.vertices(timestep, root=False, neck=False)
-        check_projection(sequence, timestep, vertices, (OFF_CENTRE, *head_view(timestep)))
-        check_pictures(sequence, timestep, seen_by_tracker(scene, timestep, OFF_CENTRE))
-    check_silhouette(sequence)
-    findings = surveyed(folder)
-    assert findings.clips[0].frames == 6
-    assert findings.face_model == "FLAME 2020"
+        view = layout.view(timestep, 0)
+        checks.check_intrinsics(checks.filmed_camera(sequence), view[0])
+        checks.check_pictures(sequence, timestep, draw(scene, layout.vertices(scene, timestep), *view, layout.size))
 
 
-def test_flash_avatar_counts_pictures_from_one(scene: Scene, tmp_path: Path) -> None:
-    (sequence,) = read(write_flash_avatar(tmp_path / "root", scene), scene, "insta")
-    for timestep in range(len(scene)):
-        vertices = scene.vertices(timestep, root=False, neck=False)
-        check_projection(sequence, timestep, vertices, (OFF_CENTRE, *head_view(timestep)))
-        check_pictures(sequence, timestep, seen_by_tracker(scene, timestep, OFF_CENTRE))
-    check_silhouette(sequence)
+def test_cameras_of_vhap_are_the_writer_s_and_a_single_one_is_mien_s(scene: Scene, tmp_path: Path) -> None:
+    (rig,) = checks.read(writers.write_vhap(tmp_path / "rig", scene), "vhap", scene.model)
+    for camera in range(2):
+        checks.check_view(rig.tracking.cameras[camera], *layouts.TRACKED["vhap"].view(0, camera)[1:])
+    (single,) = checks.read(writers.write_vhap(tmp_path / "single", scene, cameras=("0",)), "vhap", scene.model)
+    assert torch.equal(checks.filmed_camera(single).viewmat, torch.diag(torch.tensor([1.0, -1, -1, 1])))
 
 
-def test_imavatar(scene: Scene, tmp_path: Path) -> None:
-    folder = write_imavatar(tmp_path / "subject1", scene)
-    train, test = read(folder, scene, "imavatar")
-    assert (train.capture.name, test.capture.name) == ("MVI_1810", "MVI_1812")
-    view = (UNEQUAL, MIRROR, MIRROR @ IMAVATAR_PLACE / 4)
-    for first, sequence in ((0, train), (3, test)):
-        for timestep in range(3):
-            vertices = scene.vertices(first + timestep) - scene.translation[first + timestep]
-            check_projection(sequence, timestep, vertices, view)
-            check_pictures(sequence, timestep, draw(scene, vertices, *view))
-        check_silhouette(sequence)
-        check_landmarks(sequence, lambda t, first=first: scene.vertices(first + t) - scene.translation[first + t], view)
-    assert train.own_split is not None
-    assert test.own_split is not None
-    assert not train.own_split.whole(3)
-    assert test.own_split.whole(3)
-    assert surveyed(folder).split == "the clip MVI_1812 is held out"
+def test_imavatar_keeps_the_masks_of_clothes(scene: Scene, tmp_path: Path) -> None:
+    folder = writers.write_imavatar(tmp_path / "me", scene)
+    assert checks.surveyed(folder).split == "the clip MVI_1812 is held out"
+    _, test = checks.read(folder, "imavatar", scene.model)
     for timestep in range(3):
-        packed = np.asarray(test.foreign["clothes"])
-        expected = np.isin(imavatar_classes(test.capture.mattes[timestep, 0]), (15, 16))
+        expected = np.isin(writers.imavatar_classes(test.capture.mattes[timestep, 0]), (15, 16))
         assert expected.any()
-        assert np.array_equal(clothes_mask(packed, timestep, expected.shape[1]), expected)
-    shutil.rmtree(folder / "subject1/MVI_1810/semantic")
-    assert surveyed(folder).missing == ("semantic of MVI_1810: figures without clothes need it",)
-    assert not read(folder, scene, "imavatar")[0].foreign
+        found = clothes_mask(np.asarray(test.foreign["clothes"]), timestep, expected.shape[1])
+        assert np.array_equal(found, expected)
+    shutil.rmtree(folder / "me/MVI_1810/semantic")
+    assert checks.surveyed(folder).missing == ("semantic of MVI_1810: figures without clothes need it",)
+    assert not checks.read(folder, "imavatar", scene.model)[0].foreign
 
 
-@pytest.mark.parametrize("from_below", [False, True])
-def test_vhap(scene: Scene, tmp_path: Path, from_below: bool) -> None:
-    folder = write_vhap(tmp_path / "306_EMO-1", scene, from_below)
-    (sequence,) = read(folder, scene, "vhap")
-    assert sequence.capture.camera_ids == ("222200036", "222200037")
-    for timestep in range(len(scene)):
-        for camera in range(2):
-            view = (UNEQUAL, *head_view(2 + camera, 1.0))
-            check_projection(sequence, timestep, scene.vertices(timestep), view, camera)
-            check_view(sequence.tracking.cameras[camera], *view[1:])
-            drawn = draw(scene, scene.vertices(timestep), *view, (SIDE, 136))
-            check_pictures(sequence, timestep, drawn, camera)
-    check_silhouette(sequence)
-    assert sequence.own_split is not None
-    assert sequence.own_split.timesteps == ((5, 6),)
-    assert sequence.own_split.cameras == ("222200037",)
-
-
-def test_vhap_of_one_camera_has_the_camera_of_mien(scene: Scene, tmp_path: Path) -> None:
-    folder = write_vhap(tmp_path / "me", scene, cameras=("0",))
-    (sequence,) = read(folder, scene, "vhap")
-    assert sequence.capture.calibration is not None
-    assert torch.equal(sequence.capture.calibration[0].viewmat, torch.diag(torch.tensor([1.0, -1, -1, 1])))
-    for timestep in range(len(scene)):
-        view = (UNEQUAL, *head_view(2, 1.0))
-        check_projection(sequence, timestep, scene.vertices(timestep), view)
-        check_pictures(sequence, timestep, draw(scene, scene.vertices(timestep), *view, (SIDE, 136)))
-    check_silhouette(sequence)
-
-
-def test_without_flame_the_remedy_is_told(scene: Scene, tmp_path: Path, anny) -> None:
-    folder = write_insta(tmp_path / "me", scene)
+def test_without_flame_the_remedy_is_told(scene: Scene, anny: FaceModel, tmp_path: Path) -> None:
+    folder = writers.write_insta(tmp_path / "me", scene)
+    assert checks.surveyed(folder).face_model == "FLAME 2020"
     for model in (None, anny):
         with pytest.raises(UserError, match=r"its tracking needs FLAME 2020 \(generic_model.pkl\)"):
-            list(find_dataset("insta").read(folder, model))  # type: ignore[arg-type]
+            checks.read(folder, "insta", model)
 
 
 def test_a_tracking_that_does_not_fit_its_pictures_is_refused(scene: Scene, tmp_path: Path) -> None:
-    """The mesh of other conventions lies beside the person."""
-    from dataset_writers import tracker_frame, write_frame
-
-    folder = write_insta(tmp_path / "me", scene)
+    folder = writers.write_insta(tmp_path / "me", scene)
     for number in range(7):
-        frame = tracker_frame(scene, min(number, 5), OFF_CENTRE)
+        frame = writers.tracker_frame(scene, min(number, 5), writers.OFF_CENTRE)
         frame["opencv"]["t"] += np.array([0.15, 0, 0], np.float32)
-        write_frame(folder / f"checkpoint/{number:05d}.frame", frame)
-    with pytest.raises(UserError, match="of the tracked head lies on the person in me"):
-        list(find_dataset("insta").read(folder, scene.model))  # type: ignore[arg-type]
+        writers.write_frame(folder / f"checkpoint/{number:05d}.frame", frame)
+    refused(folder, scene, "of the tracked head lies on the person in me")
 
 
-@pytest.mark.parametrize("layout", ["insta", "vhap"])
-def test_the_imported_mesh_is_drawn_over_some_pictures(
-    layout: str, scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The drawn mesh covers the person, and nothing else. The last line names the picture."""
-    folder = write_insta(tmp_path / "me", scene) if layout == "insta" else write_vhap(tmp_path / "me", scene)
-    found = read(folder, scene, layout)
-    importing._write_sequences(found, Workspace(tmp_path / "W"), find_dataset(layout), folder, False)
-    first = tmp_path / "W/sequences" / found[0].capture.name / "tracking/overlay.png"
-    assert f"the imported mesh over some pictures: {first}" in capsys.readouterr().err.splitlines()[-1]
-    for sequence in found:
-        place = tmp_path / "W/sequences" / sequence.capture.name / "tracking/overlay.png"
-        pixels = read_picture(place)[0].astype(int)
-        count = min(6, max(sequence.capture.timesteps, len(sequence.tracking.cameras)))
-        assert pixels.shape == (480, 240 * count, 3)
-        above, below = pixels[20:240], pixels[260:]  # without the line that names the frame
-        person, drawn = (above < 250).any(-1), np.abs(above - below).max(-1) > 3
-        assert (person & drawn).sum() > 0.95 * (person | drawn).sum()
-        assert 0.2 < person.mean() < 0.9
-        seen = [pixels[:240, at : at + 240] for at in range(0, 240 * count, 240)]
-        assert all(np.abs(one - other).max() > 50 for one, other in zip(seen, seen[1:], strict=False))
+@pytest.mark.parametrize("name", ["insta", "vhap"])
+def test_the_imported_mesh_is_drawn_over_some_pictures(name: str, scene: Scene, tmp_path: Path) -> None:
+    """The drawn mesh covers the person, and nothing else."""
+    folder = layouts.TRACKED[name].write(tmp_path / "me", scene)
+    (sequence,) = checks.read(folder, name, scene.model)
+    write_sequence(tmp_path / "out", sequence, find_dataset(name), folder)
+    pixels = read_picture(tmp_path / "out/tracking/overlay.png")[0].astype(int)
+    assert pixels.shape == (480, 240 * 6, 3)
+    above, below = pixels[20:240], pixels[260:]  # without the line that names the frame
+    person, drawn = (above < 250).any(-1), np.abs(above - below).max(-1) > 3
+    assert (person & drawn).sum() > 0.95 * (person | drawn).sum()
+    assert 0.2 < person.mean() < 0.9
+    seen = [pixels[:240, at : at + 240] for at in range(0, 240 * 6, 240)]
+    assert all(np.abs(one - other).max() > 50 for one, other in zip(seen, seen[1:], strict=False))
+
+
+# Mattes, sizes and splits of what metrical-tracker leaves -------------------------------------------------------------
+
+
+@pytest.fixture
+def matted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
+    """Replace the network of mattes by the drawn ones. Return the list of the pictures that it was asked about."""
+    asked: list[np.ndarray] = []
+
+    def fill(images: np.ndarray, mattes: np.ndarray, plate: np.ndarray | None = None) -> None:
+        assert not mattes.any()
+        asked.append(np.array(images))
+        for timestep in range(len(images)):
+            mattes[timestep, 0] = writers.seen_by_tracker(scene, timestep, writers.OFF_CENTRE)[1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(matting, "fill_mattes", fill)
+        yield asked
+
+
+def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path, matted: list[np.ndarray]) -> None:
+    folder = layouts.write_tracker_output(tmp_path / "me", scene)
+    found = checks.read(folder, "insta", scene.model)
+    checks.check_import(found, layouts.TRACKED["insta"], scene)
+    check_retracked(folder, "insta", scene)
+    assert "mattes: they are made by mien" in checks.surveyed(folder).missing
+    assert len(matted) == 2
+    assert all(np.array_equal(images, found[0].capture.images) for images in matted)
+    # Pictures with opacities are preferred to those without.
+    layouts.write_gaussian_blendshapes(tmp_path / "other", scene)
+    (tmp_path / "other/images").rename(folder / "matted")
+    checks.check_import(checks.read(folder, "insta", scene.model), layouts.TRACKED["insta"], scene)
+    assert len(matted) == 2
+
+
+def test_a_picture_without_opacity_or_mask_is_a_damaged_copy(scene: Scene, tmp_path: Path) -> None:
+    folder = layouts.write_gaussian_blendshapes(tmp_path / "me", scene)
+    pixels = cv2.imread(str(folder / "images/00004.png"))
+    assert pixels is not None
+    assert cv2.imwrite(str(folder / "images/00004.png"), pixels)
+    refused(folder, scene, r"00004.png: has no opacity and no matte; copy")
+    folder = layouts.write_masked(tmp_path / "masked", scene)
+    (folder / "image_mask/mask_00002.png").unlink()
+    refused(folder, scene, r"00002.png: has no opacity and no matte; copy")
+
+
+def test_larger_pictures_beside_images_are_told_and_in_their_place_used(scene: Scene, tmp_path: Path) -> None:
+    folder = writers.write_insta(tmp_path / "me", scene)
+    layouts.write_larger(tmp_path / "other", scene)
+    (tmp_path / "other/images.HQ").rename(folder / "images.HQ")
+    assert "the larger pictures of images.HQ, which are not used beside images" in checks.surveyed(folder).missing
+    checks.check_import(checks.read(folder, "insta", scene.model), layouts.TRACKED["insta"], scene)
+    for file in sorted((folder / "images.HQ").iterdir()):
+        file.replace(folder / "images" / file.name)
+    for sequence in (*checks.read(folder, "insta", scene.model), checks.read_pictures(folder)):
+        checks.check_intrinsics(checks.filmed_camera(sequence), layouts.enlarged(writers.OFF_CENTRE, 2))
+
+
+def test_impossible_sizes_are_refused(scene: Scene, tmp_path: Path) -> None:
+    folder = layouts.write_larger(tmp_path / "me", scene)
+    for file in sorted((folder / "images.HQ").iterdir()):
+        pixels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert pixels is not None
+        assert cv2.imwrite(str(file), pixels[:-1])
+    words = "have 256x255 pixels, which is no whole multiple of the 128x128 that were"
+    refused(folder, scene, words)
+    with pytest.raises(UserError, match=words):
+        checks.read_pictures(folder)
+    impossible = "'img_size' is not the height and width of a picture"
+    for sizes, words in (
+        (([SIDE, SIDE], [SIDE, 2 * SIDE]), "'img_size' is not the same in all checkpoints"),
+        (([0, SIDE],), impossible), (([SIDE],), impossible), (([float("nan"), SIDE],), impossible),
+    ):  # fmt: skip
+        for number, size in enumerate(sizes):
+            frame = {**writers.tracker_frame(scene, number, writers.OFF_CENTRE), "img_size": np.array(size)}
+            writers.write_frame(folder / f"checkpoint/{number:05d}.frame", frame)
+        refused(folder, scene, words)
+
+
+def test_the_last_frames_are_held_out(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A subject that is longer than the split of its authors has it; one as long as the split has none."""
+    assert insta.TEST_FRAMES == {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
+    for kind, name in (("INSTA", "gaussian-blendshapes"), ("FlashAvatar", "flash-avatar"), ("NeRFBlendShape", "masks")):
+        folder = layouts.TRACKED[name].write(tmp_path / kind, scene)
+        monkeypatch.setitem(insta.TEST_FRAMES, kind, 4)
+        assert "the last 4 frames are held out" in str(checks.surveyed(folder).split)
+        assert checks.read(folder, "insta", scene.model)[0].own_split == OwnSplit(((2, 6),))
+        monkeypatch.setitem(insta.TEST_FRAMES, kind, 6)
+        assert checks.surveyed(folder).split is None
+        assert any("6 frames are too few for" in each for each in checks.surveyed(folder).missing)
+
+
+# VHAP -----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_union_reads_nothing_beside_its_exports(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "all").mkdir()
+    union = layouts.write_union(tmp_path / "all/UNION", scene)
+    content = (union / "transforms_test.json").read_text()
+    (union / "transforms_test.json").write_text(content.replace("../306_EXP-2/images", "../../306_EXP-2/images"))
+    (tmp_path / "all/306_EXP-2").rename(tmp_path / "306_EXP-2")
+    (tmp_path / "all/306_EXP-2").symlink_to(tmp_path / "306_EXP-2")
+    refused(union, scene, "leads out of the dataset", "vhap")
+
+
+def test_vhap_with_teeth(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The model gets the teeth from mien, and the person in the pictures from the description of GaussianAvatars."""
+    rings, count = layouts.lip_rings(scene), len(scene.arrays["v_template"])
+    changed = {"VERTICES": count, "FACES": len(scene.arrays["f"])}
+    changed |= {name: tuple(ring.tolist()) for name, ring in zip(("UPPER_LIP", "LOWER_LIP"), rings, strict=True)}
+    for name, value in changed.items():
+        monkeypatch.setattr(teeth, name, value)
+    file = read_flame(write_npz(tmp_path / "flame.npz", scene.arrays))
+    model = replace(flame_face_model(teeth.with_teeth(file, "flame"), "flame"), landmarks=scene.model.landmarks)
+    assert len(model.template) == count + layouts.TEETH
+    grown = replace(layouts.with_teeth(scene, teeth.tooth_triangles()), model=model)
+    folder = layouts.write_offset(tmp_path / "me", grown)
+    checks.check_import(checks.read(folder, "vhap", model), layouts.TRACKED["vhap, static offsets"], grown)
+    refused(folder, scene, "static_offset", "vhap")
+    assert np.abs(layouts.with_static_offset(scene)[0].vertices(0) - scene.vertices(0)).max() > 1e-3

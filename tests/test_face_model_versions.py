@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-import dataset_scene
-import dataset_writers
 from dataset_cases import NoDetector
-from dataset_scene import Scene, make_scene
+from dataset_checks import read
+from dataset_layouts import draw_at
+from dataset_scene import Scene, drawn_person
 from dataset_writers import write_benchmark, write_flash_avatar, write_imavatar, write_insta, write_vhap
 from flame_like import write_npz
-from mien.datasets import TrackedSequence, overlay, recognised
+from mien.datasets import TrackedSequence, overlay
 from mien.datasets.overlay import check_overlay, check_version
 from mien.datasets.steadiness import Steadiness, measure_steadiness
 from mien.errors import UserError
@@ -23,7 +23,8 @@ from mien.face import FaceModel, FaceParams
 from mien.face.flame import flame_face_model, read_flame
 from mien.tracking.landmarks import with_regions_by_landmarks
 
-SIDE, TIMESTEPS = 256, 10
+pytestmark = pytest.mark.unchecked
+TIMESTEPS = 10
 PAINTS = {
     "lips": (0.7, 0.25, 0.25), "brows": (0.2, 0.12, 0.08), "irises": (0.1, 0.1, 0.15), "scalp": (0.2, 0.15, 0.1),
     "eyes": (0.95, 0.95, 0.95),
@@ -34,16 +35,13 @@ PAINTS = {
 def larger_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw pictures of twice the size, and leave out the detector, which takes seconds."""
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
-    for module in (dataset_scene, dataset_writers):
-        monkeypatch.setattr(module, "SIDE", SIDE)
-    for name in ("OFF_CENTRE", "UNEQUAL"):
-        monkeypatch.setattr(dataset_writers, name, getattr(dataset_writers, name) * [[2.0], [2.0], [1.0]])
+    draw_at(2, monkeypatch)
 
 
 @pytest.fixture(scope="module")
-def scene(anny, tmp_path_factory) -> Scene:
+def scene() -> Scene:
     """Return a head with lips, brows and eyes that moves, with an identity as large as a person's."""
-    made = make_scene(anny, tmp_path_factory.mktemp("flame"), TIMESTEPS)
+    made = drawn_person(TIMESTEPS)
     painted = with_regions_by_landmarks(made.model)
     colors = torch.tensor([0.85, 0.65, 0.55]).repeat(len(made.model.template), 1)
     for region, color in PAINTS.items():
@@ -63,10 +61,10 @@ def mixed(scene: Scene, folder: Path, of: str) -> FaceModel:
     return replace(flame_face_model(read_flame(path), f"other_{of}"), landmarks=scene.model.landmarks)
 
 
-def read(path: Path, model: FaceModel) -> list[TrackedSequence]:
-    found = list(recognised(path)[0].read(path, model))  # type: ignore[arg-type]
-    assert all(isinstance(each, TrackedSequence) for each in found)
-    return found  # type: ignore[return-value]
+def insta(scene: Scene, tmp_path: Path) -> TrackedSequence:
+    """Return the import of a subject of INSTA."""
+    (sequence,) = read(write_insta(tmp_path / "me", scene), "insta", scene.model)
+    return sequence
 
 
 @pytest.fixture(scope="module")
@@ -76,16 +74,14 @@ def others(scene: Scene, tmp_path_factory) -> dict[str, FaceModel]:
 
 
 def test_other_versions_are_refused(scene: Scene, others: dict[str, FaceModel], tmp_path: Path) -> None:
-    folder = write_insta(tmp_path / "me", scene)
-    (sequence,) = read(folder, scene.model)
-    found = measure_steadiness(sequence)
+    folder, found = tmp_path / "me", measure_steadiness(insta(scene, tmp_path))
     assert found.identity is not None
     assert found.identity < 0.9
     assert found.expression is not None
     assert found.expression < 0.9
     for of, told in (("identity", "identity"), ("expressions", "expressions"), ("both", "identity")):
         with pytest.raises(UserError, match="another version of the model; it needs FLAME 2020") as refused:
-            read(folder, others[of])
+            read(folder, "insta", others[of])
         message = str(refused.value)
         assert f"% more with the tracking's {told} on 'other_{of}' than without" in message
         assert message.startswith(f"{folder}: in me, ")
@@ -94,28 +90,24 @@ def test_other_versions_are_refused(scene: Scene, others: dict[str, FaceModel], 
             assert remedy in message
 
 
-WRITERS: dict[str, Callable[[Path, Scene], Path]] = {
-    "flash-avatar": write_flash_avatar,
-    "imavatar": lambda folder, scene: write_imavatar(folder, scene, ("MVI_1810",)),
-    "vhap": lambda folder, scene: write_vhap(folder, scene, size=(SIDE, SIDE + 16)),
-    "nersemble-benchmark": write_benchmark,
-}
-
-
-@pytest.mark.parametrize("layout", WRITERS)
-def test_other_versions_are_found_in_every_layout(
-    scene: Scene, others: dict[str, FaceModel], tmp_path: Path, layout: str
-) -> None:
-    folder = WRITERS[layout](tmp_path / "me", scene)
-    (sequence,) = read(folder, scene.model)
-    check_version(folder, sequence, "FLAME")
-    with pytest.raises(UserError, match="on 'other_expressions' than without, so this is another version"):
-        check_version(folder, replace(sequence, face_model=others["expressions"]), "FLAME")
+def test_other_versions_are_found_in_every_layout(scene: Scene, others: dict[str, FaceModel], tmp_path: Path) -> None:
+    layouts: dict[str, tuple[str, Callable[[Path, Scene], Path]]] = {
+        "flash-avatar": ("insta", write_flash_avatar),
+        "imavatar": ("imavatar", lambda folder, scene: write_imavatar(folder, scene, ("MVI_1810",))),
+        "vhap": ("vhap", write_vhap),
+        "benchmark": ("nersemble-benchmark", write_benchmark),
+    }
+    for name, (dataset, write) in layouts.items():
+        folder = write(tmp_path / name, scene)
+        (sequence,) = read(folder, dataset, scene.model)
+        check_version(folder, sequence, "FLAME")
+        with pytest.raises(UserError, match="on 'other_expressions' than without, so this is another version"):
+            check_version(folder, replace(sequence, face_model=others["expressions"]), "FLAME")
 
 
 def test_what_cannot_be_compared_is_left_out(scene: Scene, tmp_path: Path) -> None:
     """Few frames, a small face, a face without expressions, and a head without motion say nothing of a version."""
-    (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
+    sequence = insta(scene, tmp_path)
     face, capture = sequence.tracking.face, sequence.capture
 
     def measured(face: FaceParams, images: np.ndarray = capture.images) -> Steadiness:
@@ -129,17 +121,13 @@ def test_what_cannot_be_compared_is_left_out(scene: Scene, tmp_path: Path) -> No
     assert measured(face[:7], capture.images[:7]) == Steadiness(None, None)
     assert measured(replace(face, head_translation=3 * face.head_translation)) == Steadiness(None, None)
     assert measured(replace(face, expression=0.1 * face.expression)).expression is None
-    still = replace(
-        face,
-        head_rotation=face.head_rotation[:1].expand(len(face), 3),
-        head_translation=face.head_translation[:1].expand(len(face), 3),
-    )
-    assert measured(still).identity is None
+    fixed = {name: getattr(face, name)[:1].expand(len(face), 3) for name in ("head_rotation", "head_translation")}
+    assert measured(replace(face, **fixed)).identity is None
 
 
 def test_a_tracking_that_is_off_by_some_pixels_is_not_refused(scene: Scene, tmp_path: Path) -> None:
     """Each frame is moved to where it fits best. Without that, the shares are 0.73 and 0.81."""
-    (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
+    sequence = insta(scene, tmp_path)
     off = torch.tensor(np.random.default_rng(2).uniform(-0.0025, 0.0025, (TIMESTEPS, 3)) * (1, 1, 0)).float()
     face = replace(sequence.tracking.face, head_translation=sequence.tracking.face.head_translation + off)
     found = measure_steadiness(replace(sequence, tracking=replace(sequence.tracking, face=face)))
@@ -150,16 +138,13 @@ def test_a_tracking_that_is_off_by_some_pixels_is_not_refused(scene: Scene, tmp_
 
 
 def test_pictures_of_another_size_are_told(scene: Scene, tmp_path: Path) -> None:
-    (sequence,) = read(write_insta(tmp_path / "me", scene), scene.model)
+    sequence = insta(scene, tmp_path)
     capture, (view,) = sequence.capture, sequence.tracking.cameras
     images = np.stack([cv2.resize(image, (400, 384)) for image in capture.images[:, 0]])[:, None]
     mattes = np.stack([cv2.resize(matte, (400, 384)) for matte in capture.mattes[:, 0]])[:, None]
     views = (replace(view, width=400, height=384),)
-    larger = replace(
-        sequence,
-        capture=replace(capture, images=images, mattes=mattes, calibration=views),
-        tracking=replace(sequence.tracking, cameras=views),
-    )
+    resized = replace(capture, images=images, mattes=mattes, calibration=views)
+    larger = replace(sequence, capture=resized, tracking=replace(sequence.tracking, cameras=views))
     with pytest.raises(UserError, match="these have 400x384 pixels, and the tracking was made on about 265x248, so"):
         check_overlay(tmp_path, larger, "FLAME")
     check_overlay(tmp_path, sequence, "FLAME")

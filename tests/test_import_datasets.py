@@ -1,36 +1,44 @@
 """`mien import` of datasets on the command line: what is told before, the workspace, its split, and mistakes."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dataset_scene import Scene, make_scene
+from dataset_cases import NoDetector, unfound
+from dataset_scene import Scene, drawn_person
 from dataset_writers import write_frame, write_imavatar, write_insta
 from mien.cli import main
 from mien.commands.stages import importing
-from mien.face import add_face_model, load_face_model
+from mien.datasets import overlay, sequences
+from mien.face import add_face_model
+from mien.files import write_json
 from mien.training import OwnSplit, TrainSettings, read_own_split, read_sequence, with_own_split, write_own_split
 from mien.training.footage.frames import training_frames
+from toy_workspace import write_toy_workspace
+
+pytestmark = pytest.mark.unchecked
 
 CLIPS = ("MVI_1810", "MVI_1812")
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Scene:
-    return make_scene(load_face_model("anny"), tmp_path_factory.mktemp("flame"))
+def scene() -> Scene:
+    return drawn_person()
 
 
 @pytest.fixture(scope="module")
-def subject(scene: Scene, tmp_path_factory) -> Path:
+def subject(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_imavatar(tmp_path_factory.mktemp("given") / "subject1", scene, CLIPS)
 
 
 @pytest.fixture
 def added(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Add the head in FLAME's schema to the user's face models, under the name `flame`."""
+    monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
 
@@ -56,14 +64,17 @@ def test_a_dry_run_only_tells(subject: Path, tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.usefixtures("added")
 def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "me"
-    assert main(["import", str(subject), "--out", str(out), "--face-model", "flame"]) == 0
-    sequences = [read_sequence(out / "sequences" / name) for name in CLIPS]
-    splits = {sequence.name: read_own_split(sequence.folder) for sequence in sequences}
+    again = ["import", str(subject), "--out", str(out), "--face-model", "flame"]
+    assert main(again) == 0
+    first = out / "sequences/MVI_1810/tracking/overlay.png"
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert f"the imported mesh over some pictures: {first}, and 1 more; look at it before you train" in told
+    read = [read_sequence(out / "sequences" / name) for name in CLIPS]
+    splits = {sequence.name: read_own_split(sequence.folder) for sequence in read}
     settings = with_own_split(TrainSettings(split="dataset"), splits, dict.fromkeys(CLIPS, 3))
     assert settings.held_out_sequences == (CLIPS[1],)
-    assert {frame.sequence for frame in training_frames(sequences, settings)} == {0}
+    assert {frame.sequence for frame in training_frames(read, settings)} == {0}
     refused(["train", str(out), "--split", "dataset", "--hold-out", CLIPS[0]], "decides what is held out", capsys)
-    again = ["import", str(subject), "--out", str(out), "--face-model", "flame"]
     refused(again, "is there already", capsys)
     assert main([*again, "--resume"]) == 0
     assert "all sequences are there already" in capsys.readouterr().err
@@ -71,17 +82,13 @@ def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest
 
 @pytest.mark.usefixtures("added")
 def test_pictures_are_tracked_again_if_asked(subject: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mien.datasets import sequences
-
     tracked: list[tuple[str, ...]] = []
 
     def track(workspace, face_model: str, settings: object) -> None:
         tracked.append((face_model, *workspace.sequence_names()))
 
     monkeypatch.setattr(importing, "run_tracking_stage", track)
-    monkeypatch.setattr(
-        sequences, "detected_landmarks", lambda images: np.full((*images.shape[:2], 478, 2), 5, np.float32)
-    )
+    monkeypatch.setattr(sequences, "detected_landmarks", unfound)
     assert main(["import", str(subject), "--out", str(tmp_path / "me"), "--retrack"]) == 0
     assert tracked == [("anny", *CLIPS)]
     assert not (tmp_path / "me/sequences/MVI_1810/tracking").exists()
@@ -108,39 +115,32 @@ def test_mistakes_leave_nothing(
     assert not list((tmp_path / "out").glob("sequences/*"))
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (lambda frame: frame.pop("pose"), "has no 'pose'"),
-        (lambda frame: frame.update(pose=[0] * 14), "'pose' is not numbers in the shape [15]"),
-        (lambda frame: frame.update(expression=[float("nan")] * 50), "'expression' holds NaN"),
-        (lambda frame: frame.update(file_path="../../../secret"), "leads out of the dataset"),
-        (lambda frame: frame.update(file_path="/etc/passwd"), "is not the name of a file in the dataset"),
-        (lambda frame: frame.update(world_mat=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4]]), "is not orthonormal"),
-    ],
-)
 @pytest.mark.usefixtures("added")
-def test_damaged_json_is_named(
-    damage, words: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import shutil
-
+def test_damaged_json_is_named(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     place = shutil.copytree(subject, tmp_path / "subject1")
     file = place / "subject1/MVI_1810/flame_params.json"
-    content = json.loads(file.read_text())
-    damage(content["frames"][1])
-    file.write_text(json.dumps(content))
-    line = ["import", str(place), "--out", str(tmp_path / "out"), "--face-model", "flame"]
-    refused(line, words, capsys)
+    whole = file.read_text()
+    for name, value, words in (
+        ("pose", None, "has no 'pose'"),
+        ("pose", [0] * 14, "'pose' is not numbers in the shape [15]"),
+        ("expression", [float("nan")] * 50, "'expression' holds NaN"),
+        ("file_path", "../../../secret", "leads out of the dataset"),
+        ("file_path", "/etc/passwd", "is not the name of a file in the dataset"),
+        ("world_mat", [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4]], "is not orthonormal"),
+    ):
+        content = json.loads(whole)
+        content["frames"][1][name] = value
+        if value is None:
+            del content["frames"][1][name]
+        file.write_text(json.dumps(content))
+        refused(["import", str(place), "--out", str(tmp_path / "out"), "--face-model", "flame"], words, capsys)
     assert not list((tmp_path / "out").glob("sequences/*"))
 
 
+@pytest.mark.usefixtures("short_films")
 def test_the_protocol_of_a_dataset_scores_its_mattes_and_its_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from mien.files import write_json
-    from toy_workspace import write_toy_workspace
-
     root = tmp_path / "W"
     write_toy_workspace(root)
     clip, file = root / "sequences/clip", root / "runs/toy/config.json"

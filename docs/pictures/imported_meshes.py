@@ -25,7 +25,7 @@ from mien.face import load_face_model  # noqa: E402
 OUT = Path(__file__).parent / "imported_meshes.webp"
 ENLARGED, TILE = 4, 240
 LAYOUTS = {
-    "vhap": lambda folder, scene: writers.write_vhap(folder, scene, size=(dataset_scene.SIDE, ENLARGED * 136)),
+    "vhap": writers.write_vhap,
     "insta": writers.write_insta,
     "imavatar": writers.write_imavatar,
     "nersemble-benchmark": writers.write_benchmark,

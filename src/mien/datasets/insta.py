@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mien.face import FaceModel
 
 _FPS = 25.0
-_TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
+TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
 """Number of frames at the end that the authors hold out."""
 _TEST = "transforms_test.json"
 _LARGER = "images.HQ"
@@ -138,7 +138,7 @@ def _paired(
     for place in (*pictures.values(), *mattes.values(), *saved.values()):
         check_file_inside(root, place)
     frames = tuple(_Frame(pictures[number], mattes.get(number), saved.get(number)) for number in both)
-    last = _TEST_FRAMES[kind] if len(frames) > _TEST_FRAMES[kind] else 0
+    last = TEST_FRAMES[kind] if len(frames) > TEST_FRAMES[kind] else 0
     test, split = tuple(range(len(frames) - last, len(frames))), f"the last {last} frames are held out ({kind})"
     return _Layout(kind, folder.name, root, frames, test, split, len(pictures) - len(both))
 

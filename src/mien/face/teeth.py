@@ -18,8 +18,8 @@ VERTICES, FACES = 5023, 9976
 TOOTH_VERTICES = 120
 _COUNT = 15
 """Vertices of a row."""
-_UPPER = (1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543, 2774, 2811, 2813, 2850, 2833, 2832, 2830)
-_LOWER = (1576, 1577, 1773, 1774, 1795, 1802, 1865, 3503, 2948, 2905, 2898, 2881, 2880, 2713, 2712)
+UPPER_LIP = (1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543, 2774, 2811, 2813, 2850, 2833, 2832, 2830)
+LOWER_LIP = (1576, 1577, 1773, 1774, 1795, 1802, 1865, 3503, 2948, 2905, 2898, 2881, 2880, 2713, 2712)
 """FLAME's vertices on the outer ring of the upper and the lower lip, from the subject's left to the right."""
 _U, _V = (0.62, 0.38), (0.9917, 0.9575)
 """Texture coordinates at the ends of rows, and of the first and the last row."""
@@ -54,7 +54,7 @@ def with_teeth(flame: FlameFile, name: str) -> FlameFile:
             f"{name}: has {len(flame.template):,} vertices and {len(flame.faces):,} triangles, and teeth belong to "
             f"FLAME's {VERTICES:,} and {FACES:,}; add it without --teeth"
         )
-    upper, lower = np.array(_UPPER), np.array(_LOWER)
+    upper, lower = np.array(UPPER_LIP), np.array(LOWER_LIP)
     template = np.concatenate([flame.template, _places(flame.template[upper], flame.template[lower])])
     added = TOOTH_VERTICES
     rows = np.repeat(np.arange(8), _COUNT)

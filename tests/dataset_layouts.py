@@ -1,16 +1,45 @@
-"""Variants of layouts that other programs read, made of what `dataset_writers` writes. Nothing calls the importers."""
+"""The layouts of datasets that are tracked on FLAME: who writes each, and which heads and cameras come back.
+
+None was tried with real files of variants. Their folders follow the loaders of the programs that they are named after.
+"""
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
 
+import dataset_scene
 import dataset_writers
 from dataset_scene import Scene, draw, head_view
-from dataset_writers import npz, write_imavatar, write_insta, write_picture, write_vhap
+from dataset_writers import (
+    IMAVATAR_PLACE,
+    npz,
+    write_flash_avatar,
+    write_imavatar,
+    write_insta,
+    write_picture,
+    write_vhap,
+)
+from mien.training import OwnSplit
+
+MIRROR = np.diag([1.0, -1.0, -1.0])
+View = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Intrinsics, and the rotation and translation from the world to a camera with OpenCV's axes."""
+
+
+def draw_at(factor: float, patch: pytest.MonkeyPatch) -> None:
+    """Let writers draw so many times as many pixels on each side."""
+    side = round(factor * dataset_writers.SIDE)
+    for module in (dataset_scene, dataset_writers):
+        patch.setattr(module, "SIDE", side)
+    for name in ("OFF_CENTRE", "UNEQUAL"):
+        patch.setattr(dataset_writers, name, enlarged(getattr(dataset_writers, name), factor))
 
 
 def write_gaussian_blendshapes(folder: Path, scene: Scene) -> Path:
@@ -48,7 +77,7 @@ def write_masked(folder: Path, scene: Scene, channels: int = 1) -> Path:
     return folder
 
 
-def enlarged(K: np.ndarray, factor: int) -> np.ndarray:
+def enlarged(K: np.ndarray, factor: float) -> np.ndarray:
     """Return intrinsics for pictures with `factor` times as many pixels on each side."""
     return K * np.array([[factor], [factor], [1.0]])
 
@@ -69,10 +98,9 @@ def write_larger(folder: Path, scene: Scene, factor: int = 2) -> Path:
     return folder
 
 
-def write_splatting_avatar(folder: Path, scene: Scene, name: str = "bala") -> Path:
+def write_splatting_avatar(subject: Path, scene: Scene) -> Path:
     """Write a subject of SplattingAvatar: one clip of IMavatar's layout, whose pictures have opacities."""
-    clip = write_imavatar(folder / "x", scene, ("clip",)) / "x/clip"
-    subject = folder / name
+    clip = write_imavatar(subject.with_name("x"), scene, ("clip",)) / "x/clip"
     for file in sorted((clip / "image").glob("*.png")):
         pixels, matte = (cv2.imread(str(each)) for each in (file, clip / "mask" / file.name))
         assert pixels is not None
@@ -85,41 +113,42 @@ def write_splatting_avatar(folder: Path, scene: Scene, name: str = "bala") -> Pa
     return subject
 
 
-def write_union(folder: Path, scene: Scene, names: tuple[str, str] = ("306_EMO-1", "306_EXP-2")) -> Path:
-    """Write two exports of VHAP, and beside them a UNION folder, whose timesteps go on in the second.
+UNITED = ("306_EMO-1", "306_EXP-2")
+
+
+def write_union(union: Path, scene: Scene) -> Path:
+    """Write a UNION folder, and beside it two exports of VHAP, whose timesteps go on in the second.
 
     The second sequence is held out, and of the first the last camera.
     """
     parts: dict[str, list[dict]] = {"train": [], "val": [], "test": []}
-    for index, name in enumerate(names):
-        export = write_vhap(folder / name, scene)
+    for index, name in enumerate(UNITED):
+        export = write_vhap(union.with_name(name), scene)
         for frame in json.loads((export / "transforms.json").read_text())["frames"]:
             frame["timestep_index"] += index * len(scene)
             for key in ("file_path", "fg_mask_path", "flame_param_path"):
                 frame[key] = f"../{name}/{frame[key]}"
             parts["test" if index else "val" if frame["camera_index"] else "train"].append(frame)
-    union = folder / "UNION2_306"
     union.mkdir()
     for part, frames in parts.items():
         (union / f"transforms_{part}.json").write_text(json.dumps({"frames": frames}))
     return union
 
 
-def with_static_offset(scene: Scene, metres: float = 1e-3) -> tuple[Scene, np.ndarray]:
+def with_static_offset(scene: Scene) -> tuple[Scene, np.ndarray]:
     """Return the scene of a person whose head at rest differs from the model's, and by how much [v, 3]."""
     template = scene.arrays["v_template"]
-    random = np.random.default_rng(0)
-    offset = (metres * random.standard_normal(template.shape)).astype(np.float32)
+    offset = (1e-3 * np.random.default_rng(0).standard_normal(template.shape)).astype(np.float32)
     return replace(scene, arrays={**scene.arrays, "v_template": template + offset}), offset
 
 
-def write_offset(folder: Path, scene: Scene, metres: float = 1e-3) -> tuple[Path, Scene]:
-    """Write an export of VHAP with `static_offset`. Return it and the scene of the person that it shows."""
-    shown, offset = with_static_offset(scene, metres)
+def write_offset(folder: Path, scene: Scene) -> Path:
+    """Write an export of VHAP with `static_offset`."""
+    shown, offset = with_static_offset(scene)
     write_vhap(folder, shown)
     for file in sorted((folder / "flame_param").glob("*.npz")):
         file.write_bytes(npz({**np.load(file), "static_offset": offset[None]}))
-    return folder, shown
+    return folder
 
 
 TEETH = 120
@@ -167,3 +196,86 @@ def with_teeth(scene: Scene, triangles: np.ndarray) -> Scene:
     }
     colors = torch.cat([scene.colors, torch.full((TEETH, 3), 0.7)])
     return replace(scene, arrays={**arrays, **grown}, colors=colors)
+
+
+# The table -----------------------------------------------------------------------------------------------------------
+
+
+def _from_the_tracker(scene: Scene, timestep: int) -> np.ndarray:
+    return scene.vertices(timestep, root=False, neck=False)
+
+
+def _tracker_view(timestep: int, _: int, factor: int = 1) -> View:
+    return enlarged(dataset_writers.OFF_CENTRE, factor), *head_view(timestep)
+
+
+def _at_the_origin(scene: Scene, timestep: int) -> np.ndarray:
+    return scene.vertices(timestep) - scene.translation[timestep]
+
+
+def _imavatar_view(*_: int) -> View:
+    return dataset_writers.UNEQUAL, MIRROR, MIRROR @ IMAVATAR_PLACE / 4
+
+
+def _rig_view(_: int, camera: int) -> View:
+    return dataset_writers.UNEQUAL, *head_view(2 + camera, 1.0)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A layout, what its writer means by it, and what comes back. The writer's folder is called `me`."""
+
+    write: Callable[[Path, Scene], Path]
+    reads: str = "insta"
+    """The importer that recognises it."""
+    vertices: Callable[[Scene, int], np.ndarray] = _from_the_tracker
+    """Vertices of a timestep in the writer's world."""
+    view: Callable[[int, int], View] = _tracker_view
+    """The camera of a timestep."""
+    clips: dict[str, range] = field(default_factory=lambda: {"me": range(6)})
+    """Sequences, with the timesteps of each."""
+    splits: tuple[OwnSplit | None, ...] = (None,)
+    """What the authors hold out of each."""
+    cameras: tuple[str, ...] = ("0",)
+    size: tuple[int, int] | None = None
+    """Width and height of the pictures, if they are not the usual ones."""
+    shown: Callable[[Scene], Scene] = lambda scene: scene
+    """The scene of the person in the pictures."""
+    retracked: bool = False
+    """Whether it has the tracker's camera, for the pictures to be tracked again."""
+
+
+_RIG = ("222200036", "222200037")
+_TALL = (dataset_writers.SIDE, 136)
+_PART = OwnSplit(((5, 6),), _RIG[1:])
+_VHAP = Layout(write_vhap, "vhap", Scene.vertices, _rig_view, splits=(_PART,), cameras=_RIG, size=_TALL)
+
+TRACKED = {
+    "insta": Layout(write_insta),
+    "flash-avatar": Layout(write_flash_avatar, retracked=True),
+    "gaussian-blendshapes": Layout(write_gaussian_blendshapes, retracked=True),
+    "masks": Layout(write_masked, retracked=True),
+    "masks of three channels": Layout(lambda folder, scene: write_masked(folder, scene, 3), retracked=True),
+    "imavatar": Layout(
+        write_imavatar, "imavatar", _at_the_origin, _imavatar_view,
+        {"MVI_1810": range(3), "MVI_1812": range(3, 6)}, (OwnSplit(), OwnSplit(((0, 3),))),
+    ),
+    "splatting-avatar": Layout(write_splatting_avatar, "imavatar", _at_the_origin, _imavatar_view),
+    "vhap": _VHAP,
+    "vhap, from below": replace(_VHAP, write=lambda folder, scene: write_vhap(folder, scene, True)),
+    "vhap, one camera": replace(
+        _VHAP, write=lambda folder, scene: write_vhap(folder, scene, cameras=("0",)), cameras=("0",),
+        splits=(OwnSplit(((5, 6),)),),
+    ),
+    "vhap, a union": replace(
+        _VHAP, write=write_union, clips=dict.fromkeys(UNITED, range(6)),
+        splits=(OwnSplit((), _RIG[1:]), OwnSplit(((0, 6),))),
+    ),
+    "vhap, static offsets": replace(_VHAP, write=write_offset, shown=lambda scene: with_static_offset(scene)[0]),
+    **{
+        f"pictures {factor} times as large": Layout(
+            partial(write_larger, factor=factor), view=partial(_tracker_view, factor=factor), retracked=True,
+            size=(factor * dataset_writers.SIDE, factor * dataset_writers.SIDE),
+        ) for factor in (2, 3)
+    },
+}  # fmt: skip
