@@ -15,9 +15,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mien.batch import Batch, Row, row_process
+from mien.batch import Batch, Driver, EngineOptions, Row, row_process
 from mien.batch.row import RowFailedError
 from mien.batch.store import fetched
+from mien.stops import orderly_stops
 
 PROGRAM = (sys.executable, str(Path(__file__).resolve()))
 
@@ -83,6 +84,38 @@ def note(path: Path, line: str) -> None:
 def tries(path: Path, name: str) -> int:
     """How often a row began."""
     return path.read_text().count(f"begin {name} ") if path.exists() else 0
+
+
+def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
+    """Return the driver of a batch of stub rows."""
+    return Driver(batch, engine, EngineOptions(batch.root, jobs, 1), retry, store, PROGRAM)
+
+
+def drive_stubs(root: str) -> None:
+    """Run the rows of a plan, as a command does."""
+    batch = Batch(Path(root))
+    with orderly_stops():
+        driver(batch).run(batch.read_plan())
+
+
+def wait_for_begin(root: Path, name: str) -> int:
+    """Return the process that began a row, once it has."""
+    place = root / "begins.txt"
+    for _ in range(6_000):
+        for line in place.read_text().splitlines() if place.exists() else ():
+            if line.startswith(f"begin {name} "):
+                return int(line.split()[2])
+        time.sleep(0.05)
+    raise AssertionError(f"{name} never began")
+
+
+def ended(process: int) -> bool:
+    """Wait until a process is gone, and return whether it is."""
+    for _ in range(6_000):
+        if not Path(f"/proc/{process}").exists():
+            return True
+        time.sleep(0.02)
+    return False
 
 
 if __name__ == "__main__":

@@ -1,10 +1,8 @@
-"""`mien batch`: tables become rows, rows run once, failures stay alone, and results tell what came of them."""
+"""`mien batch`: rows run once, failures stay alone, and what lost processes leave is taken up."""
 
 import importlib
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -12,26 +10,13 @@ from typing import Any
 
 import pytest
 
-from batch_stub import PROGRAM, do_stub, stub_row
-from mien.batch import (
-    Batch,
-    Driver,
-    EngineOptions,
-    Row,
-    State,
-    batch_progress,
-    progress_text,
-    run_row,
-    shard_of,
-)
+from batch_stub import do_stub, driver, ended, stub_row, wait_for_begin
+from forked import ForkServer
+from mien.batch import Batch, Driver, EngineOptions, Row, State, batch_progress, progress_text, run_row, shard_of
 from mien.errors import UserError
 from mien.locks import hold
 from needs import NO_ENGINE
 from other_process import Holder
-
-
-def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
-    return Driver(batch, engine, EngineOptions(batch.root, jobs, 1), retry, store, PROGRAM)
 
 
 def run_stubs(batch: Batch, rows: list[Row], **options: object) -> dict[str, str]:
@@ -78,7 +63,7 @@ def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(
         path.write_text(text)
         path.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr("mien.batch.engines.slurm._POLL_SECONDS", 0.05)
+    monkeypatch.setattr("mien.batch.engines.slurm.POLL_SECONDS", 0.05)
     (batch.root / "slurm").mkdir()
     (batch.root / "slurm" / "jobs.txt").write_text("77")
 
@@ -140,58 +125,33 @@ def test_a_failing_row_stops_no_other_and_is_tried_again(tmp_path: Path):
     assert (tmp_path / "begins.txt").read_text().count("begin good ") == 1
 
 
-def test_a_row_whose_process_is_killed_fails_alone_or_is_tried_again(tmp_path: Path):
+def test_a_row_whose_process_is_killed_is_tried_again(tmp_path: Path, fork_server: ForkServer):
     batch = Batch(tmp_path)
-    rows = [stub_row("victim", ("sleep", "1.5"), ("value", "21")), stub_row("other", ("sleep", "0.1"))]
-    batch.write_plan(rows)
-    script = (
-        "import sys; from pathlib import Path; from test_batch import driver; from mien.batch import Batch; "
-        "b = Batch(Path(sys.argv[1])); driver(b).run(b.read_plan())"
-    )
-    command = [sys.executable, "-c", script, str(tmp_path)]
-    running = subprocess.Popen(command, cwd=Path(__file__).parent, stderr=subprocess.DEVNULL)
+    batch.write_plan([stub_row("victim", ("wait", "go"), ("value", "21")), stub_row("other", ("sleep", "0"))])
+    running = fork_server.call("batch_stub:drive_stubs", str(tmp_path))
     os.kill(wait_for_begin(tmp_path, "victim"), signal.SIGKILL)
-    assert running.wait(60) == 0
+    (tmp_path / "go").touch()
+    assert running.wait() == 0
     state = batch.read_state("victim")
     assert state is not None
     assert (state.status, state.tries, state.runs[0]["psnr"]) == ("done", 2, 21.0)
+    assert batch.is_done(stub_row("other", ("sleep", "0")))
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_rows_stop_when_their_driver_is_stopped_and_the_same_command_continues(tmp_path: Path, number: int):
+def test_rows_stop_when_their_driver_is_stopped_and_the_same_command_continues(
+    tmp_path: Path, number: int, fork_server: ForkServer
+):
     batch = Batch(tmp_path)
-    rows = [stub_row(name, ("sleep", "30")) for name in ("long", "second", "queued")]
-    batch.write_plan(rows)
-    script = (
-        "import sys; from pathlib import Path; from test_batch import driver; from mien.batch import Batch; "
-        "from mien.stops import orderly_stops; b = Batch(Path(sys.argv[1]))\n"
-        "with orderly_stops(): driver(b).run(b.read_plan())"
-    )
-    running = subprocess.Popen(
-        [sys.executable, "-c", script, str(tmp_path)], cwd=Path(__file__).parent, stderr=subprocess.DEVNULL
-    )
+    batch.write_plan([stub_row(name, ("wait", "never")) for name in ("long", "second", "queued")])
+    running = fork_server.call("batch_stub:drive_stubs", str(tmp_path))
     pid = wait_for_begin(tmp_path, "long")
     assert batch_progress(batch)["rows"][0]["status"] == "running"
     running.send_signal(number)
-    running.wait(20)
-    until = time.monotonic() + 10
-    while Path(f"/proc/{pid}").exists() and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not Path(f"/proc/{pid}").exists()
+    running.wait()
+    assert ended(pid)
     assert batch_progress(batch)["rows"][0]["status"] == "interrupted"
-    again = [stub_row("long", ("sleep", "0"))]
-    assert run_stubs(batch, again) == {"long": "done"}
-
-
-def wait_for_begin(root: Path, name: str) -> int:
-    """The process that began a row."""
-    place, until = root / "begins.txt", time.monotonic() + 30
-    while time.monotonic() < until:
-        for line in place.read_text().splitlines() if place.exists() else ():
-            if line.startswith(f"begin {name} "):
-                return int(line.split()[2])
-        time.sleep(0.05)
-    raise AssertionError(f"{name} never began")
+    assert run_stubs(batch, [stub_row("long", ("sleep", "0"))]) == {"long": "done"}
 
 
 def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Holder):
@@ -228,7 +188,7 @@ def test_a_row_that_another_command_holds_is_left_to_it(tmp_path: Path):
 
 def test_memory_is_counted_before_rows_run_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("mien.batch.engines.local.free_memory_mb", lambda: 1000.0)
-    rows = [stub_row(f"big{index}", ("sleep", "0.3"), memory_mb=700.0) for index in range(3)]
+    rows = [stub_row(f"big{index}", ("sleep", "0.3"), memory_mb=700.0) for index in range(2)]
     rows.append(stub_row("huge", ("sleep", "0.1"), memory_mb=5000.0))
     assert set(run_stubs(Batch(tmp_path), rows, jobs=4).values()) == {"done"}
     running, most = 0, 0
@@ -247,7 +207,7 @@ def test_workspaces_go_through_a_store(tmp_path: Path):
     assert (store / "away" / "kept").read_text() == "away\naway\n"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_workspaces_go_through_an_object_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     server = needed("moto.server").ThreadedMotoServer("127.0.0.1", 0)
     s3fs = needed("s3fs")

@@ -16,10 +16,13 @@ from typing import Any
 
 import pytest
 
-from batch_stub import PROGRAM, stub_row
+from batch_stub import PROGRAM, stub_row, wait_for_begin
 from mien.batch import Batch, Driver, EngineOptions, batch_progress
 from needs import NO_ENGINE
-from test_batch import wait_for_begin
+
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]
+IN_SLURM = pytest.mark.skipif("SLURM_CONF" not in os.environ or shutil.which("sbatch") is None, reason=NO_ENGINE)
+EXPECTED = {f"row{index}": 20.0 + index for index in range(4)}
 
 
 @pytest.fixture
@@ -36,9 +39,7 @@ def ray_cluster() -> Iterator[Any]:
             cluster.add_node(**node)
             cluster.add_node(**node)
             break
-        except (
-            Exception
-        ):  # A node waits 30 s for its agent, which is too short where other programs take the processor.
+        except Exception:  # A node waits 30 s for its agent, too short where other programs take the processor.
             cluster.shutdown()
             if not tries_left:
                 raise
@@ -91,11 +92,6 @@ def lines_of(path: Path) -> list[str]:
     return path.read_text().splitlines() if path.exists() else []
 
 
-EXPECTED = {f"row{index}": 20.0 + index for index in range(4)}
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
 def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(tmp_path: Path, ray_cluster: Any):
     def kill() -> None:
         os.kill(next(ancestors(wait_for_begin(tmp_path, "row1"))), signal.SIGKILL)
@@ -105,8 +101,6 @@ def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(t
     assert begins(tmp_path, "row1") == 2
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
 def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: Any):
     rows = [stub_row(name, ("wait", f"go {name}"), ("value", str(figure))) for name, figure in EXPECTED.items()]
     lost, until = [], time.monotonic() + 120
@@ -133,20 +127,17 @@ def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: An
     assert begins(tmp_path, lost[0]) == 2
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
 def test_a_row_that_no_node_of_ray_can_hold_fails_alone(
     tmp_path: Path, ray_cluster: Any, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("mien.batch.engines.on_ray._LOOK_SECONDS", 0.5)
-    monkeypatch.setattr("mien.batch.engines.on_ray._PATIENCE_SECONDS", 1.0)
+    monkeypatch.setattr("mien.batch.engines.on_ray.LOOK_SECONDS", 0.5)
+    monkeypatch.setattr("mien.batch.engines.on_ray.PATIENCE_SECONDS", 1.0)
     rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of(4, "0.1")]
     assert run_with("ray", tmp_path, rows, address=ray_cluster.address) == EXPECTED
     assert "enough memory" in too_large(tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif("SLURM_CONF" not in os.environ or shutil.which("sbatch") is None, reason=NO_ENGINE)
+@IN_SLURM
 def test_a_row_that_no_node_of_slurm_can_hold_fails_alone(tmp_path: Path):
     pytest.importorskip("submitit")
     rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of(4, "0.1")]
@@ -154,8 +145,7 @@ def test_a_row_that_no_node_of_slurm_can_hold_fails_alone(tmp_path: Path):
     assert "Slurm does not take it" in too_large(tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif("SLURM_CONF" not in os.environ or shutil.which("sbatch") is None, reason=NO_ENGINE)
+@IN_SLURM
 def test_slurm_gives_the_same_figures_though_a_task_is_requeued(tmp_path: Path):
     pytest.importorskip("submitit")
 

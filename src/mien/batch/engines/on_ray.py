@@ -17,10 +17,10 @@ _LOST_NODES = 3
 """How often Ray starts a row again whose node or worker was lost."""
 _WAITING = 200
 """Rows that are handed to Ray at a time, if no number of jobs is given."""
-_LOOK_SECONDS, _PATIENCE_SECONDS = 30.0, 600.0
+LOOK_SECONDS, PATIENCE_SECONDS = 30.0, 600.0
 """How often rows are looked for that fit no node, and how long a cluster may take to start a node for them."""
 _NO_NODE = (
-    f"no node of Ray has had enough memory, cores or GPUs for it for {_PATIENCE_SECONDS / 60:.0f} min; "
+    f"no node of Ray has had enough memory, cores or GPUs for it for {PATIENCE_SECONDS / 60:.0f} min; "
     "see `ray status`, memory_gb, --threads and --gpus"
 )
 
@@ -49,7 +49,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
                 asked = {"num_cpus": options.threads or 2, "num_gpus": options.gpus, "memory": _bytes(row)}
                 asked |= {"max_retries": _LOST_NODES, "name": f"mien {row.name}"}
                 running[task.options(**asked).remote(work, row)] = row
-            ended, _ = ray.wait(list(running), num_returns=1, timeout=_LOOK_SECONDS)
+            ended, _ = ray.wait(list(running), num_returns=1, timeout=LOOK_SECONDS)
             for first in ended:
                 row = running.pop(first)
                 try:
@@ -79,7 +79,7 @@ def _never_started(ray: Any, running: dict[Any, Row], since: dict[Any, float], o
         asked = {"CPU": options.threads or 2, "GPU": options.gpus, "memory": _bytes(row)}
         if any(all(node.get(kind, 0) >= amount for kind, amount in asked.items()) for node in nodes):
             since.pop(task, None)
-        elif now - since.setdefault(task, now) >= _PATIENCE_SECONDS:
+        elif now - since.setdefault(task, now) >= PATIENCE_SECONDS:
             found.append(task)
     return found
 

@@ -20,7 +20,8 @@ from mien.progress import say
 
 _MOST_TASKS = 1000
 """Largest number of tasks of an array. Slurm's default limit is 1001."""
-_POLL_SECONDS = 2.0
+POLL_SECONDS = 2.0
+"""Seconds between two questions to Slurm."""
 _NOTED = "slurm/jobs.txt"
 """The file in the batch's folder that has the numbers of jobs which have not ended."""
 _DEFAULT_MINUTES, _SLACK, _LEAST_MINUTES = 24 * 60, 3.0, 10
@@ -123,5 +124,5 @@ def _wait(noted: Path) -> None:
             raise UserError(f"squeue: {asked.stderr.strip()[:300]}; correct that and run the same command again")
         if not asked.stdout.strip():
             break
-        time.sleep(_POLL_SECONDS)
+        time.sleep(POLL_SECONDS)
     noted.unlink(missing_ok=True)

@@ -1,4 +1,6 @@
-"""A trial of an engine with many stub rows, which sleep: python tests/batch_trial.py ENGINE FOLDER [--kills 20].
+"""A trial of an engine with many stub rows, which sleep.
+
+    PYTHONPATH=tests python benchmarks/batch_trial.py ENGINE FOLDER [--kills 20]
 
 It prints what docs/scale.md quotes: seconds, the driver's memory, the time of `mien batch status`, rows that began or
 ended more than once, rows that ran twice at the same time, and rows that were lost. With `--kills`, processes are
@@ -114,7 +116,7 @@ def main() -> None:
         drive(given.engine, root, given.address)
         return
     os.environ["MIEN_TRIAL"] = str(root)
-    os.environ["PYTHONPATH"] = str(Path(__file__).parent)
+    os.environ["PYTHONPATH"] = str(Path(__file__).parents[1] / "tests")
     batch = Batch(root)
     batch.write_plan(rows_of(given.rows, given.seconds))
     cluster, faults = start(given.engine, root)

@@ -1,4 +1,6 @@
-"""Real rows of a batch with faults: python tests/batch_faults.py ENGINE TABLE FOLDER [--address RAY] [--node PID].
+"""Real rows of a batch with faults.
+
+    PYTHONPATH=tests python benchmarks/batch_faults.py ENGINE TABLE FOLDER [--address RAY] [--node PID]
 
 Faults come while rows track and train: SIGKILL of a row, of a worker of the engine, of a node and of the driver, and
 what the engine itself offers (`scontrol requeue`, `scancel`). Then the same command runs to its end. The script prints
