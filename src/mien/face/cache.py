@@ -21,7 +21,7 @@ def cache_folder() -> Path:
     """
     obstacle = _obstacle()
     wanted = _wanted_folder()
-    return wanted if wanted is not None and obstacle is None else _temporary_folder(str(obstacle))
+    return wanted if wanted is not None and obstacle is None else temporary_folder(str(obstacle))
 
 
 def cache_is_kept() -> bool:
@@ -43,7 +43,8 @@ def _obstacle() -> str | None:
 
 
 @lru_cache(maxsize=1)
-def _temporary_folder(reason: str) -> Path:
+def temporary_folder(reason: str) -> Path:
+    """Return a folder for this process alone, and say why."""
     folder = Path(tempfile.mkdtemp(prefix="mien-cache-"))
     atexit.register(remove_tree, folder)
     say(f"{reason}: face models are baked into {folder} for this command only; set MIEN_CACHE to keep them")

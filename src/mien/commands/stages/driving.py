@@ -64,7 +64,7 @@ def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | No
     if suffix in (".csv", ".json", *SOUND_ENDINGS):
         return read_recording(by, face_model, fps)
     if by.is_file():
-        workspace, names = _tracked_video(by, face_model.name)
+        workspace, names = tracked_video(by, face_model.name)
         names = names if sequence is None else [workspace.pick_sequence(sequence)]
     elif is_tracked_sequence(by):
         return read_tracked_driver([by], face_model)
@@ -74,7 +74,7 @@ def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | No
     return read_tracked_driver([workspace.sequence_dir(name) for name in names], face_model)
 
 
-def _tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
+def tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
     """The workspace of a video in this user's cache, and its sequences. They are captured and tracked if needed."""
     workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
     run_capture_stage(workspace, video, None, CaptureSettings())

@@ -42,7 +42,7 @@ def run_evaluation_stage(
         metrics = read_figures(run_dir)
     else:
         named = read_run_config(run_dir)["settings"]["split"] == NAMED_SPLIT
-        metrics = evaluate(run_dir, folders, settings, _driver_folders(drivers, driving_sequences if named else list))
+        metrics = evaluate(run_dir, folders, settings, driver_folders(drivers, driving_sequences if named else list))
     for name, entry in metrics["protocols"].items():
         for line in [driven_line(entry)] if name == "cross_reenactment" else protocol_lines(name, entry):
             say(line)
@@ -76,7 +76,7 @@ def run_comparison(workspaces: Items[Workspace], run: str | None, out: Path | No
     return comparison
 
 
-def _driver_folders(drivers: Items[Path], chosen: Callable[[list[str]], list[str]]) -> list[Path]:
+def driver_folders(drivers: Items[Path], chosen: Callable[[list[str]], list[str]]) -> list[Path]:
     """The folders of the given sequences, and of the chosen sequences in the given workspaces."""
     folders: list[Path] = []
     for driver in drivers:

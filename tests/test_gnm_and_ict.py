@@ -1,6 +1,6 @@
-"""Heads in GNM's schema are posed as GNM poses, and refused in clear words."""
+"""GNM and ICT-FaceKit: a head in GNM's schema is posed as GNM poses, ICT is read, and what does not fit is told."""
 
-from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,9 @@ from gnm_like import gnm_like, posed_as_gnm, write_gnm
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.gnm import gnm_face_model, read_gnm
+from mien.face.ict import NEUTRAL, PACKED_KEYS, read_ict
 from mien.face.model_files import default_name, read_model_file
+from mien.face.obj_files import read_obj, read_obj_positions
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 
@@ -56,22 +58,18 @@ def test_poses_as_gnm_does(moved: str, arrays: dict[str, Any], model: FaceModel)
 
 def test_the_order_of_joints_is_read_by_their_names(arrays: dict[str, Any], model: FaceModel, tmp_path) -> None:
     swapped = [1, 0, 3, 2]
-    parents = np.array([1, -1, 0, 0], np.int32)
-    changed = {
-        **arrays,
-        "joint_names": arrays["joint_names"][swapped],
-        "joint_parent_indices": parents,
-        "template_joint_positions": arrays["template_joint_positions"][swapped],
+    names = ("joint_names", "template_joint_positions", "skinning_weights")
+    changed = {**arrays, **{name: arrays[name][swapped] for name in names}} | {
+        "joint_parent_indices": np.array([1, -1, 0, 0], np.int32),
         "joint_identity_basis": arrays["joint_identity_basis"][:, swapped],
-        "skinning_weights": arrays["skinning_weights"][swapped],
         "pose_correctives_regressor": arrays["pose_correctives_regressor"].reshape(4, 9, -1)[swapped].reshape(36, -1),
     }
     path = write_gnm(tmp_path / "other.npz", changed)
     assert default_name(path) == "other"
-    assert replace(read_model_file(path, "gnm_head")).content_hash == model.content_hash
+    assert read_model_file(path, "gnm_head").content_hash == model.content_hash
 
 
-FAULTS = {
+GNM_FAULTS = {
     "a key": (lambda a: {k: v for k, v in a.items() if k != "skinning_weights"}, "has no 'skinning_weights'"),
     "a shape": (lambda a: {**a, "expression_basis": a["expression_basis"][:, 1:]}, "'expression_basis' is .*download"),
     "not finite": (lambda a: {**a, "vertex_identity_basis": a["vertex_identity_basis"] * np.nan}, "not finite"),
@@ -90,15 +88,82 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_what_does_not_fit_is_named_with_a_remedy(fault: str, arrays: dict[str, Any], tmp_path) -> None:
-    change, message = FAULTS[fault]
-    path = write_gnm(tmp_path / "gnm_head.npz", change(arrays))
-    with pytest.raises(UserError, match=message) as told:
-        read_model_file(path, "gnm_head")
-    assert "\n" not in str(told.value)
-
-
-def test_teeth_are_for_flame_alone(arrays: dict[str, Any], tmp_path) -> None:
+def test_what_does_not_fit_gnm_is_named_with_a_remedy(arrays: dict[str, Any], tmp_path: Path) -> None:
+    for fault, (change, message) in GNM_FAULTS.items():
+        path = write_gnm(tmp_path / f"{fault}.npz", change(arrays))
+        with pytest.raises(UserError, match=message) as told:
+            read_model_file(path, "gnm_head")
+        assert "\n" not in str(told.value), fault
     with pytest.raises(UserError, match="without --teeth"):
         read_model_file(write_gnm(tmp_path / "gnm_head.npz", arrays), "gnm_head", teeth=True)
+
+
+# ICT-FaceKit ----------------------------------------------------------------------------------------------------------
+
+SMALL = b"# a comment\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0.5\nvt 0 0\nf 1/1/1 2/1/1 3/1/1 4/1/1\nf 1 2 3\n"
+
+
+def _packed(folder: Path, **changed: Any) -> Path:
+    arrays = {
+        "v": np.zeros((4, 3), np.float32), "f_quad": np.array([[0, 1, 2, -1]], np.int32),
+        "identity": np.zeros((2, 4, 3), np.float16), "expression": np.zeros((2, 4, 3), np.float16),
+        "expression_names": np.array(["jawOpen", "jawLeft"]), **changed,
+    }  # fmt: skip
+    np.savez(folder / "packed.npz", **arrays)
+    return folder / "packed.npz"
+
+
+def test_faces_of_three_and_four_corners_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_bytes(SMALL)
+    positions, quads = read_obj(path)
+    assert positions.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.5]]
+    assert quads.tolist() == [[0, 1, 2, 3], [0, 1, 2, -1]]
+    assert np.array_equal(read_obj_positions(path, 4), positions)
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"v 0 0\nf 1 2 3\n", b"v a b c\nf 1 2 3\n", b"v 0 0 0\nf 1 x 3\n", b"v 0 0 0\nf 1 2\n", b"\xff\x00"]
+)
+def test_a_damaged_obj_is_told_in_one_line(text: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_bytes(text)
+    with pytest.raises(UserError, match="cannot be read as .obj") as told:
+        read_obj(path)
+    assert "\n" not in str(told.value)
+    path.write_bytes(SMALL)
+    with pytest.raises(UserError, match="4 vertices instead of 5"):
+        read_obj_positions(path, 5)
+
+
+def test_the_folder_and_the_packed_copy_have_one_name(tmp_path: Path) -> None:
+    (tmp_path / "FaceXModel").mkdir()
+    (tmp_path / "FaceXModel" / NEUTRAL).write_bytes(SMALL)
+    assert default_name(tmp_path / "FaceXModel") == default_name(_packed(tmp_path)) == "ict"
+    for path in (tmp_path / "FaceXModel", tmp_path / "packed.npz"):
+        with pytest.raises(UserError, match=r"has 4 vertices and \d faces, and ICT-FaceKit Light has 26,719"):
+            read_model_file(path, "ict")
+        with pytest.raises(UserError, match="without --teeth"):
+            read_model_file(path, "ict", teeth=True)
+
+
+def test_what_does_not_fit_ict_is_told_in_one_line(tmp_path: Path) -> None:
+    faults: tuple[dict[str, Any], ...] = (
+        {"expression_names": np.array(["a", 1], dtype=object)}, {"expression_names": np.array(["jawOpen"])},
+        {"identity": np.zeros(3)}, {"f_quad": np.zeros((1, 4))},
+    )  # fmt: skip
+    for fault in faults:
+        with pytest.raises(UserError, match="cannot be read as ICT-FaceKit") as told:
+            read_ict(_packed(tmp_path, **fault))
+        assert "\n" not in str(told.value)
+    with np.load(_packed(tmp_path), allow_pickle=False) as found:
+        np.savez(tmp_path / "b.npz", **{key: found[key] for key in PACKED_KEYS if key != "identity"})
+    with pytest.raises(UserError, match="has no 'identity'"):
+        read_ict(tmp_path / "b.npz")
+
+
+def test_the_published_model_is_read(test_data: Path) -> None:
+    whole = read_ict(test_data / "face_models" / "ict_facekit_light_f16.npz")
+    assert whole.template.shape == (26719, 3)
+    assert len(whole.identity) == 100
+    assert {"browInnerUp_L", "jawOpen", "PupilDilate_R"} <= whole.expression.keys()
