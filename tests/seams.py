@@ -1,9 +1,9 @@
-"""Two rules of CONTRIBUTING.md that no other tool checks: who may name a method, and what may be overridden.
+"""Three rules of CONTRIBUTING.md that no other tool checks: naming methods, overriding, and the private names of mien.
 
 `make lint` runs this file in the repository's root. No file names a method but those of the method and those in
 `MAY_NAME`. No class in src/mien overrides a method that a base class in src/mien implements. What may be overridden:
 abstract methods, methods of protocols, methods with two underscores, and methods of other packages' classes, such as
-torch's `forward`.
+torch's `forward`. No test uses a private name of mien: a test that does breaks with every change of what it tests.
 """
 
 import ast
@@ -158,12 +158,42 @@ def _read_classes(place: str, text: str, classes: dict[str, _Class], doors: dict
         classes[f"{module}.{node.name}"] = one
 
 
+_PRIVATE = re.compile(r"_[a-zA-Z]\w*")
+
+
+def private_faults(texts: Mapping[str, str]) -> Iterator[str]:
+    """Yield a message for each private name of a module or class of mien that a test imports, reads or replaces."""
+    for place, text in texts.items():
+        tree = ast.parse(text)
+        ours: set[str] = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom | ast.Import):
+                module = getattr(node, "module", None) or ""
+                for name in node.names:
+                    if not f"{module}.{name.name}".strip(".").startswith("mien"):
+                        continue
+                    ours.add(name.asname or name.name.partition(".")[0])
+                    if _PRIVATE.fullmatch(name.name) and name.name != "_native":
+                        yield f"{place}:{node.lineno}: imports {name.name} of {module}; use what the room offers"
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and _PRIVATE.fullmatch(node.attr) and node.attr != "_native":
+                if ast.unparse(node.value).partition(".")[0] in ours:
+                    yield f"{place}:{node.lineno}: uses {ast.unparse(node)}; use what the room offers"
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr") and len(node.args) > 1:
+                owner, name = node.args[:2]
+                replaced = ast.literal_eval(name) if isinstance(name, ast.Constant) else ""
+                if ast.unparse(owner).partition(".")[0] in ours and _PRIVATE.fullmatch(str(replaced)):
+                    yield f"{place}:{node.lineno}: replaces {replaced}; use what the room offers"
+
+
 def main() -> int:
     """Check every source file, and report what breaks a rule."""
     python = {str(path): path.read_text() for path in sorted(Path("src/mien").rglob("*.py"))}
     scripts = {str(path): path.read_text() for path in sorted(Path("web/src").glob("*.ts"))}
+    tests = {str(path): path.read_text() for path in sorted(Path("tests").rglob("*.py"))}
     faults = [*naming_faults(python | scripts, method_names(), MAY_NAME), *override_faults(python)]
-    print("\n".join(faults) or f"Seams: {len(python) + len(scripts)} files checked; methods stay in their folders.")
+    faults += private_faults(tests)
+    print("\n".join(faults) or f"Seams: {len(python | scripts | tests)} files checked; methods stay in their folders.")
     return bool(faults)
 
 

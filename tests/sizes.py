@@ -1,4 +1,4 @@
-"""Limits on the size of functions that no other tool checks: lines in Python and C++, and parameters in C++.
+"""Limits that no other tool checks: lines of functions in Python and C++, parameters in C++, lines of a file of tests.
 
 `make lint` runs this file in the repository's root; ruff (PLR0913) counts the parameters of Python's functions. C++ is
 not parsed: the layout that clang-format gives it tells where a function begins and ends.
@@ -12,6 +12,7 @@ from pathlib import Path
 
 MOST_LINES = 60
 MOST_PARAMETERS = 10
+MOST_LINES_OF_TESTS = 400
 _COMMENT_OR_STRING = re.compile(r'//[^\n]*|/\*.*?\*/|"(?:\\.|[^"\\\n])*"', re.DOTALL)
 _TEMPLATE_ARGUMENTS = re.compile(r"<[^<>()]*>")
 _NOT_A_FUNCTION = re.compile(r"\s*(?:namespace|class|struct|union|enum|extern)\b[^()]*\{|[^(]*=[^(]*\{")
@@ -65,9 +66,12 @@ def main() -> int:
         for path in sorted(Path(folder).rglob("*")):
             check = {".py": python_faults, ".cpp": cpp_faults, ".h": cpp_faults}.get(path.suffix)
             if check is not None:
-                faults += check(path, path.read_text())
+                text = path.read_text()
+                faults += check(path, text)
                 count += 1
-    print("\n".join(faults) or f"Sizes: {count} files checked, no function exceeds a limit.")
+                if folder == "tests" and (lines := text.count("\n")) > MOST_LINES_OF_TESTS:
+                    faults.append(f"{path}: {lines} lines; at most {MOST_LINES_OF_TESTS} in a file of tests")
+    print("\n".join(faults) or f"Sizes: {count} files checked, nothing exceeds a limit.")
     return bool(faults)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from seams import MethodNames, naming_faults, override_faults
+from seams import MethodNames, naming_faults, override_faults, private_faults
 
 METHODS = [MethodNames("old", ("OldAvatar", "OldConfig")), MethodNames("new_one", ("NewOne", "NewOneConfig"))]
 BASE = """
@@ -84,3 +84,15 @@ def test_a_base_class_by_its_module_and_of_a_generic_class_is_found() -> None:
     user = "from mien import kept\n\nclass Own(kept.Kept[int]):\n    def get(self): ...\n"
     faults = list(override_faults({"src/mien/kept.py": generic, "src/mien/user.py": user}))
     assert len(faults) == 1
+
+
+@pytest.mark.parametrize(("text", "count"), [
+    ("from mien.face import _part\n", 1),
+    ("from mien import _native\n_native.draw()\n", 0),
+    ("from mien.face import loading\nloading._read(1)\nloading.read(1)\n", 1),
+    ("import mien.face\nmien.face._part\n", 1),
+    ("from mien import cli\nmonkeypatch.setattr(cli, '_run', None)\nmonkeypatch.setattr(cli, 'run', None)\n", 1),
+    ("import pathlib\npathlib._x\nself._y\n", 0),
+])  # fmt: skip
+def test_private_names_of_mien_are_found_in_tests(text: str, count: int) -> None:
+    assert len(list(private_faults({"tests/test_x.py": text}))) == count
