@@ -1,0 +1,71 @@
+"""Where the time of the tests goes, by theme: seconds, those that wait for other processes, and how many are started.
+
+As a plugin of pytest it appends a line of json for each test to the file that MIEN_TEST_TIMES names. As a program it
+prints the table of docs/tests.md. `make test-times` does both.
+"""
+
+import json
+import os
+import re
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+THEMES = {
+    "pages, browser, viewer, web packages": "web|viewer|live_view|gaze_pixels|site|first_minute|playcanvas|vrm|glb",
+    "processes, commands, recipes": "no_network|examples|two_commands|kills|plugins|new_|needs|startup|places|cli|"
+    "interrupt|stops|terminal|memory|readers_beside|system|extras|end_to_end|checked_types|batch",
+    "damage, fuzz, full disks, odd command lines": "damage|reader|fuzz|hostile|odd_|full_disks|inside|exhaust|"
+    "bad_input|matrices_in|handed_in|native_calls|edges_of|locks",
+    "tracking, alignment, drawn people": "track(?!ed)|alignment|outline|eyelids|synthetic|mesh|photometric|neutral|"
+    "embedding",
+    "face models": "face|flame|gnm|ict|teeth",
+    "capture, cameras, driving": "capture|video|color|camera|calibration|driv|motion|recordings|interlaced|litert|cuts",
+    "datasets": "dataset|layout|named_split|submission",
+    "evaluation, reports, lab": "evaluation|analysis|study|bench|unseen|ablate|lpips|metrics|flicker|report",
+    "docs, settings, presets": "docs|settings|setting_|paper_preset|public_api|constants|licences|release|seams|sizes|"
+    "mutation",
+    "training, avatars, rasterizer": "",
+}
+"""Theme -> pattern of the names of its files; the first that fits counts."""
+_starts = [0]
+
+
+def pytest_configure() -> None:
+    """Count the processes that are started."""
+    sys.addaudithook(lambda event, _: _starts.__setitem__(0, _starts[0] + (event == "subprocess.Popen")))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Record the test with its fixtures."""
+    began, computed, starts = time.monotonic(), time.process_time(), _starts[0]
+    yield
+    wall, own = time.monotonic() - began, time.process_time() - computed
+    with Path(os.environ["MIEN_TEST_TIMES"]).open("a") as file:
+        started = _starts[0] - starts
+        file.write(json.dumps([item.nodeid, wall, max(wall - own, 0) if started else 0, started]) + "\n")
+
+
+def main(path: str) -> None:
+    """Print the table by theme, and the tests that take longest."""
+    sums: dict[str, list[float]] = defaultdict(lambda: [0, 0.0, 0.0, 0])
+    rows = [json.loads(line) for line in Path(path).read_text().splitlines()]
+    for name, *numbers in rows:
+        stem = Path(name.partition("::")[0]).stem.removeprefix("test_")
+        theme = next(theme for theme, pattern in THEMES.items() if re.search(pattern, stem))
+        sums[theme] = [total + number for total, number in zip(sums[theme], (1, *numbers), strict=True)]
+    print("| theme | tests | s | of this, waiting for processes | processes |\n|---|---|---|---|---|")
+    for theme, (count, wall, waits, starts) in sorted(sums.items(), key=lambda entry: -entry[1][1]):
+        print(f"| {theme} | {count:,.0f} | {wall:,.0f} | {waits:,.0f} | {starts:,.0f} |")
+    print()
+    for name, wall, *_ in sorted(rows, key=lambda row: -row[1])[:20]:
+        print(f"{wall:6.1f} s  {name}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
