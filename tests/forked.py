@@ -4,6 +4,8 @@ For tests about processes: signals, kills, two commands at the same time. A proc
 Start-up, missing packages and other interpreters need a process that Python starts anew.
 """
 
+import atexit
+import gc
 import importlib
 import json
 import os
@@ -12,7 +14,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -169,8 +173,35 @@ def _become(request: dict[str, Any]) -> None:
         os.dup2(os.open(Path(request["folder"]) / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), number)
     sys.argv = ["mien", *map(str, request["arguments"][0])] if request["exits"] else [request["function"]]
     module, name = request["function"].split(":")
-    result = getattr(importlib.import_module(module), name)(*request["arguments"])
-    sys.exit(result if request["exits"] else 0)
+    try:
+        result = getattr(importlib.import_module(module), name)(*request["arguments"])
+        _end(result if request["exits"] else 0)
+    except SystemExit as stop:
+        _end(stop.code)
+    except KeyboardInterrupt:
+        traceback.print_exc()
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGINT)
+    except BaseException:
+        traceback.print_exc()
+        _end(1)
+
+
+def _end(code: object) -> None:
+    """End as Python does, but without the removal of all objects, which takes a second."""
+    if not isinstance(code, int | None):
+        print(code, file=sys.stderr)
+        code = 1
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and not thread.daemon:
+            thread.join()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            code = 120
+    os._exit(code or 0)
 
 
 if __name__ == "__main__":
@@ -179,4 +210,5 @@ if __name__ == "__main__":
     for each in ("mien.cli", "mien.avatar.gaussian_avatars.avatar", "tyro"):
         importlib.import_module(each)
     tempfile.tempdir = None
+    gc.freeze()
     _serve()
