@@ -124,7 +124,8 @@ def test_a_missing_engine_is_told_before_rows_are_read(tmp_path: Path, monkeypat
 @pytest.mark.parametrize(
     "changed",
     [
-        None, {"version": 99}, {"status": []}, {"status": "bogus"}, {"runs": [1]}, {"stages": "x"}, {"stages": {"a": "x"}},
+        None, {"version": 99},
+        {"status": []}, {"status": "bogus"}, {"runs": [1]}, {"stages": "x"}, {"stages": {"a": "x"}},
         {"began": float("nan")}, {"tries": None},
     ],
     ids=str,
