@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 TargetsAt = Callable[[int], Items[Targets]]
 """Gives the targets of a step, one entry per sequence."""
 
-_AHEAD = 4
+AHEAD = 4
 """Number of steps whose pictures are prepared in advance. It bounds the memory: each has 4 bytes a pixel."""
 
 
@@ -44,7 +44,7 @@ class TargetQueue:
         if step != self._next - len(self._waiting):
             self.close()
             self._next = step
-        while self._next <= step + _AHEAD and (self._next <= step or self._next < self._settings.steps):
+        while self._next <= step + AHEAD and (self._next <= step or self._next < self._settings.steps):
             self._waiting.append(self._planned(self._next))
             self._next += 1
         found = self._waiting.popleft()

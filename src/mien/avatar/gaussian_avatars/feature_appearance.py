@@ -47,7 +47,7 @@ class FeatureAppearance(nn.Module):
         """
         bases, neutral = store["feature_bases"], store["neutral_features"]
         own = neutral.new_zeros(len(neutral), 0)
-        return feature_network(bases, activations.detach(), neutral, own, self._layers(), self._gradient)
+        return feature_network(bases, activations.detach(), neutral, own, self.layers(), self._gradient)
 
     def parameter_groups(self, store: GaussianStore, rate: Rate, network_rate: Rate) -> list[ParameterGroup]:
         """The groups of the features and of the network."""
@@ -59,7 +59,7 @@ class FeatureAppearance(nn.Module):
 
     def bake(self, store: GaussianStore) -> FeatureChanges:
         """The features and the network as arrays."""
-        layers = self._layers()
+        layers = self.layers()
         return FeatureChanges(
             neutral=as_array(store["neutral_features"]),
             basis=as_array(store["feature_bases"]),
@@ -68,7 +68,8 @@ class FeatureAppearance(nn.Module):
             biases=(as_array(layers.bias1), as_array(layers.bias2)),
         )
 
-    def _layers(self) -> Layers:
+    def layers(self) -> Layers:
+        """The weights of the network."""
         return Layers(self.first.weight, self.no_bias1, self.last.weight, self.no_bias2)
 
 

@@ -75,7 +75,7 @@ class MonoGaussianAvatar(Avatar):
             cube = 2 * torch.rand(config.points, 3).to(like) - 1
             means = config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)
         else:
-            means = sample_surface(self._at_rest().vertices, face_model.faces, config.points)
+            means = sample_surface(self.at_rest().vertices, face_model.faces, config.points)
         trained = {"means": means}
         if config.own_rate.start > 0:
             trained["own_attributes"] = means.new_zeros(config.points, sum(ATTRIBUTE_WIDTHS))
@@ -220,7 +220,7 @@ class MonoGaussianAvatar(Avatar):
         own = (self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints"))
         return PointMotion(self.face_model, self.subject, self.deformation, *own, self._rest)
 
-    def _at_rest(self) -> AtRest:
+    def at_rest(self) -> AtRest:
         """What depends on the canonical face alone."""
         return self._motion.at_rest()
 

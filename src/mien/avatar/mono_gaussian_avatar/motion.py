@@ -25,7 +25,7 @@ from mien.face import FaceModel, FaceParams
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.runtime.baked import Rig
 
-_POINTS_AT_ONCE = 4096
+POINTS_AT_ONCE = 4096
 """Number of points whose distances to all vertices are in memory at once: 74 MB for a face model of 4,535 vertices."""
 
 
@@ -207,7 +207,7 @@ def nearest_vertices(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "v 3"
         return torch.from_numpy(nearest)
     # |p - v|^2 less |p|^2, which is the same for all vertices, and half of that.
     own, across = vertices.square().sum(-1) / 2, vertices.T
-    return torch.cat([torch.addmm(own, part, across, alpha=-1).argmin(-1) for part in points.split(_POINTS_AT_ONCE)])
+    return torch.cat([torch.addmm(own, part, across, alpha=-1).argmin(-1) for part in points.split(POINTS_AT_ONCE)])
 
 
 def _pose_features(face: FaceParams) -> Float[Tensor, "b p"]:

@@ -86,12 +86,12 @@ class PointAvatar(Avatar):
             cube = 2 * torch.rand(config.points, 3).to(like) - 1
             means = config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)
         else:
-            means = sample_surface(self._motion.at_rest().vertices, face_model.faces, config.points)
+            means = sample_surface(self.motion.at_rest().vertices, face_model.faces, config.points)
         self.store = GaussianStore({"means": means})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The points in the head frame, one batch entry per timestep, as Gaussians."""
-        means, _ = self._motion.deformed(self.store["means"], face)
+        means, _ = self.motion.deformed(self.store["means"], face)
         colors = self._colors(face)
         sh = sh_from_rgb(colors)[..., None, :]
         like, n = means.detach(), len(self.store)
@@ -102,7 +102,7 @@ class PointAvatar(Avatar):
 
     def radius(self, fraction: float) -> float:
         """The radius of all points at a time, in metres. It shrinks whenever their number doubles."""
-        doublings = math.log2(self._count(fraction) / 100)
+        doublings = math.log2(self.points_at(fraction) / 100)
         return self.config.first_radius * self.config.radius_factor**doublings
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
@@ -117,7 +117,7 @@ class PointAvatar(Avatar):
         means = means[chosen[:n].to(means.device) % n]
         surface = self.surface_net(means / LENGTH_UNIT)
         return {
-            **self._motion.face_losses(means, self._face_weights()),
+            **self.motion.face_losses(means, self._face_weights()),
             "distance": config.distance_weight * surface.distance.square().mean(),
             "slope": config.slope_weight * (surface.slope.norm(dim=-1) - 1).square().mean(),
         }
@@ -136,7 +136,7 @@ class PointAvatar(Avatar):
         """Deletes points that no picture of the last epoch showed, then refills up to the scheduled number."""
         epochs = self.config.epochs
         times = tuple(epoch / epochs for epoch in range(1, epochs))
-        targets = tuple(self._count(time) for time in times)
+        targets = tuple(self.points_at(time) for time in times)
 
         def near_parents(
             store: GaussianStore, parents: Int[Tensor, " p"], noise: Float[Tensor, "p 3"], fraction: float
@@ -144,7 +144,7 @@ class PointAvatar(Avatar):
             """Children in a cube around their parents, whose side is the radius."""
             return {"means": store["means"].detach()[parents] + noise.to(store["means"]) * self.radius(fraction)}
 
-        return RefillDensity(RefillSettings(times, targets, prune_opacity=0.5), near_parents, observed=_was_drawn)
+        return RefillDensity(RefillSettings(times, targets, prune_opacity=0.5), near_parents, observed=was_drawn)
 
     @torch.no_grad()
     def bake(self) -> BlendSkinned:
@@ -156,7 +156,7 @@ class PointAvatar(Avatar):
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         n, own = len(self.store), self.store["means"]
-        motion = self._motion.baked(own, bake_rig(self.face_model, self.subject))
+        motion = self.motion.baked(own, bake_rig(self.face_model, self.subject))
         attributes = Attributes(
             quats=as_array(own.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)),
             log_scales=as_array(own.new_full((n, 3), math.log(self.radius(1.0) / 2))),
@@ -166,11 +166,12 @@ class PointAvatar(Avatar):
         return BlendSkinned(motion.rig, attributes, still_weights=motion.still_weights, still_pose=motion.still_pose)
 
     @property
-    def _motion(self) -> PointMotion:
+    def motion(self) -> PointMotion:
+        """How points move with the face model."""
         own = (self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints"))
         return PointMotion(self.face_model, self.subject, self.deformation, *own, self._rest)
 
-    def _count(self, fraction: float) -> int:
+    def points_at(self, fraction: float) -> int:
         """The number of points that an epoch begins with."""
         config = self.config
         # Times of rounds are epoch / epochs, which multiplied by epochs may be a little less than the epoch.
@@ -183,14 +184,14 @@ class PointAvatar(Avatar):
         surface = self.surface_net(points)
         normals = torch.nn.functional.normalize(surface.slope, dim=-1)
         if self.config.normals == "deformed":
-            normals = self._deformed_normals(points, normals, face)
+            normals = self.deformed_normals(points, normals, face)
         return sigmoid(surface.albedo) * self.shading(normals)
 
-    def _deformed_normals(
+    def deformed_normals(
         self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], face: FaceParams
     ) -> Float[Tensor, "b n 3"]:
         """Normals of the skinned points in the world, of length 1."""
-        motion, weights = self._motion, self.deformation.whole(points).weights
+        motion, weights = self.motion, self.deformation.whole(points).weights
         into, to = motion.at_rest().transforms[None], motion.transforms(face)
         at_rest = blend_transforms(weights, into)[0, :, :, :3]
         skinned = blend_transforms(weights, to)[..., :3]
@@ -208,10 +209,10 @@ class PointAvatar(Avatar):
 
     def _pretrain(self, face: FaceParams) -> Iterator[None]:
         """Teach the deformation network the face model's motion in training frames."""
-        yield from self._motion.learn(face, self.config.pretraining, self._face_weights())
+        yield from self.motion.learn(face, self.config.pretraining, self._face_weights())
 
 
-def _was_drawn(gaussians: Gaussians, rendering: Rendering) -> Float[Tensor, " n"]:
+def was_drawn(gaussians: Gaussians, rendering: Rendering) -> Float[Tensor, " n"]:
     """1 for points that take part in a pixel of the picture, and 0 for the others, which others hide."""
     gradient = rendering.means2d_offset.grad
     if gradient is None:

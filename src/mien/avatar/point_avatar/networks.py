@@ -54,7 +54,7 @@ class SurfaceNet(nn.Module):
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Surface:
         """Everything about some points."""
-        values, slopes = positional_encoding(points, self.bands), _slopes_of_encoding(points, self.bands)
+        values, slopes = positional_encoding(points, self.bands), slopes_of_encoding(points, self.bands)
         for layer in self.trunk:
             weight, bias = _parts(layer)
             raw = torch.addmm(bias, values, weight.T)
@@ -78,7 +78,7 @@ class ShadingNet(nn.Module):
         return 2 * torch.sigmoid(self.light(self.layers(normals)))
 
 
-def _slopes_of_encoding(points: Float[Tensor, "n 3"], bands: int) -> Float[Tensor, "n c 3"]:
+def slopes_of_encoding(points: Float[Tensor, "n 3"], bands: int) -> Float[Tensor, "n c 3"]:
     """Gradients of the encoding by the position."""
     scales = 2.0 ** torch.arange(bands, dtype=points.dtype, device=points.device)[:, None]
     angles = points[..., None, :] * scales

@@ -160,7 +160,7 @@ class TexturedMesh(Avatar):
 
     def _compute_rest(self) -> _AtRest:
         store, faces, surfels = self.store, self.face_model.faces.long(), self.surfels
-        offsets, vertex_albedo = self._averaged()
+        offsets, vertex_albedo = self.averaged()
         vertices = self.face_model.rest_vertices(self._moved_subject(offsets))
         corners = corners_in_frames(vertices, faces)
         means, albedo = surfels.at_corners(torch.cat([corners, vertex_albedo[faces]], dim=-1)).split(3, dim=-1)
@@ -193,7 +193,7 @@ class TexturedMesh(Avatar):
         own = self.subject.vertex_offsets
         return replace(self.subject, vertex_offsets=offsets if own is None else own + offsets)
 
-    def _averaged(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v 3"]]:
+    def averaged(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v 3"]]:
         """Offsets in metres and logits of the albedo of the vertices, averaged over neighbours."""
         values = torch.cat([self.vertex_means, self.vertex_albedo], dim=-1)
         for _ in range(self.config.smoothing):

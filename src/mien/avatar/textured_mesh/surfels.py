@@ -37,7 +37,7 @@ class Surfels(nn.Module):
         """Numbers of parts along an edge."""
         self.counts: list[int] = numbers.tolist()
         """Numbers of triangles that are cut so."""
-        grids = torch.cat([_middles(side) for side in self.sides])
+        grids = torch.cat([middles_of_parts(side) for side in self.sides])
         self.register_buffer("grids", grids.to(like), persistent=False)
 
     def at_corners(self, corners: Float[Tensor, "*b f 3 c"]) -> Float[Tensor, "*b n c"]:
@@ -78,7 +78,7 @@ def _face_index(sides: Int[Tensor, " f"]) -> Int[Tensor, " n"]:
     return ordered.indices.repeat_interleave(ordered.values.square())
 
 
-def _middles(side: int) -> Float[Tensor, "k 3"]:
+def middles_of_parts(side: int) -> Float[Tensor, "k 3"]:
     """Barycentric coordinates of the middles of a triangle's `side` times `side` equal parts."""
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(side) for j in range(side - i)]
     turned = [(i + 2 / 3, j + 2 / 3) for i in range(side - 1) for j in range(side - 1 - i)]

@@ -21,7 +21,7 @@ from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, re
 from mien.training.footage.foreground import soft_colors
 from mien.training.footage.hidden import hidden_triangles
 
-_CACHE_BYTES = 1 << 30
+CACHE_BYTES = 1 << 30
 _ON_CPU = torch.zeros(())
 
 
@@ -167,11 +167,11 @@ class Targets:
         self._cache: dict[tuple[int, int, bytes], Target] = {}
         self._soft: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         """Indices of soft pixels, in rows, and their cleaned colours, by timestep and camera."""
-        self._soft_room = _CACHE_BYTES // share
+        self._soft_room = CACHE_BYTES // share
         self._face_model, self._inside = face_model, inside
         self._boxes: dict[tuple[int, int], tuple[Box, tuple[Box, ...], Tensor | None]] = {}
         """Boxes of the mattes and of the parts, and hidden triangles, by timestep and camera."""
-        self._max_cached = _CACHE_BYTES // (share * self.width * self.height * 4)
+        self._max_cached = CACHE_BYTES // (share * self.width * self.height * 4)
 
     def halved(self) -> "Targets":
         """The same pictures at half the size."""

@@ -101,7 +101,7 @@ class SideViews:
         # The same tensor of the identity says that the person's shape at rest need not be computed again.
         face = replace(turned_to_side(face.detach(), angle), identity=face.identity, vertex_offsets=face.vertex_offsets)
         if raised:
-            face = replace(face, expression=self._raised(face.expression, random))
+            face = replace(face, expression=self.raised(face.expression, random))
         scale = WHOLE_HEAD.side_views_size / max(camera.width, camera.height)
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         background = torch.rand(3, generator=random)
@@ -145,7 +145,7 @@ class SideViews:
         compared = self.compared.index_select(0, triangle).view(index.shape) & (alpha > 0)
         return SideView(plan, picture, alpha, compared)
 
-    def _raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
+    def raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""
         count = expression.shape[1]
         chosen = torch.randperm(count, generator=random)[: WHOLE_HEAD.raised_coefficients]
