@@ -79,6 +79,27 @@ def random() -> torch.Generator:
 ABOVE, BELOW = 1.1e-5, 0.9e-5
 
 
+def faces(
+    scales: list[float],
+    gradients: list[float],
+    opacities: list[float] | None = None,
+    settings: GradientSettings = EVERY_STEP,
+    at: int = 0,
+    **hooks: object,
+) -> list[int]:
+    """The faces of the Gaussians after a round of a run of 100 steps."""
+    store = make_store(scales)
+    store.assign("opacity_logits", torch.logit(torch.tensor(opacities or [0.5] * len(scales))))
+    strategy = control(store, settings, **hooks)
+    strategy.observe(pose(store), rendering(gradients))
+    strategy.adapt(store, pose(store), Progress(at, 100), random)
+    return store["face_index"].tolist()
+
+
+def keep_the_second(store: GaussianStore, prune: Tensor) -> Tensor:
+    return prune & (store["face_index"] != 1)
+
+
 def test_small_ones_duplicate_and_large_ones_split() -> None:
     store = make_store([0.001, 0.001, 0.004, 0.004])
     strategy = control(store)
@@ -100,29 +121,20 @@ def test_gradient_is_the_mean_over_the_steps_that_showed_the_gaussian() -> None:
     assert store["face_index"].tolist() == [0, 1, 0]
 
 
-def test_faint_and_huge_ones_go() -> None:
-    store = make_store([0.001, 0.001, 0.2])
-    store.assign("opacity_logits", torch.logit(torch.tensor([0.004, 0.006, 0.5])))
-    settings = replace(EVERY_STEP, opacity_resets=(0.0, 0.5), reset_opacity=0.9)
-    early, late = make_store([1.0]), store
-    strategy = control(store, settings)
-    strategy.observe(pose(store), rendering([0.0] * 3))
-    strategy.adapt(late, pose(late), Progress(60, 100), random)
-    assert late["face_index"].tolist() == [1]
-    strategy = control(early, settings)
-    strategy.observe(pose(early), rendering([0.0]))
-    strategy.adapt(early, pose(early), Progress(10, 100), random)
-    assert len(early) == 1, "size is judged only after a reset that follows the start"
-
-
-def test_a_round_prunes_first_so_that_what_goes_does_not_grow() -> None:
-    """The published code of GaussianAvatars grows first (docs/paper_preset.md)."""
-    store = make_store([0.001, 0.001, 0.004])
-    store.assign("opacity_logits", torch.logit(torch.tensor([0.004, 0.5, 0.004])))
-    strategy = control(store)
-    strategy.observe(pose(store), rendering([ABOVE, ABOVE, ABOVE]))
-    strategy.adapt(store, pose(store), Progress(0, 100), random)
-    assert store["face_index"].tolist() == [1, 1]
+def test_what_goes_and_what_grows() -> None:
+    resets, nothing = replace(EVERY_STEP, opacity_resets=(0.0, 0.5), reset_opacity=0.9), [0.0] * 3
+    # Faint and huge ones go. Size is judged only after a reset that follows the start.
+    assert faces([0.001, 0.001, 0.2], nothing, [0.004, 0.006, 0.5], resets, at=60) == [1]
+    assert faces([1.0], [0.0], None, resets, at=10) == [0]
+    # A round prunes first, so that what goes does not grow. The published code grows first (docs/paper_preset.md).
+    assert faces([0.001, 0.001, 0.004], [ABOVE] * 3, [0.004, 0.5, 0.004]) == [1, 1]
+    # An avatar keeps one Gaussian, whatever is pruned.
+    assert faces([0.001] * 3, nothing, [0.1, 0.3, 0.2], replace(EVERY_STEP, prune_opacity=0.9)) == [1]
+    # A method may forbid prunes.
+    assert faces([0.001] * 3, nothing, [0.001, 0.001, 0.5], may_prune=keep_the_second) == [1, 2]
+    # Growth stops at the limit with those that pull most.
+    capped = replace(EVERY_STEP, max_gaussians=5)
+    assert faces([0.001] * 4, [2e-5, 3e-5, 4e-5, 1e-6], None, capped) == [0, 1, 2, 3, 2]
 
 
 @pytest.mark.parametrize(("axis", "side"), [(0, WIDTH), (1, HEIGHT)])
@@ -134,32 +146,6 @@ def test_gradients_weigh_by_the_pictures_own_width_and_height(axis: int, side: i
     strategy.observe(pose(store), drawn)
     strategy.adapt(store, pose(store), Progress(0, 100), random)
     assert store["face_index"].tolist() == [0, 1, 1]
-
-
-def test_an_avatar_keeps_one_gaussian_whatever_is_pruned() -> None:
-    store = make_store([0.001] * 3)
-    store.assign("opacity_logits", torch.logit(torch.tensor([0.1, 0.3, 0.2])))
-    strategy = control(store, replace(EVERY_STEP, prune_opacity=0.9))
-    strategy.observe(pose(store), rendering([0.0] * 3))
-    strategy.adapt(store, pose(store), Progress(0, 100), random)
-    assert store["face_index"].tolist() == [1]
-
-
-def test_a_method_may_forbid_prunes() -> None:
-    store = make_store([0.001] * 3)
-    store.assign("opacity_logits", torch.logit(torch.tensor([0.001, 0.001, 0.5])))
-    strategy = control(store, may_prune=lambda store, prune: prune & (store["face_index"] != 1))
-    strategy.observe(pose(store), rendering([0.0] * 3))
-    strategy.adapt(store, pose(store), Progress(0, 100), random)
-    assert store["face_index"].tolist() == [1, 2]
-
-
-def test_growth_stops_at_the_limit_with_those_that_pull_most() -> None:
-    store = make_store([0.001] * 4)
-    strategy = control(store, replace(EVERY_STEP, max_gaussians=5))
-    strategy.observe(pose(store), rendering([2e-5, 3e-5, 4e-5, 1e-6]))
-    strategy.adapt(store, pose(store), Progress(0, 100), random)
-    assert store["face_index"].tolist() == [0, 1, 2, 3, 2]
 
 
 def test_rounds_and_resets_happen_at_their_fractions() -> None:
@@ -252,20 +238,14 @@ def test_every_refill_keeps_the_store_whole(opacities: list[float], target: int,
     assert not strategy.state()["opacity"].any()
 
 
-def test_refill_survives_when_nothing_was_seen() -> None:
-    store = make_store([0.001] * 3, opacity=0.01)
+def test_refill_survives_when_nothing_was_seen_and_fixed_density_changes_nothing() -> None:
     described = RefillDensity(RefillSettings((0.0,), (5,)), refill=lambda store, parents, noise, fraction: {})
-    strategy = density_strategy(described, store)
-    strategy.observe(pose(store), rendering([0.0] * 3))
-    strategy.adapt(store, pose(store), Progress(0, 10), random)
-    assert len(store) == 5
-
-
-def test_fixed_density_changes_nothing() -> None:
-    store = make_store([0.001] * 3)
-    strategy = density_strategy(FixedDensity(), store)
-    strategy.observe(pose(store), rendering([1.0] * 3))
-    assert not strategy.adapt(store, pose(store), Progress(0, 1), random)
+    for density, count in ((described, 5), (FixedDensity(), 3)):
+        store = make_store([0.001] * 3, opacity=0.01)
+        strategy = density_strategy(density, store)
+        strategy.observe(pose(store), rendering([1.0] * 3))
+        assert strategy.adapt(store, pose(store), Progress(0, 10), random) == (count == 5)
+        assert len(store) == count
 
 
 def test_statistics_survive_a_checkpoint() -> None:
@@ -275,9 +255,6 @@ def test_statistics_survive_a_checkpoint() -> None:
     other.load_state(strategy.state())
     for name, tensor in strategy.state().items():
         assert torch.equal(tensor, other.state()[name]), name
-
-
-# -- a switch for each rule -------------------------------------------------------------------------------------------
 
 
 def off(rule: str, settings: GradientSettings = EVERY_STEP, **changes: object) -> GradientSettings:
@@ -310,6 +287,9 @@ def test_each_rule_has_a_switch() -> None:
     keeps = {"may_prune": lambda store, prune: prune & (store["face_index"] != 3)}
     assert faces_after(settings, BELOW, **keeps) == [0, 1, 3]
     assert faces_after(off("never_empty", settings), BELOW, **keeps) == [0, 1]
+    # Pruning by size may begin without resets.
+    for begin, kept in ((0.0, [0, 1]), (0.99, [0, 1, 3, 4])):
+        assert faces_after(replace(EVERY_STEP, size_start=begin, prune_radius=20.0), BELOW) == kept
 
 
 @pytest.mark.parametrize("on", [True, False])
@@ -324,12 +304,6 @@ def test_resets_have_a_switch_that_leaves_the_time_of_size_pruning(on: bool) -> 
     strategy.observe(pose(store), rendering([0.0, 0.0]))
     strategy.adapt(store, pose(store), Progress(59, 100), random)
     assert store["face_index"].tolist() == [0]
-
-
-@pytest.mark.parametrize(("begin", "kept"), [(0.0, [0, 1]), (0.99, [0, 1, 3, 4])])
-def test_pruning_by_size_may_begin_without_resets(begin: float, kept: list[int]) -> None:
-    settings = replace(EVERY_STEP, size_start=begin, prune_radius=20.0)
-    assert faces_after(settings, BELOW) == kept
 
 
 def test_sizes_may_be_parts_of_the_extent_of_the_cameras() -> None:

@@ -23,12 +23,6 @@ from toy_scene import toy_sequence
 META = torch.zeros((), device="meta")
 
 
-def test_meta_tensors_show_who_asks_for_a_number() -> None:
-    for ask in (Tensor.item, bool, Tensor.tolist, Tensor.nonzero, Tensor.cpu):
-        with pytest.raises((RuntimeError, NotImplementedError)):
-            ask(META + 1)
-
-
 def configs() -> dict[str, MethodConfig]:
     """All methods, with every loss, and again with colours that depend on the view where a method has them."""
     found = {}
@@ -78,7 +72,10 @@ def test_regions_are_looked_for_where_the_model_is(monkeypatch: pytest.MonkeyPat
     assert asked == [("meta", "meta")]
 
 
-def test_steps_are_counted_on_the_host() -> None:
+def test_meta_tensors_show_who_asks_for_a_number_and_steps_are_counted_on_the_host() -> None:
+    for ask in (Tensor.item, bool, Tensor.tolist, Tensor.nonzero, Tensor.cpu):
+        with pytest.raises((RuntimeError, NotImplementedError)):
+            ask(META + 1)
     assert Moments.zeros(META).step.device.type == "cpu"
 
 

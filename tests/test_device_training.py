@@ -27,8 +27,10 @@ from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Sequence, Targets
 from mien.training.trainer import TrainingData, start, step
+from mien.training.whole_head.constants import WHOLE_HEAD
+from mien.training.whole_head.hair_surface import HairSurface
+from shared_things import toy_workspace
 from toy_scene import toy_sequence
-from toy_workspace import write_toy_workspace
 from training_progress import silence, stopped_at
 
 SETTINGS = replace(train_toy.SETTINGS, steps=12, record_every=1)
@@ -69,18 +71,12 @@ def no_native_step(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("a native operation away from float32 on a CPU")
 
-    parts = ("ride", "rig_forward", "pose_face", "sigmoid", "head_poses", "rasterize_views", "photometric_loss")
-    for name in (
-        *parts,
-        "triangle_penalties",
-        "observe_view",
-        "adam_update",
-        "mean_squared_difference",
-        "absolute_difference",
-    ):
+    parts = "ride rig_forward pose_face sigmoid head_poses rasterize_views photometric_loss triangle_penalties"
+    for name in f"{parts} observe_view adam_update mean_squared_difference absolute_difference".split():
         monkeypatch.setattr(_native, name, refuse)
 
 
+@pytest.mark.unchecked
 def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, request: pytest.FixtureRequest) -> None:
     native = train_some(scene, torch.zeros(()))
     request.getfixturevalue("no_native_step")
@@ -101,31 +97,24 @@ def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, installed: bool) -> None:
     monkeypatch.setattr(mien.devices, "find_spec", lambda name: object() if installed else None)
 
 
-def test_cuda_without_a_gpu_or_without_gsplat_says_what_to_do(monkeypatch: pytest.MonkeyPatch, no_gpu: None) -> None:
+def test_a_device_is_chosen_or_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, no_gpu: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     pretend_gsplat(monkeypatch, installed=False)
     with pytest.raises(UserError, match=r"--device cuda: needs a CUDA GPU and gsplat.*uv pip install"):
         choose_device("cuda")
     pretend_gsplat(monkeypatch, installed=True)
     with pytest.raises(UserError, match=r"--device cuda: torch .*nvidia-smi"):
         choose_device("cuda")
-
-
-def test_auto_takes_the_processor_where_nothing_else_is(
-    monkeypatch: pytest.MonkeyPatch, no_gpu: None, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pretend_gsplat(monkeypatch, installed=True)
     assert choose_device("auto").type == choose_device("cpu").type == "cpu"
     assert "using the processor" in capsys.readouterr().err
-
-
-def test_a_gpu_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    pretend_gsplat(monkeypatch, installed=True)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "some GPU")
     assert choose_device("auto").type == choose_device("cuda").type == "cuda"
     assert "some GPU: gsplat compiles its kernels at first use" in capsys.readouterr().err
 
 
+@pytest.mark.unchecked
 def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> None:
     face_model, sequence = scene
     train([sequence], face_model, train_toy.CONFIG, replace(SETTINGS, device="auto"), tmp_path / "run", silence)
@@ -142,13 +131,17 @@ def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
     assert_alike(on_gpu, native)
 
 
-@pytest.mark.slow
+@pytest.mark.unchecked
 @pytest.mark.parametrize("device", ["float64", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_a_whole_head_is_trained_on_a_device(scene: Scene, device: str) -> None:
+def test_a_whole_head_is_trained_on_a_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """By default, with sides that are filled and features. Steps reach a correction of the hair and a prune."""
+    monkeypatch.setattr("mien.training.whole_head.part.WHOLE_HEAD", replace(WHOLE_HEAD, hair_every=2))
+    corrections, correct = [], HairSurface.correct
+    monkeypatch.setattr(HairSurface, "correct", lambda *given: corrections.append(correct(*given)) or corrections[-1])
     like = like_on("cuda") if device == "cuda" else torch.zeros((), dtype=torch.float64)
-    settings = TrainSettings(steps=16, split="none", unseen="filled", mesh="fitted", record_every=1)
-    state = train_some(scene, like, GaussianAvatarsConfig(), settings)
+    settings = TrainSettings(steps=4, split="none", unseen="filled", mesh="fitted", record_every=1)
+    state = train_some(toy_sequence(timesteps=5, size=16), like, GaussianAvatarsConfig(), settings)
+    assert corrections[0]
     store = state.avatar.gaussian_store()
     assert all(store[name].device.type == like.device.type for name in store.names())
     assert all(torch.isfinite(store[name]).all() for name in store.trained)
@@ -170,11 +163,9 @@ def test_what_a_gpu_trained_is_loaded_and_resumed_without_one(scene: Scene, tmp_
     assert len(load_avatar(whole).gaussian_store()) > 0
 
 
-@pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("workspace")
-    write_toy_workspace(root)
-    return root
+@pytest.fixture
+def workspace(made_once) -> Path:
+    return toy_workspace(made_once)
 
 
 def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
@@ -184,6 +175,7 @@ def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
     return np.stack([np.asarray(cv2.imread(str(path)), np.float32) for path in sorted(out.glob("*.png"))])
 
 
+@pytest.mark.unchecked
 def test_pictures_are_the_same_wherever_they_are_drawn(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

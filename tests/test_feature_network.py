@@ -1,4 +1,4 @@
-"""The network of blended features, and the update of its bases: native against PyTorch, finite differences."""
+"""The network of blended features, and the update of its bases. tests/test_training_native.py has their twins."""
 
 import pytest
 import torch
@@ -13,7 +13,6 @@ from mien.training.adam import (
     Update,
     factored_adam_update,
     factored_update,
-    factored_update_reference,
     update_all,
 )
 
@@ -70,15 +69,6 @@ def theirs(given: list[Tensor], by: tuple[Tensor, Tensor]) -> list[Tensor]:
     return [tensor.detach() for tensor in (*outputs, *found)]
 
 
-@pytest.mark.parametrize("sizes", SIZES, ids=str)
-def test_native_outputs_and_gradients_equal_their_reference(isa: str, sizes: Sizes) -> None:
-    given, by = arguments(sizes), gradients_of(sizes)
-    for index, (own, expected) in enumerate(zip(ours(given, by), theirs(given, by), strict=True)):
-        error = (own.double() - expected).norm() / expected.norm().clamp_min(1e-6)
-        assert own.shape == expected.shape
-        assert float(error) < 1e-5, index
-
-
 def test_other_dtypes_have_factored_gradients_too() -> None:
     given, by = arguments(SIZES[0], torch.float64), gradients_of(SIZES[0])
     for own, expected in zip(ours(given, by), theirs(given, by), strict=True):
@@ -93,15 +83,6 @@ def test_reference_has_the_gradients_of_finite_differences() -> None:
         ),
         given,
     )
-
-
-def test_threads_do_not_change_a_bit() -> None:
-    before, results = _native.thread_count(), []
-    for threads in (1, 3):
-        _native.set_thread_count(threads)
-        results.append(ours(arguments(SIZES[3]), gradients_of(SIZES[3])))
-    _native.set_thread_count(before)
-    assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
 
 
 def test_gradients_are_the_same_whether_own_numbers_have_one(isa: str) -> None:
@@ -147,35 +128,6 @@ def update_of(dtype: torch.dtype = torch.float32, n: int = 2000, k: int = 5, f: 
     moments.weights[1::2], moments.second[1::2] = 0, 0  # rows without an update so far
     tensors = [tensor.to(dtype) for tensor in (random(n, k, f), rows, columns, moments.second, moments.weights)]
     return FactoredUpdate(tensors[0], [(tensors[1], tensors[2])], FactoredMoments(*tensors[3:]), 0.01)
-
-
-@pytest.mark.parametrize("f", [1, 16, 19, 32])
-def test_native_update_equals_its_reference(isa: str, f: int) -> None:
-    compare_updates(update_of(f=f), update_of(torch.float64, f=f))
-
-
-@pytest.mark.parametrize("f", [1, 16, 19, 32])
-def test_native_update_of_several_terms_equals_its_reference(isa: str, f: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such as that of a filmed frame and a view from the side. Some terms have rows that others lack."""
-    native, plain = update_of(f=f), update_of(torch.float64, f=f)
-    more = [(random(2000, f, seed=7), random(5, seed=8)), (random(2000, f, seed=9), torch.zeros(5))]
-    more[0][0][1::3] = 0
-    native = native._replace(terms=[*native.terms, *more])
-    plain = plain._replace(terms=[*plain.terms, *((rows.double(), columns.double()) for rows, columns in more)])
-    with monkeypatch.context() as only_native:
-        only_native.setattr("mien.training.adam.factored_update_reference", None)
-        factored_update(native._replace(rate=0.0))
-        factored_update_reference(plain._replace(rate=0.0))
-    compare_updates(native, plain)
-
-
-def compare_updates(native: FactoredUpdate, plain: FactoredUpdate) -> None:
-    for _ in range(3):
-        factored_update(native)
-        factored_update_reference(plain)
-    torch.testing.assert_close(native.values.double(), plain.values, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(native.moments.second.double(), plain.moments.second, rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(native.moments.weights.double(), plain.moments.weights, rtol=1e-5, atol=1e-7)
 
 
 def test_first_update_of_a_row_moves_by_about_the_rate() -> None:
@@ -236,17 +188,6 @@ def published(dtype: torch.dtype, f: int, terms: int) -> FactoredAdamUpdate:
 
 def changed(update: FactoredAdamUpdate) -> tuple[Tensor, ...]:
     return update.values, update.moments.first, update.moments.second, update.moments.step
-
-
-@pytest.mark.parametrize(("f", "terms"), [(1, 1), (16, 1), (19, 3), (32, 2)])
-def test_published_update_equals_its_reference(isa: str, f: int, terms: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    native, plain = published(torch.float32, f, terms), published(torch.float64, f, terms)
-    with monkeypatch.context() as only_native:
-        only_native.setattr("mien.training.adam.update_reference", None)
-        factored_adam_update(native)
-    factored_adam_update(plain)
-    for own, expected in zip(changed(native), changed(plain), strict=True):
-        torch.testing.assert_close(own.double(), expected.double(), rtol=1e-5, atol=1e-6)
 
 
 def test_published_update_has_the_bits_of_adam_with_the_whole_gradient(isa: str) -> None:

@@ -1,19 +1,22 @@
-"""GaussianAvatars' formulas."""
+"""GaussianAvatars' formulas. Gaussians stay on the surface, within limits to their place, size and tilt."""
+
+import math
 
 import pytest
 import torch
-from torch import Tensor
 
-from mien import _native
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, GaussianStore, Progress
 from mien.avatar.gaussian_avatars.avatar import (
     never_empty_a_triangle,
 )
-from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
+from mien.avatar.gaussian_avatars.settings import SurfaceLimits
+from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface, limits_of_triangles
+from mien.avatar.ops.triangle_frames import bind_to_world, triangle_ellipses
 from mien.face import FaceModel
 from mien.gaussians import world_means
 from mien.render import rasterize
 from mien.render.rendering import Rendering
+from mien.rotation import matrix_from_quaternion
 from plain_settings import plain_gaussian_avatars
 from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_camera, toy_face, toy_face_model
@@ -105,34 +108,55 @@ def test_no_triangle_is_emptied() -> None:
     assert new_avatar().density().may_prune is never_empty_a_triangle
 
 
-def random(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal numbers."""
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+@pytest.mark.parametrize(("hair", "widen"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
+def test_limits_keep_gaussians_on_the_surface(hair: float, widen: float) -> None:
+    torch.manual_seed(0)
+    count, limits = 200, SurfaceLimits(enabled=True)
+    values = {"means": torch.randn(count, 3), "quats": torch.randn(count, 4), "log_scales": torch.randn(count, 3)}
+    store = GaussianStore(values, {"face_index": torch.arange(count) % 5})
+    sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
+    widening = torch.full((5,), widen)
+    table = limits_of_triangles(limits, sizes, torch.full((5,), hair), widening)
+    keep_on_surface(store, table, limits.ratio)
+    size = sizes[store["face_index"]]
+    height, scales = store["means"][:, 1] * size, store["log_scales"].exp() * size[:, None]
+    depth, thickness = widen * limits.depth, widen * limits.thickness
+    assert (height <= depth + limits.hair_share * hair + 1e-7).all()
+    assert (height >= -depth - 1e-7).all()
+    assert (height.abs() > 0.9 * depth).any()
+    assert (scales[:, 1] <= thickness + limits.hair_thickness * hair + 1e-7).all()
+    flat = scales[:, [0, 2]]
+    assert (flat <= limits.width + limits.hair_width * hair + 1e-7).all()
+    assert (flat.amax(1) / flat.amin(1) <= limits.ratio * 1.0001).all()
+    normal = matrix_from_quaternion(torch.nn.functional.normalize(store["quats"], dim=1))[:, 1, 1]
+    assert (normal >= math.cos(math.radians(widen * limits.tilt)) - 1e-5).all()
+    before = {name: store[name].clone() for name in store.names()}
+    keep_on_surface(store, table, limits.ratio)
+    for name, value in before.items():
+        torch.testing.assert_close(store[name], value)
 
 
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 4097])
-def test_triangle_penalties_equal_their_reference(isa: str, count: int) -> None:
-    means, log_scales = random(count, 3), random(count, 3, seed=1)
-    means[:2] = 0  # whose length has no derivative
-    radii = torch.randint(0, 3, (count,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
-    results = []
-    for function, dtype in ((triangle_penalties, torch.float32), (triangle_penalties_reference, torch.float64)):
-        inputs = [tensor.to(dtype).requires_grad_() for tensor in (means, log_scales)]
-        position, scale = function(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
-        gradients = torch.autograd.grad(3 * position + scale, inputs)
-        results.append([tensor.double() for tensor in (position, scale, *gradients)])
-    for ours, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-7)
+def test_needles_grow_wider_and_not_shorter() -> None:
+    """Training cannot hold a side that is thinner than a pixel. It must not take the longer side with it."""
+    limits, sizes = SurfaceLimits(enabled=True), torch.ones(1)
+    scales = torch.tensor([[0.004, 0.0001, 1e-7], [1e-7, 0.0001, 0.004], [0.9, 0.0001, 1e-7], [0.002, 0.0001, 0.001]])
+    values = {"means": torch.zeros(4, 3), "quats": torch.eye(4)[:1].repeat(4, 1), "log_scales": scales.log()}
+    store = GaussianStore(values, {"face_index": torch.zeros(4, dtype=torch.long)})
+    keep_on_surface(store, limits_of_triangles(limits, sizes, torch.zeros(1)), limits.ratio)
+    expected = [[0.004, 0.0001, 0.0008], [0.0008, 0.0001, 0.004], [0.006, 0.0001, 0.0012], [0.002, 0.0001, 0.001]]
+    torch.testing.assert_close(store["log_scales"].exp(), torch.tensor(expected))
 
 
-def test_penalties_have_the_same_bits_for_any_number_of_threads() -> None:
-    means, log_scales, radii = random(20_000, 3), random(20_000, 3, seed=1), torch.ones(20_000, dtype=torch.int32)
-    before, results = _native.thread_count(), []
-    for threads in (1, 2, 3):
-        _native.set_thread_count(threads)
-        inputs = [tensor.clone().requires_grad_() for tensor in (means, log_scales)]
-        position, scale = triangle_penalties(inputs[0], inputs[1], radii, thresholds=(1.0, 0.6), weights=(0.5, 2.0))
-        results.append((position, scale, *torch.autograd.grad(position + scale, inputs)))
-    _native.set_thread_count(before)
-    for other in results[1:]:
-        assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
+def test_ellipses_have_the_moments_of_their_triangles() -> None:
+    torch.manual_seed(0)
+    vertices, faces = torch.randn(9, 3), torch.arange(9).view(3, 3)
+    quats, log_scales = triangle_ellipses(vertices, faces)
+    _, world, scales = bind_to_world(vertices[None], faces, torch.arange(3), torch.zeros(3, 3), quats, log_scales)
+    rotation = matrix_from_quaternion(world[0])
+    found = rotation @ torch.diag_embed(scales[0] ** 2) @ rotation.mT
+    corners = vertices[faces] - vertices[faces].mean(1, keepdim=True)
+    expected = 2.0**2 / 12 * torch.einsum("fci,fcj->fij", corners, corners)
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = normal / normal.norm(dim=-1, keepdim=True)
+    thin = torch.einsum("f,fi,fj->fij", scales[0].amin(-1) ** 2, normal, normal)
+    torch.testing.assert_close(found, expected + thin, atol=1e-4, rtol=1e-3)

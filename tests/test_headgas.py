@@ -1,24 +1,30 @@
-"""HeadGaS follows its formulas."""
+"""HeadGaS and its ablations follow their formulas. tests/test_methods.py trains, saves and bakes them."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
 from torch import Tensor
 
 from mien.adam import FactoredMoments, Moments
-from mien.avatar import HeadGas, HeadGasConfig, Progress, method_named
+from mien.avatar import HeadGas, HeadGasConfig, Progress, make_portable, method_named
 from mien.avatar.avatar import neutral_of
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.avatar import input_directions, neighbor_distances, sample_surface, spread_out
+from mien.avatar.headgas.constants import HEADGAS
+from mien.avatar.headgas.settings import Variant
+from mien.avatar.headgas.variants import MOVED, averaging_weights
 from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, head_poses
+from mien.render import rasterize
+from mien.rotation import matrix_from_quaternion
 from mien.runtime import pose
 from mien.training import PRESETS
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import round_steps
-from toy_scene import runtime_face, toy_face, toy_face_model
+from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
 
 SMALL = HeadGasConfig(
     points=40, features=5, directions=0, sh_degree=1, sh_warmup=0.0, sh_higher_share=1.0, judged_expressions=0
@@ -173,15 +179,6 @@ def test_opacity_has_no_reset_and_counts_by_the_highest_seen() -> None:
     assert torch.equal(density.judged_opacities(avatar.store, seen), seen)
 
 
-def test_opacities_count_at_expressions_that_no_step_drew() -> None:
-    avatar, face = new_avatar(replace(SMALL, judged_expressions=5)), toy_face(5)
-    fill(avatar.store["bases"])
-    expected = avatar.pose(face).gaussians.opacities.amax(0)
-    found = avatar.density().judged_opacities(avatar.store, torch.zeros(40))
-    torch.testing.assert_close(found, expected.detach())
-    assert torch.equal(avatar.density().judged_opacities(avatar.store, torch.ones(40)), torch.ones(40))
-
-
 def test_judged_expressions_are_far_from_each_other() -> None:
     points = torch.tensor([[0.0, 0], [0.1, 0], [5, 0], [0, 1], [5.1, 0], [0.1, 0.1]])
     assert torch.equal(spread_out(points, 3), points[[4, 3, 1]])
@@ -242,3 +239,116 @@ def test_positional_encoding_is_sines_and_cosines_of_octaves() -> None:
     for octave in (1, 2, 4):
         expected += [(octave * point).sin(), (octave * point).cos()]
     torch.testing.assert_close(positional_encoding(point, 3), torch.cat(expected))
+
+
+ABLATIONS = [name for name in get_args(Variant) if name != "full"]
+ablation = pytest.mark.parametrize("variant", ABLATIONS)
+VARIANT = HeadGasConfig(points=40, features=5, hidden=8, sh_degree=1, sh_warmup=0.0)
+
+
+def new_variant(variant: Variant, disturbed: bool = True) -> HeadGas:
+    avatar = new_avatar(replace(VARIANT, variant=variant))
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for name, parameter in avatar.named_parameters():
+            if disturbed and not name.endswith("means"):
+                parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return avatar
+
+
+def encoding_of(avatar: HeadGas) -> Tensor:
+    return positional_encoding(avatar.store["means"].detach() / SMALL.encoding_length, SMALL.encoding_bands)
+
+
+def network_inputs(avatar: HeadGas) -> Tensor:
+    """Features and place of each point at the third timestep."""
+    return torch.cat([blended(avatar, toy_face(5)[2])[0], encoding_of(avatar)], dim=-1)
+
+
+def directed(avatar: HeadGas) -> Tensor:
+    """The third timestep's inputs along the directions."""
+    return ((inputs_of(toy_face(5)[2]) - avatar.rest) @ avatar.directions)[0]
+
+
+@ablation
+def test_starts_faint_gray_and_still(variant: Variant) -> None:
+    avatar, face = new_variant(variant, disturbed=False), toy_face(5)
+    gaussians = avatar.pose(face).gaussians
+    assert (gaussians.opacities - 0.1).abs().max() < 0.1
+    assert gaussians.sh.abs().max() < 1
+    torch.testing.assert_close(gaussians.means.expand(5, 40, 3), avatar.store["means"].expand(5, 40, 3))
+
+
+def test_delta_moves_and_turns_by_the_network_and_paints_nothing() -> None:
+    """Eq. 1 to 4 of the supplement, where the rotation comes before that of the Gaussian itself."""
+    avatar, face = new_variant("delta"), toy_face(5)
+    posed = avatar.pose(face)
+    moved = avatar.network(network_inputs(avatar))
+    assert moved.shape == (40, MOVED)
+    store, found = avatar.store, posed.gaussians.timestep(2)
+    torch.testing.assert_close(found.means, store["means"] + HEADGAS.shift_length * moved[:, :3])
+    turn = matrix_from_quaternion(moved[:, 3:] + torch.tensor([1.0, 0, 0, 0]))
+    expected = turn @ matrix_from_quaternion(store["quats"])
+    torch.testing.assert_close(matrix_from_quaternion(found.quats), expected)
+    torch.testing.assert_close(found.opacities, store["opacity_logits"].sigmoid())
+    torch.testing.assert_close(found.sh[:, 0], store["sh"][:, 0])
+    torch.testing.assert_close(found.sh[:, 1:], VARIANT.sh_higher_share * store["sh"][:, 1:])
+    rendering = rasterize(found, toy_camera(32), torch.ones(3))
+    shifts = (posed.gaussians.means - store["means"]).detach()
+    assert float(shifts.abs().max()) > 1e-4
+    losses = avatar.regularizers(posed, rendering, Progress(1, 2))
+    torch.testing.assert_close(losses["shift"], VARIANT.shift_weight * shifts.abs().mean(), atol=1e-7, rtol=1e-4)
+
+
+def test_change_all_paints_too() -> None:
+    avatar, face = new_variant("change_all"), toy_face(5)
+    posed = avatar.pose(face)
+    outputs, found = avatar.network(network_inputs(avatar)), posed.gaussians.timestep(2)
+    assert outputs.shape == (40, 12 + MOVED + 1)
+    torch.testing.assert_close(found.sh[:, 0], outputs[:, :3])
+    torch.testing.assert_close(found.means, avatar.store["means"] + HEADGAS.shift_length * outputs[:, 12:15])
+    torch.testing.assert_close(found.opacities, outputs[:, -1].sigmoid())
+    assert set(avatar.regularizers(posed, rasterize(found, toy_camera(32), torch.ones(3)), Progress(1, 2))) == {"shift"}
+
+
+def test_no_mlp_averages_colors_and_opacities() -> None:
+    avatar, face = new_variant("no_mlp"), toy_face(5)
+    e = directed(avatar)
+    total = 1 + e.abs().sum()
+    average = (avatar.store["neutral_features"] + torch.einsum("nko,k->no", avatar.store["bases"], e)) / total
+    found = avatar.pose(face).gaussians.timestep(2)
+    torch.testing.assert_close(found.sh[:, 0], average[:, :3])
+    logits = torch.logit(torch.tensor(0.1)) + 20 * average[:, -1]
+    torch.testing.assert_close(found.opacities, logits.sigmoid())
+    assert len(list(avatar.network.parameters())) == 0
+    weights, rest = averaging_weights(torch.tensor([3.0, -4.0]))
+    torch.testing.assert_close(torch.cat([weights, rest[None]]), torch.tensor([0.375, -0.5, 0.125]))
+
+
+def test_no_blending_gives_the_expression_to_five_layers() -> None:
+    avatar, face = new_variant("no_blending"), toy_face(5)
+    e = directed(avatar)
+    outputs = avatar.network(torch.cat([e.expand(40, -1), encoding_of(avatar)], dim=-1))
+    found = avatar.pose(face).gaussians.timestep(2)
+    torch.testing.assert_close(found.sh[:, 0], outputs[:, :3])
+    torch.testing.assert_close(found.opacities, outputs[:, -1].sigmoid())
+    assert sum(isinstance(layer, torch.nn.Linear) for layer in avatar.network) == 5
+    assert set(avatar.store.names()) == {"means", "quats", "log_scales"}
+
+
+@pytest.mark.parametrize("variant", get_args(Variant))
+def test_opacities_are_judged_as_they_are_drawn(variant: Variant) -> None:
+    avatar, face = new_variant(variant), toy_face(5)
+    expected = avatar.pose(face).gaussians.opacities.expand(5, 40).amax(0)
+    found = avatar.density().judged_opacities(avatar.store, torch.zeros(40))
+    torch.testing.assert_close(found, expected.detach())
+    assert torch.equal(avatar.density().judged_opacities(avatar.store, torch.ones(40)), torch.ones(40))
+
+
+@pytest.mark.parametrize("variant", ["no_mlp", "delta", "change_all"])
+def test_what_cannot_be_baked_says_so_in_one_line(variant: Variant) -> None:
+    avatar = new_variant(variant)
+    with pytest.raises(UserError, match=rf"^the variant {variant} of headgas: .*export a \.ply") as caught:
+        make_portable(avatar, toy_camera(32), "toy")
+    assert "\n" not in str(caught.value)
+    assert new_variant("full").extras.unbaked is None

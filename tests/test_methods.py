@@ -1,8 +1,9 @@
-"""Every method keeps the promises of the interface, in one suite on a toy scene."""
+"""Every method, also with settings that change its steps, keeps the promises of the interface on a toy scene."""
 
 import base64
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,8 +15,12 @@ from mien.avatar import (
     TRAINED,
     Avatar,
     FixedDensity,
+    GradientSettings,
+    HeadGasConfig,
     MethodConfig,
     ParameterGroup,
+    PerceptualLoss,
+    Photometric,
     Progress,
     as_array,
     bake_rig,
@@ -23,38 +28,60 @@ from mien.avatar import (
     make_portable,
     write_avatar,
 )
-from mien.config import decode, encode
+from mien.avatar.headgas.settings import Variant
 from mien.export import MeshModel, pack, read_glb_avatar, write_glb, write_page
 from mien.render import rasterize
 from mien.training.checkpoint import resume, write_checkpoint
-from mien.training.density_control import density_strategy
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
-from plain_settings import plain_config, plain_run
+from plain_settings import plain_config, plain_gaussian_avatars, plain_mono_gaussian_avatar, plain_run
 from toy_scene import runtime_face, toy_camera, toy_sequence
 
 SIZE = 32
 FIRST, LAST = slice(0, 5), slice(-5, None)
-SETTINGS = plain_run(steps=50, split="none", background="white", record_every=1, checkpoint_every=1000)
+SETTINGS = plain_run(steps=24, split="none", background="white", record_every=1, checkpoint_every=1000)
+GROWING = GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, opacity_resets=(), max_gaussians=400)
+SMALL = HeadGasConfig(
+    points=60, features=5, hidden=8, sh_degree=1, sh_warmup=0.0, density=replace(GROWING, grow_gradient=1e-5)
+)
+CONFIGS: dict[str, MethodConfig] = {method: plain_config(method) for method in METHODS}
+CONFIGS |= {f"headgas-{name}": replace(SMALL, variant=name) for name in get_args(Variant) if name != "full"}
+CONFIGS["gaussian_avatars-features"] = plain_gaussian_avatars(
+    expression_rank=3, appearance="features", appearance_directions=5, appearance_features=6, density=GROWING
+)
+CONFIGS["gaussian_avatars-perceptual"] = plain_gaussian_avatars(
+    photometric=Photometric(perceptual=PerceptualLoss(0.5, 0.1, every=2, crop=16, blocks=1)), density=GROWING
+)
+CONFIGS["mono_gaussian_avatar-batch"] = plain_mono_gaussian_avatar(
+    points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4,
+    points_per_step=240,
+)  # fmt: skip
+UNBAKED = ("headgas-no_mlp", "headgas-delta", "headgas-change_all")
+baked = pytest.mark.parametrize("method", [name for name in CONFIGS if name not in UNBAKED])
 method = pytest.mark.parametrize("method", METHODS)
+each = pytest.mark.parametrize("method", CONFIGS)
 
 
 def config_of(method: str) -> MethodConfig:
-    return plain_config(method)
+    return CONFIGS[method]
 
 
 def new_avatar(method: str) -> Avatar:
     face_model, sequence = toy_sequence(5, SIZE)
     torch.manual_seed(0)
-    return METHODS[method].avatar(config_of(method), face_model, sequence.tracking.face)
+    config = replace(config_of(method), photometric=replace(config_of(method).photometric, alpha_weight=0.125))
+    return METHODS[method.split("-")[0]].avatar(config, face_model, sequence.tracking.face)
 
 
-@method
+@pytest.mark.unchecked
+@each
 def test_first_fifty_steps_lower_the_loss(method: str) -> None:
     face_model, sequence = toy_sequence(5, SIZE)
-    settings = replace(SETTINGS, steps=3000)
-    state = start([sequence], face_model, config_of(method), settings)
+    config, settings = config_of(method), replace(SETTINGS, steps=3000)
+    if isinstance(config, HeadGasConfig):
+        config = HeadGasConfig(variant=config.variant)
+    state = start([sequence], face_model, config, settings)
     data = TrainingData(FrameOrder(training_frames([sequence], settings), 0), (Targets(sequence, 0),))
     for _ in range(50):
         step(state, data, settings)
@@ -64,42 +91,64 @@ def test_first_fifty_steps_lower_the_loss(method: str) -> None:
     assert last["psnr"] > first["psnr"] + 1
 
 
-@method
-def test_density_control_keeps_all_tensors_equally_long(method: str) -> None:
+@pytest.mark.unchecked
+@each
+def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: str, tmp_path: Path) -> None:
+    """All tensors are equally long after each step."""
     face_model, sequence = toy_sequence(5, SIZE)
-    state = start([sequence], face_model, config_of(method), SETTINGS)
     data = TrainingData(FrameOrder(training_frames([sequence], SETTINGS), 0), (Targets(sequence, 0),))
-    fixed = isinstance(state.avatar.density(), FixedDensity)
-    counts = set()
-    while state.step < SETTINGS.steps:
-        step(state, data, SETTINGS)
-        store = state.avatar.gaussian_store()
+    undisturbed = start([sequence], face_model, config_of(method), SETTINGS)
+    counts, written = {len(undisturbed.avatar.gaussian_store())}, 0
+    while undisturbed.step < SETTINGS.steps:
+        step(undisturbed, data, SETTINGS)
+        if undisturbed.step >= 11 and not written:
+            write_checkpoint(tmp_path, undisturbed)
+            written = undisturbed.step
+        store = undisturbed.avatar.gaussian_store()
         lengths = {len(store[name]) for name in store.names()}
         lengths |= {len(getattr(m, field)) for m in store.moments.values() for field in m.PER_ROW}
-        lengths |= {len(tensor) for tensor in state.density.state().values()}
+        lengths |= {len(tensor) for tensor in undisturbed.density.state().values()}
         assert lengths == {len(store)}
         counts.add(len(store))
-    assert (len(counts) == 1) == fixed, "density control never changed anything"
+    assert (len(counts) == 1) == isinstance(undisturbed.avatar.density(), FixedDensity)
+    resumed = start([sequence], face_model, config_of(method), SETTINGS)
+    resume(tmp_path, resumed, first_record=1)
+    assert resumed.step == written
+    while resumed.step < SETTINGS.steps:
+        step(resumed, data, SETTINGS)
+    expected = undisturbed.avatar.state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in resumed.avatar.state_dict().items())
+    assert resumed.curves["loss"] == undisturbed.curves["loss"]
 
 
-@method
+@each
 def test_saved_avatar_renders_the_same_picture(method: str, tmp_path: Path) -> None:
+    """From the folder of a run, and from that of the avatar alone."""
     avatar = new_avatar(method)
+    _disturb(avatar)
     if not isinstance(avatar.density(), FixedDensity):
         avatar.gaussian_store().append(torch.arange(7))
-    write_avatar(tmp_path, avatar)
-    loaded = load_avatar(tmp_path)
+    write_avatar(tmp_path / "avatar", avatar)
     avatar.eval()  # as a loaded one is: a method may then pose its baked form
     face = toy_sequence(5, SIZE)[1].tracking.face[2]
-    pictures = [
-        rasterize(a.pose(face).gaussians.timestep(0), toy_camera(SIZE), torch.ones(3)).image for a in (avatar, loaded)
-    ]
-    assert torch.equal(*pictures)
-    assert loaded.config == avatar.config
-    assert loaded.face_model.content_hash == avatar.face_model.content_hash
+    for folder in (tmp_path, tmp_path / "avatar"):
+        loaded = load_avatar(folder)
+        pictures = [
+            rasterize(a.pose(face).gaussians.timestep(0), toy_camera(SIZE), torch.ones(3)).image
+            for a in (avatar, loaded)
+        ]
+        assert torch.equal(*pictures)
+        assert loaded.config == avatar.config
+        assert loaded.face_model.content_hash == avatar.face_model.content_hash
+        for ours, theirs in (
+            (avatar.state_dict(), loaded.state_dict()),
+            (avatar.subject.tensors(), loaded.subject.tensors()),
+        ):
+            assert ours.keys() == theirs.keys()
+            assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.items())
 
 
-@method
+@baked
 def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> None:
     avatar = new_avatar(method)
     _disturb(avatar)
@@ -132,7 +181,7 @@ def test_an_avatar_becomes_a_file_a_page_and_a_mesh(method: str, tmp_path: Path)
     assert base64.b64encode(pack(portable)).decode() in (tmp_path / "a.html").read_text(encoding="utf-8")
 
 
-@method
+@each
 def test_gradients_are_finite_and_reach_everything_that_is_trained(method: str) -> None:
     avatar = new_avatar(method)
     _disturb(avatar)
@@ -150,6 +199,8 @@ def test_gradients_are_finite_and_reach_everything_that_is_trained(method: str) 
             assert gradient.shape == group.tensors[name].shape
             assert gradient.isfinite().all(), f"{group.name}/{name}"
         assert any(bool((gradient != 0).any()) for gradient in gradients.values()), f"{group.name} has no effect"
+    trained = {id(tensor) for group in avatar.parameter_groups() for tensor in group.tensors.values()}
+    assert trained == {id(parameter) for parameter in avatar.parameters()}
 
 
 @method
@@ -161,39 +212,6 @@ def test_pose_depends_on_its_arguments_only(method: str) -> None:
     assert torch.equal(first, avatar.pose(face[1]).gaussians.means)
     together = avatar.pose(face, TRAINED).gaussians.timestep(1).means
     torch.testing.assert_close(together, avatar.pose(face[1]).gaussians.timestep(0).means, atol=1e-6, rtol=1e-5)
-
-
-@method
-def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: str, tmp_path: Path) -> None:
-    face_model, sequence = toy_sequence(5, SIZE)
-    settings = replace(SETTINGS, steps=24)
-    data = TrainingData(FrameOrder(training_frames([sequence], settings), 0), (Targets(sequence, 0),))
-    undisturbed = start([sequence], face_model, config_of(method), settings)
-    for _ in range(settings.steps):
-        step(undisturbed, data, settings)
-        if undisturbed.step == 11:
-            write_checkpoint(tmp_path, undisturbed)
-    resumed = start([sequence], face_model, config_of(method), settings)
-    resume(tmp_path, resumed, first_record=1)
-    assert resumed.step == 11
-    while resumed.step < settings.steps:
-        step(resumed, data, settings)
-    expected = undisturbed.avatar.state_dict()
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in resumed.avatar.state_dict().items())
-    assert resumed.curves["loss"] == undisturbed.curves["loss"]
-
-
-@method
-def test_config_survives_json(method: str) -> None:
-    config = replace(config_of(method), photometric=replace(config_of(method).photometric, alpha_weight=0.125))
-    assert decode(METHODS[method].config, encode(config)) == config
-
-
-@method
-def test_density_description_is_one_that_the_trainer_knows(method: str) -> None:
-    avatar = new_avatar(method)
-    strategy = density_strategy(avatar.density(), avatar.gaussian_store())
-    assert all(len(tensor) == len(avatar.gaussian_store()) for tensor in strategy.state().values())
 
 
 def _gradient_of(group: ParameterGroup, name: str) -> torch.Tensor | None:

@@ -131,18 +131,14 @@ def perfect_avatar() -> MonoGaussianAvatar:
     return avatar
 
 
-def test_vertices_with_their_own_directions_move_as_the_mesh_does() -> None:
+def test_vertices_with_their_own_directions_move_as_the_mesh_does_and_cost_nothing() -> None:
     avatar, face = perfect_avatar(), toy_face(5)
     gaussians = avatar.pose(face).gaussians
     torch.testing.assert_close(gaussians.means, avatar.face_model.head_vertices(face), atol=1e-6, rtol=0)
     assert gaussians.T_world_local is not None
     assert torch.equal(gaussians.T_world_local, head_poses(face))
-
-
-def test_vertices_with_their_own_directions_cost_nothing() -> None:
-    avatar = perfect_avatar()
     avatar.config = replace(SMALL, face_points=len(avatar.store))
-    losses = avatar.regularizers(avatar.pose(toy_face(5)[1]), pictured(len(avatar.store)), Progress(0, 100))
+    losses = avatar.regularizers(avatar.pose(face[1]), pictured(len(avatar.store)), Progress(0, 100))
     assert max(loss.item() for loss in losses.values()) < 1e-9
 
 
@@ -204,15 +200,10 @@ def test_attributes_are_those_at_rest_and_their_change() -> None:
     torch.testing.assert_close(got.quats[0], raw[:, 3:7] / raw[:, 3:7].norm(dim=-1, keepdim=True))
     torch.testing.assert_close(got.opacities[0], raw[:, 7].sigmoid())
     torch.testing.assert_close(rgb_from_sh(got.sh[0, :, 0]), raw[:, 8:].sigmoid())
-
-
-def test_attributes_do_not_pull_at_points() -> None:
-    avatar = new_avatar()
-    gaussians = avatar.pose(toy_face(5)[1]).gaussians
-    (gaussians.opacities.sum() + gaussians.sh.sum() + gaussians.scales.sum()).backward()
+    # They do not pull at points.
+    (got.opacities.sum() + got.sh.sum() + got.scales.sum()).backward(retain_graph=True)
     assert avatar.store["means"].grad is None
-    gaussians = avatar.pose(toy_face(5)[1]).gaussians
-    gaussians.means.sum().backward()
+    got.means.sum().backward()
     assert avatar.store["means"].grad is not None
 
 
@@ -261,15 +252,8 @@ def test_the_round_into_epoch_101_is_the_first_with_the_late_length_in_paper() -
 def test_paper_has_adams_own_epsilon_and_the_published_skinning_branch() -> None:
     paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
     assert (paper.adam_epsilon, paper.skinning_norm) == (1e-8, True)
-    groups = new_avatar(replace(SMALL, adam_epsilon=1e-8)).parameter_groups()
-    assert {group.epsilon for group in groups} == {1e-8}
-    assert {group.epsilon for group in new_avatar().parameter_groups()} == {1e-15}
-
-
-def test_the_end_of_a_run_changes_nothing() -> None:
-    schedule = Schedule("code", 100, 400)
-    assert schedule.rendering_radius(1.0) == schedule.rendering_radius(0.999)
-    assert schedule.rendering_radius(0.949) > schedule.rendering_radius(0.95)
+    for epsilon, config in ((1e-8, replace(SMALL, adam_epsilon=1e-8)), (1e-15, SMALL)):
+        assert {group.epsilon for group in new_avatar(config).parameter_groups()} == {epsilon}
 
 
 def test_rounds_grow_to_the_limit_and_no_further() -> None:
@@ -291,6 +275,9 @@ def test_children_are_around_their_parents() -> None:
         else:
             torch.testing.assert_close(away.norm(dim=-1), torch.ones(2), atol=1e-5, rtol=0)
             assert (away * noise).sum(-1).min() > 0
+        avatar.store.append(parents, {"means": children})
+        own = avatar.store["own_attributes"]
+        assert torch.equal(own[30:], own[parents]), "children inherit what is their parents' own"
 
 
 def test_rates_halve_at_their_times() -> None:
@@ -315,13 +302,6 @@ def test_points_without_attributes_of_their_own() -> None:
     torch.testing.assert_close(baked.sh, trained.sh, atol=1e-5, rtol=0)
 
 
-def test_children_inherit_what_is_their_parents_own() -> None:
-    avatar = new_avatar()
-    own = avatar.store["own_attributes"].detach().clone()
-    avatar.store.append(torch.tensor([3, 3, 7]), {"means": torch.zeros(3, 3)})
-    assert torch.equal(avatar.store["own_attributes"][30:], own[[3, 3, 7]])
-
-
 def test_points_start_on_the_canonical_face() -> None:
     avatar = new_avatar(replace(SMALL, start="face", points=200), disturbed=False)
     vertices = avatar.face_model.head_vertices(avatar.canonical_face())[0]
@@ -333,15 +313,16 @@ def test_points_start_on_the_canonical_face() -> None:
     assert len({tuple(point) for point in avatar.store["means"].tolist()}) == 200
 
 
+@pytest.mark.unchecked
 def test_lessons_teach_the_motion_of_the_face_model() -> None:
     face = toy_face(5)
 
     def error(pretraining: int) -> float:
         avatar = new_avatar(replace(SMALL, start="face", points=200, pretraining=pretraining), disturbed=False)
         torch.manual_seed(1)
-        corners, weights = random_places(avatar._at_rest().vertices, avatar.face_model.faces, 200)
+        corners, weights = random_places(avatar.at_rest().vertices, avatar.face_model.faces, 200)
         with torch.no_grad():
-            avatar.store["means"].copy_(at_places(avatar._at_rest().vertices, corners, weights))
+            avatar.store["means"].copy_(at_places(avatar.at_rest().vertices, corners, weights))
         taught = avatar.extras.pretraining
         assert (0 if taught is None else len(list(taught.run(face)))) == pretraining == (taught.count if taught else 0)
         target = at_places(avatar.face_model.head_vertices(face), corners, weights)
@@ -353,6 +334,8 @@ def test_lessons_teach_the_motion_of_the_face_model() -> None:
 
 def test_a_run_may_begin_at_a_later_epoch() -> None:
     whole, late = Schedule("code", 100, 400), Schedule("code", 100, 400, 60)
+    assert whole.rendering_radius(1.0) == whole.rendering_radius(0.999), "the end of a run changes nothing"
+    assert whole.rendering_radius(0.949) > whole.rendering_radius(0.95)
     assert late.rounds() == tuple(epoch / 40 for epoch in range(1, 40))
     for fraction in (0.0, 0.25, 0.5, 0.975):
         at = 0.6 + 0.4 * fraction

@@ -1,4 +1,4 @@
-"""The perceptual loss: its features, its crops, its steps, and runs that resume with the same bytes."""
+"""The perceptual loss: its features, its crops and its steps."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +13,13 @@ from mien.errors import UserError
 from mien.face import FaceModel
 from mien.perceptual import load_training_features, weights
 from mien.perceptual.weights import weights_path
-from mien.pictures import Box
 from mien.render.rendering import Rendering
 from mien.training import Sequence, TrainSettings, read_curves, train
 from mien.training.footage.frames import crop_random
 from mien.training.footage.sequence import Target, Targets
 from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss, person_box
 from toy_scene import toy_sequence
-from training_progress import silence, stopped_at
-
-RESULTS = ("avatar/avatar.safetensors", "face_track.safetensors")
+from training_progress import silence
 
 
 def some_picture(seed: int, side: int = 32) -> torch.Tensor:
@@ -94,49 +91,39 @@ def test_crops_lie_in_the_picture_and_visit_every_part() -> None:
     assert drawn_crop(target, 512, crop_random(settings, 0)) == (0, 0, 80, 60)
 
 
-def test_crops_of_low_pictures_are_as_wide_as_asked() -> None:
-    """A picture of 128 x 64 has no square of 100 pixels, so the crop is 100 wide and 64 high."""
-    target = replace(some_target((), 64, 128), picture=torch.full((64, 128, 3), 90, dtype=torch.uint8))
-    goal = perceptual_goal(target, PerceptualLoss(crop=100), crop_random(TrainSettings(), 0))
-    assert target.picture[goal.crop].shape == (64, 100, 3)
+def loss_of(width: int, settings: PerceptualLoss) -> tuple[float, torch.Size]:
+    """The loss of a gray picture of height 64 in place of a darker one, and the size of what is compared."""
+    rendering = Rendering(
+        torch.full((64, width, 3), 0.5), torch.ones(64, width), torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2)
+    )
+    target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
+    goal = perceptual_goal(target, settings, crop_random(TrainSettings(), 0))
+    return float(perceptual_loss(rendering, goal, settings)), target.picture[goal.crop].shape
+
+
+def whole(side: int) -> float:
+    """The distance of a square of both grays."""
+    return float(load_training_features()(torch.full((side, side, 3), 0.5), torch.full((side, side, 3), 90 / 255)))
 
 
 def test_weight_of_a_pixel_is_that_of_the_whole_picture() -> None:
     """The same crop counts half as much in a picture that is twice as large."""
-    losses = []
-    for width in (64, 128):
-        image = torch.full((64, width, 3), 0.5)
-        rendering = Rendering(image, torch.ones(64, width), torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
-        target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
-        settings = PerceptualLoss(weight=2.0, crop=32)
-        wanted = perceptual_goal(target, settings, crop_random(TrainSettings(), 0))
-        losses.append(float(perceptual_loss(rendering, wanted, settings)))
-    crop, goal = torch.full((32, 32, 3), 0.5), torch.full((32, 32, 3), 90 / 255)
-    assert losses[0] == pytest.approx(2.0 / 4 * float(load_training_features()(crop, goal)), rel=1e-5)
-    assert losses[1] == pytest.approx(losses[0] / 2, rel=1e-5)
+    losses = [loss_of(width, PerceptualLoss(weight=2.0, crop=32))[0] for width in (64, 128)]
+    assert losses == pytest.approx([0.5 * whole(32), 0.25 * whole(32)], rel=1e-5)
+    # A picture of 128 x 64 has no square of 100 pixels, so the crop is 100 wide and 64 high.
+    assert loss_of(128, PerceptualLoss(crop=100))[1] == (64, 100, 3)
 
 
 def test_the_whole_person_counts_fully() -> None:
     """The box of the person is compared, and its share of the picture does not matter."""
-    losses = []
-    for width in (64, 128):
-        image = torch.full((64, width, 3), 0.5)
-        rendering = Rendering(image, torch.ones(64, width), torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
-        target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
-        settings = PerceptualLoss(weight=2.0, region="person", crop=16)
-        goal = perceptual_goal(target, settings, crop_random(TrainSettings(), 0))
-        assert target.picture[goal.crop].shape == (50, 50, 3)
-        losses.append(float(perceptual_loss(rendering, goal, settings)))
-    whole = load_training_features()(torch.full((50, 50, 3), 0.5), torch.full((50, 50, 3), 90 / 255))
-    assert losses == pytest.approx([2.0 * float(whole)] * 2, rel=1e-5)
+    found = [loss_of(width, PerceptualLoss(weight=2.0, region="person", crop=16)) for width in (64, 128)]
+    assert [size for _, size in found] == [(50, 50, 3)] * 2
+    assert [loss for loss, _ in found] == pytest.approx([2.0 * whole(50)] * 2, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("box", "used"),
-    [((10, 5, 50, 40), (10, 5, 50, 40)), ((0, 0, 0, 0), (0, 0, 16, 16)), ((78, 59, 2, 1), (64, 44, 16, 16))],
-)
-def test_the_persons_box_is_never_too_small(box: Box, used: Box) -> None:
-    assert person_box(replace(some_target(()), box=box)) == used
+def test_the_persons_box_is_never_too_small() -> None:
+    boxes = {(10, 5, 50, 40): (10, 5, 50, 40), (0, 0, 0, 0): (0, 0, 16, 16), (78, 59, 2, 1): (64, 44, 16, 16)}
+    assert {box: person_box(replace(some_target(()), box=box)) for box in boxes} == boxes
 
 
 def test_steps_that_have_the_loss() -> None:
@@ -172,26 +159,19 @@ def test_targets_have_parts_if_they_are_asked_for(scene: tuple[FaceModel, Sequen
     assert [abs(2 * small - large) <= 1 for small, large in zip(half, mouth, strict=True)] == [True] * 4
 
 
-class StoppedError(Exception):
-    """Ends a run in the middle of a step's report."""
-
-
-def test_a_stopped_run_resumes_with_the_same_bytes(scene: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
+@pytest.mark.unchecked
+def test_the_loss_is_recorded_at_its_steps(scene: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
+    """tests/test_methods.py resumes a run that has it."""
     face_model, sequence = scene
-    whole, parted, plain = tmp_path / "whole", tmp_path / "parted", tmp_path / "plain"
-    train([sequence], face_model, CONFIG, train_toy.SETTINGS, whole, silence)
-    for stop in (7, 14):
-        with pytest.raises(StoppedError):
-            train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, stopped_at(stop, StoppedError))
-    train([sequence], face_model, CONFIG, train_toy.SETTINGS, parted, silence)
-    train([sequence], face_model, train_toy.CONFIG, train_toy.SETTINGS, plain, silence)
-    for name in RESULTS:
-        assert (parted / name).read_bytes() == (whole / name).read_bytes(), f"{name} differs"
-        assert (plain / name).read_bytes() != (whole / name).read_bytes(), f"{name}: the loss does nothing"
-    curves = read_curves(whole)
-    assert curves["perceptual"].tolist() == read_curves(parted)["perceptual"].tolist()
-    assert (curves["perceptual"] > 0).sum() == 4, "it is recorded at the steps that have it, and 0 at the others"
-    assert "perceptual" not in read_curves(plain)
+    settings = replace(train_toy.SETTINGS, steps=12)
+    runs = {"whole": CONFIG, "plain": train_toy.CONFIG}
+    for name, config in runs.items():
+        train([sequence], face_model, config, settings, tmp_path / name, silence)
+    curves = read_curves(tmp_path / "whole")
+    assert [value > 0 for value in curves["perceptual"].tolist()] == [True, False] * 2, "0 at steps without it"
+    assert "perceptual" not in read_curves(tmp_path / "plain")
+    for name in ("avatar/avatar.safetensors", "face_track.safetensors"):
+        assert (tmp_path / "plain" / name).read_bytes() != (tmp_path / "whole" / name).read_bytes(), name
 
 
 def test_missing_features_are_told_before_the_run_begins(

@@ -11,8 +11,8 @@ from torch import Tensor
 from mien.avatar import PointAvatar, PointAvatarConfig, Progress
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
-from mien.avatar.point_avatar.avatar import _was_drawn
-from mien.avatar.point_avatar.networks import SurfaceNet, _slopes_of_encoding
+from mien.avatar.point_avatar.avatar import was_drawn
+from mien.avatar.point_avatar.networks import SurfaceNet, slopes_of_encoding
 from mien.errors import UserError
 from mien.face import FaceParams, head_poses
 from mien.gaussians import Gaussians
@@ -39,16 +39,16 @@ def colors(avatar: PointAvatar, face: FaceParams) -> Tensor:
     return rgb_from_sh(avatar.pose(face).gaussians.sh)[..., 0, :]
 
 
-def test_all_points_are_round_opaque_and_of_one_size() -> None:
-    gaussians = new_avatar().pose(toy_face(5)[0], Progress(0, 100)).gaussians
-    radius = 0.0375 * 0.75 ** np.log2(30 / 100)
-    torch.testing.assert_close(gaussians.scales, torch.full((30, 3), radius / 2))
-    assert gaussians.opacities.unique().tolist() == [pytest.approx(0.99)]
-
-
 def test_points_double_and_shrink_together() -> None:
+    """They are round, opaque and of one size. Children are within the radius around their parents."""
     avatar = new_avatar()
-    counts = [avatar._count((epoch + 0.5) / 20) for epoch in (0, 3, 4, 7, 8, 19)]
+    gaussians = avatar.pose(toy_face(5)[0], Progress(0, 100)).gaussians
+    torch.testing.assert_close(gaussians.scales, torch.full((30, 3), 0.0375 * 0.75 ** np.log2(30 / 100) / 2))
+    assert gaussians.opacities.unique().tolist() == [pytest.approx(0.99)]
+    parents, noise = torch.tensor([3, 7]), torch.tensor([[0.5, -0.5, 0.0], [0.1, 0.2, 0.3]])
+    children = avatar.density().refill(avatar.store, parents, noise, 0.0)["means"]
+    torch.testing.assert_close(children - avatar.store["means"][parents], noise * avatar.radius(0.0))
+    counts = [avatar.points_at((epoch + 0.5) / 20) for epoch in (0, 3, 4, 7, 8, 19)]
     assert counts == [30, 30, 60, 60, 100, 100]
     assert avatar.radius(0.25) == pytest.approx(0.75 * avatar.radius(0.1))
     settings = avatar.density().settings
@@ -67,13 +67,6 @@ def test_the_papers_points_begin_on_a_sphere_and_end_as_a_hundred_thousand() -> 
     torch.testing.assert_close(avatar.store["means"].norm(dim=-1), torch.full((400,), 0.125))
 
 
-def test_children_are_within_the_radius_around_their_parents() -> None:
-    avatar = new_avatar()
-    parents, noise = torch.tensor([3, 7]), torch.tensor([[0.5, -0.5, 0.0], [0.1, 0.2, 0.3]])
-    children = avatar.density().refill(avatar.store, parents, noise, 0.0)["means"]
-    torch.testing.assert_close(children - avatar.store["means"][parents], noise * avatar.radius(0.0))
-
-
 def test_slopes_are_the_gradients_of_the_distance() -> None:
     torch.manual_seed(0)
     network = SurfaceNet(16, 3, 2).double()
@@ -86,7 +79,7 @@ def test_slopes_are_the_gradients_of_the_distance() -> None:
     encoding = positional_encoding(points, 2)
     for column in range(encoding.shape[1]):
         (expected,) = torch.autograd.grad(encoding[:, column].sum(), points, retain_graph=True)
-        torch.testing.assert_close(_slopes_of_encoding(points, 2)[:, column].detach(), expected)
+        torch.testing.assert_close(slopes_of_encoding(points, 2)[:, column].detach(), expected)
 
 
 def test_the_surface_starts_as_about_a_sphere() -> None:
@@ -110,6 +103,8 @@ def test_light_follows_deformed_normals_as_the_head_turns() -> None:
     avatar, face = new_avatar(replace(SMALL, normals="deformed")), toy_face(5)[2]
     turned = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.0, 0.0]))
     assert (colors(avatar, face) - colors(avatar, turned)).abs().max() > 1e-3
+    with pytest.raises(UserError, match=r"^the setting normals deformed of point_avatar: .*export a \.ply"):
+        avatar.bake()
     still = new_avatar()
     torch.testing.assert_close(colors(still, face), colors(still, turned))
     # Points on rigid bones have normals that turn with them.
@@ -119,15 +114,10 @@ def test_light_follows_deformed_normals_as_the_head_turns() -> None:
         avatar.deformation.skinning.bias[0] = 10.0
     points = avatar.store["means"].detach() / LENGTH_UNIT
     normals = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
-    rest = avatar._motion.transforms(avatar._motion.canonical_face())[0, 0, :, :3]
-    now = avatar._motion.transforms(turned)[0, 0, :, :3]
+    rest = avatar.motion.transforms(avatar.motion.canonical_face())[0, 0, :, :3]
+    now = avatar.motion.transforms(turned)[0, 0, :, :3]
     expected = normals @ (head_poses(turned)[0, :3, :3] @ now @ rest.T).T
-    torch.testing.assert_close(avatar._deformed_normals(points, normals, turned)[0], expected, atol=1e-5, rtol=0)
-
-
-def test_avatars_with_deformed_normals_say_why_they_cannot_be_exported() -> None:
-    with pytest.raises(UserError, match=r"^the setting normals deformed of point_avatar: .*export a \.ply"):
-        new_avatar(replace(SMALL, normals="deformed")).bake()
+    torch.testing.assert_close(avatar.deformed_normals(points, normals, turned)[0], expected, atol=1e-5, rtol=0)
 
 
 def test_points_that_others_hide_are_not_drawn() -> None:
@@ -143,7 +133,7 @@ def test_points_that_others_hide_are_not_drawn() -> None:
     rendering = rasterize(gaussians, camera, torch.ones(3))
     assert (rendering.radii > 0).all()
     (rendering.image * torch.linspace(0, 1, 32)[:, None]).sum().backward()
-    seen = _was_drawn(gaussians, rendering)
+    seen = was_drawn(gaussians, rendering)
     assert seen[0] == 1
     assert seen[4] == 0
 

@@ -1,10 +1,9 @@
-"""The network of points: native against PyTorch, finite differences, and independence of the number of threads."""
+"""The network of points against finite differences. tests/test_training_native.py compares it with its twin."""
 
 import pytest
 import torch
 from torch import Tensor
 
-from mien import _native
 from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
 
 Sizes = tuple[int, int, tuple[tuple[int, Activation, int | None], ...]]
@@ -56,16 +55,6 @@ def results(sizes: Sizes, given: list[Tensor], native: bool) -> list[Tensor]:
     return [tensor.detach() for tensor in (outputs, *found)]
 
 
-@pytest.mark.parametrize("sizes", NETWORKS, ids=lambda sizes: f"{sizes[0]} points")
-def test_native_outputs_and_gradients_equal_their_reference(isa: str, sizes: Sizes) -> None:
-    given = arguments(sizes)
-    expected = results(sizes, [tensor.double() for tensor in given], native=False)
-    for index, (own, truth) in enumerate(zip(results(sizes, given, native=True), expected, strict=True)):
-        assert own.shape == truth.shape
-        error = (own.double() - truth).norm() / truth.norm().clamp_min(1e-6)
-        assert float(error) < 1e-5, index
-
-
 def test_softplus_over_its_whole_range(isa: str) -> None:
     values = torch.cat([torch.linspace(-2, 2, 4001), torch.tensor([0.0, -1e30, 1e30, 1e-20])])[:, None]
     one = torch.ones(1, 1)
@@ -101,15 +90,6 @@ def test_native_gradients_are_those_of_finite_differences() -> None:
         moved = [[tensor + sign * step if i == index else tensor for i, tensor in enumerate(given)] for sign in (1, -1)]
         slope = (result(moved[0]) - result(moved[1])) / 2e-3
         assert slope == pytest.approx(float(gradient.norm()), rel=0.02), index
-
-
-def test_threads_do_not_change_a_bit() -> None:
-    before, found = _native.thread_count(), []
-    for threads in (1, 3):
-        _native.set_thread_count(threads)
-        found.append(results(NETWORKS[3], arguments(NETWORKS[3]), native=True))
-    _native.set_thread_count(before)
-    assert all(torch.equal(one, two) for one, two in zip(*found, strict=True))
 
 
 def test_without_gradients_the_outputs_are_the_same() -> None:

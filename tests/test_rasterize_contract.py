@@ -135,68 +135,58 @@ def test_no_gradients_without_grad_mode() -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(
-    "gaussians",
-    [
-        one_gaussian(depth=-1),
-        one_gaussian(depth=0.01),
-        one_gaussian(opacity=0),
-        one_gaussian(opacity=1 / 256),
-        replace(one_gaussian(), means=torch.tensor([[10.0, 0, 1]])),
-        one_gaussian().select(torch.zeros(1, dtype=torch.bool)),
-    ],
-    ids=["behind", "at the near plane", "transparent", "below 1/255", "beside the picture", "none"],
-)
-def test_nothing_to_see_is_background(backend: Backend, gaussians: Gaussians) -> None:
-    means = gaussians.means.clone().requires_grad_()
-    rendering = rasterize(replace(gaussians, means=means), front_camera(), torch.tensor([0.1, 0.2, 0.3]), backend)
-    assert torch.equal(rendering.image, torch.tensor([0.1, 0.2, 0.3]).expand(15, 21, 3))
-    assert not rendering.alpha.any()
-    assert not rendering.radii.any()
-    rendering.image.sum().backward()
-    assert means.grad is not None
-    assert not means.grad.any()
+def test_nothing_to_see_is_background(backend: Backend) -> None:
+    unseen = {
+        "behind": one_gaussian(depth=-1),
+        "at the near plane": one_gaussian(depth=0.01),
+        "transparent": one_gaussian(opacity=0),
+        "below 1/255": one_gaussian(opacity=1 / 256),
+        "beside the picture": replace(one_gaussian(), means=torch.tensor([[10.0, 0, 1]])),
+        "none": one_gaussian().select(torch.zeros(1, dtype=torch.bool)),
+    }
+    for name, gaussians in unseen.items():
+        means = gaussians.means.clone().requires_grad_()
+        rendering = rasterize(replace(gaussians, means=means), front_camera(), torch.tensor([0.1, 0.2, 0.3]), backend)
+        assert torch.equal(rendering.image, torch.tensor([0.1, 0.2, 0.3]).expand(15, 21, 3)), name
+        assert not rendering.alpha.any(), name
+        assert not rendering.radii.any(), name
+        rendering.image.sum().backward()
+        assert means.grad is not None
+        assert not means.grad.any(), name
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"quats": torch.zeros(1, 4)},
-        {"scales": torch.zeros(1, 3)},
-        {"scales": torch.full((1, 3), 1e4)},
-        {"scales": torch.tensor([[1e3, 1e-6, 1e-6]])},
-        {"opacities": torch.ones(1)},
-        {"opacities": torch.full((1,), 1 / 255)},
-        {"means": torch.tensor([[0.0, 0.0, 0.0101]])},
-        {"means": torch.tensor([[0.0, 0.0, 1e6]])},
-    ],
-    ids=["zero quaternion", "points", "huge", "needle", "opaque", "at the cutoff", "touching the camera", "far away"],
-)
-def test_extremes_stay_finite(backend: Backend, change: dict[str, torch.Tensor]) -> None:
-    gaussians = replace(one_gaussian(), **change)
-    means, quats, scales = (t.clone().requires_grad_() for t in (gaussians.means, gaussians.quats, gaussians.scales))
-    posed = replace(gaussians, means=means, quats=quats, scales=scales)
-    rendering = rasterize(posed, front_camera(70, 50), torch.zeros(3), backend)
-    rendering.image.sum().backward()
-    assert rendering.image.isfinite().all()
-    assert (rendering.alpha >= 0).all()
-    assert (rendering.alpha <= 1).all()
-    for tensor in (means, quats, scales):
-        assert tensor.grad is not None
-        assert tensor.grad.isfinite().all()
+def test_extremes_stay_finite(backend: Backend) -> None:
+    extremes = {
+        "zero quaternion": {"quats": torch.zeros(1, 4)},
+        "points": {"scales": torch.zeros(1, 3)},
+        "huge": {"scales": torch.full((1, 3), 1e4)},
+        "needle": {"scales": torch.tensor([[1e3, 1e-6, 1e-6]])},
+        "opaque": {"opacities": torch.ones(1)},
+        "at the cutoff": {"opacities": torch.full((1,), 1 / 255)},
+        "touching the camera": {"means": torch.tensor([[0.0, 0.0, 0.0101]])},
+        "far away": {"means": torch.tensor([[0.0, 0.0, 1e6]])},
+    }
+    for name, change in extremes.items():
+        gaussians = replace(one_gaussian(), **change)
+        leaves = {one: getattr(gaussians, one).clone().requires_grad_() for one in ("means", "quats", "scales")}
+        rendering = rasterize(replace(gaussians, **leaves), front_camera(70, 50), torch.zeros(3), backend)
+        rendering.image.sum().backward()
+        assert rendering.image.isfinite().all(), name
+        assert ((rendering.alpha >= 0) & (rendering.alpha <= 1)).all(), name
+        assert all(tensor.grad is not None and tensor.grad.isfinite().all() for tensor in leaves.values()), name
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh"])
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-def test_what_is_not_finite_is_named(backend: Backend, name: str, value: float) -> None:
-    gaussians = random_scene(3, count=40).gaussians
-    gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
-    gaussians.opacities[17] = 0.5
-    getattr(gaussians, name).view(40, -1)[17, -1] = value
-    with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
-        rasterize(gaussians, random_scene(3).camera, torch.zeros(3), backend)
+def test_what_is_not_finite_is_named(backend: Backend, name: str) -> None:
+    for value in (torch.nan, torch.inf, -torch.inf):
+        gaussians = random_scene(3, count=40).gaussians
+        gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
+        gaussians.opacities[17] = 0.5
+        getattr(gaussians, name).view(40, -1)[17, -1] = value
+        with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
+            rasterize(gaussians, random_scene(3).camera, torch.zeros(3), backend)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -205,6 +195,8 @@ def test_a_camera_that_is_not_finite_is_named(backend: Backend) -> None:
     broken = replace(camera, viewmat=torch.full((4, 4), torch.nan))
     with pytest.raises(ValueError, match=r"camera.viewmat\[0, 0\] is nan"):
         rasterize(one_gaussian(), broken, torch.zeros(3), backend)
+    with pytest.raises(ValueError, match=r"camera.viewmat\[0, \d\] is nan"):
+        rasterize(one_gaussian(), [camera, broken, camera], torch.zeros(3), backend)
     with pytest.raises(ValueError, match=r"background\[1\] is inf"):
         rasterize(one_gaussian(), camera, torch.tensor([0, torch.inf, 0]), backend)
 

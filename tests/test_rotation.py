@@ -102,14 +102,14 @@ def test_leading_axes_are_batches(axis_angles: list[Tensor]) -> None:
         close(quats[index, 0], quaternion_from_matrix(matrix_from_axis_angle(axis_angle)))
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-4, math.pi])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_are_finite_at_every_angle(angle: float, dtype: torch.dtype) -> None:
-    axis_angle = torch.tensor([0.6 * angle, -0.8 * angle, 0.0], dtype=dtype, requires_grad=True)
-    matrix = matrix_from_axis_angle(axis_angle)
-    (matrix.sum() + axis_angle_from_matrix(matrix).sum()).backward()
-    assert axis_angle.grad is not None
-    assert axis_angle.grad.isfinite().all()
+def test_gradients_are_finite_at_every_angle(dtype: torch.dtype) -> None:
+    for angle in (0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-4, math.pi):
+        axis_angle = torch.tensor([0.6 * angle, -0.8 * angle, 0.0], dtype=dtype, requires_grad=True)
+        matrix = matrix_from_axis_angle(axis_angle)
+        (matrix.sum() + axis_angle_from_matrix(matrix).sum()).backward()
+        assert axis_angle.grad is not None
+        assert axis_angle.grad.isfinite().all(), angle
 
 
 def test_axis_angle_gradients_match_differences_around_zero() -> None:
@@ -117,13 +117,10 @@ def test_axis_angle_gradients_match_differences_around_zero() -> None:
         assert torch.autograd.gradcheck(matrix_from_axis_angle, axis_angle.double().requires_grad_(), eps=1e-7)
 
 
-def test_the_quarter_turn_about_z_takes_x_to_y() -> None:
+def test_known_turns() -> None:
     x, y = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0])
     close(matrix_from_axis_angle(torch.tensor([0, 0, math.pi / 2])) @ x, y, 1e-6)
     close(matrix_from_quaternion(torch.tensor([1.0, 0, 0, 1])) @ x, y, 1e-6)
-
-
-def test_a_zero_quaternion_is_no_rotation() -> None:
     close(matrix_from_quaternion(torch.zeros(4)), torch.eye(3))
 
 
@@ -135,12 +132,12 @@ def test_rotations_without_torch_are_the_same(axis_angles: Tensor) -> None:
     close(matrix_from_axis_angle(torch.from_numpy(recovered)), torch.from_numpy(matrices), 1e-7)
 
 
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (0.6, 0, -0.8), (0.48, 0.6, 0.64)])
-@pytest.mark.parametrize("angle", [0.0, 1e-10, 0.3, 1.6, 3.1])
-def test_turns_without_torch_come_back(axis: tuple[float, float, float], angle: float) -> None:
-    turn = angle * np.array(axis)
-    found = runtime_rotation.axis_angle_from_matrix(runtime_rotation.matrix_from_axis_angle(turn))
-    np.testing.assert_allclose(found, turn, rtol=0, atol=1e-9)
+def test_turns_without_torch_come_back() -> None:
+    for axis in ((1, 0, 0), (0, -1, 0), (0, 0, 1), (0.6, 0, -0.8), (0.48, 0.6, 0.64)):
+        for angle in (0.0, 1e-10, 0.3, 1.6, 3.1):
+            turn = angle * np.array(axis)
+            found = runtime_rotation.axis_angle_from_matrix(runtime_rotation.matrix_from_axis_angle(turn))
+            np.testing.assert_allclose(found, turn, rtol=0, atol=1e-9)
 
 
 def test_compositions_round_as_without_torch() -> None:

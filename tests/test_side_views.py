@@ -123,7 +123,7 @@ def test_gradients_reach_gaussians_and_not_the_face(anny):
 
 def test_raised_expressions_stay_within_the_bounds_and_change_with_the_random_numbers(anny):
     views, rest = _views(anny), _face(anny).expression
-    raised = [views._raised(rest, _random(seed)) for seed in (0, 1)]
+    raised = [views.raised(rest, _random(seed)) for seed in (0, 1)]
     for one in raised:
         assert bool((one <= anny.expression_bounds[:, 1] + 1e-6).all())
         assert 1 <= int((one != rest).sum()) <= 6

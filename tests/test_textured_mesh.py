@@ -11,7 +11,7 @@ from torch import Tensor
 
 from damage import edit_json
 from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, load_avatar, move_avatar, write_avatar
-from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, _middles, place_surfels
+from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, middles_of_parts, place_surfels
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
@@ -79,7 +79,7 @@ def plane_model(cells: int = 5) -> FaceModel:
 
 def test_parts_of_a_triangle_have_its_shape_and_fill_it() -> None:
     for side in (1, 2, 5):
-        middles = _middles(side)
+        middles = middles_of_parts(side)
         assert len(middles) == side**2
         torch.testing.assert_close(middles.sum(1), torch.ones(side**2, dtype=torch.float64))
         torch.testing.assert_close(middles.mean(0), torch.full((3,), 1 / 3, dtype=torch.float64))
@@ -171,7 +171,7 @@ def test_offsets_and_colours_are_averaged_over_neighbours() -> None:
     torch.testing.assert_close(gradient, matrix[3, :, None].expand(-1, 2))
     avatar = new_avatar(replace(PLAIN, smoothing=3), disturbed=1.0)
     smooth = torch.linalg.matrix_power((torch.eye(len(matrix)) + matrix.float()) / 2, 3)
-    offsets, albedo = avatar._averaged()
+    offsets, albedo = avatar.averaged()
     torch.testing.assert_close(offsets, avatar.get_buffer("movable") * (smooth @ avatar.vertex_means))
     torch.testing.assert_close(albedo, smooth @ avatar.vertex_albedo)
 
@@ -181,7 +181,7 @@ def test_teeth_and_eyes_stay_where_they_are() -> None:
     regions = torch.zeros(len(model.faces), dtype=torch.long)
     regions[:20], regions[20:25], regions[-20:] = 1, 2, 3
     model = replace(model, region_names=("skin", "teeth", "mouth", "eyes"), face_regions=regions)
-    offsets = new_avatar(model=model, disturbed=1.0)._averaged()[0]
+    offsets = new_avatar(model=model, disturbed=1.0).averaged()[0]
     outer = torch.zeros(len(offsets), dtype=torch.bool)
     outer[model.faces[regions == 0].flatten()] = True
     inner = ~outer
@@ -278,7 +278,7 @@ def test_penalties_are_of_rough_offsets_and_albedo_and_of_bent_normals_and_of_li
     posed = avatar.pose(toy_face(5)[1])
     losses = avatar.regularizers(posed, rendered(), Progress(1, 2))
     near, store = Neighbours(avatar.face_model.template, avatar.face_model.faces), avatar.store
-    offsets, albedo = avatar._averaged()
+    offsets, albedo = avatar.averaged()
     rough = [(x - near.means(x)).square().sum() / len(x) for x in (1000 * offsets, albedo)]
     detail, slopes = (store[name].square().sum() / len(store) for name in ("albedo", "slopes"))
     torch.testing.assert_close(losses["offsets"], PLAIN.offset_weight * rough[0])

@@ -1,22 +1,25 @@
-"""Several frames in one optimiser step: the mean of their losses, the same order of frames, and exact resuming."""
+"""Several frames in one optimiser step, and pictures of half the size at the start of a run."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+import train_toy
 from mien import _native
 from mien.adam import Moments
-from mien.avatar import Avatar, MonoGaussianAvatarConfig, PerceptualLoss, Photometric, Progress
+from mien.avatar import MonoGaussianAvatarConfig, PerceptualLoss, Photometric, Progress
 from mien.cli import main
 from mien.errors import UserError
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
-from mien.training import TrainSettings, read_curves, train
-from mien.training.batch import TrainingData, next_batch
-from mien.training.checkpoint import TrainingState, checkpoint_files
+from mien.training import TrainSettings, train, trainer
+from mien.training.batch import TrainingData, coarse_steps, next_batch
+from mien.training.checkpoint import TrainingState
+from mien.training.constants import TRAINING
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import passed, start, step
@@ -24,7 +27,7 @@ from plain_settings import plain_mono_gaussian_avatar, plain_run
 from test_methods import new_avatar
 from test_training_resume import assert_same_results
 from toy_scene import toy_camera, toy_face, toy_sequence
-from training_progress import silence
+from training_progress import silence, stopped_at
 
 SMALL = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
@@ -142,36 +145,6 @@ def test_the_number_of_threads_changes_no_bit() -> None:
         assert all(torch.equal(tensor, other[name]) for name, tensor in results[0].items())
 
 
-class StoppedError(Exception):
-    """Ends a run, as a crash would."""
-
-
-def test_a_stopped_run_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    """It stops between checkpoints, and once the number of frames in a step has changed."""
-    config = replace(SMALL, points_per_step=240)
-    face_model, sequence = toy_sequence(7, 32)
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    train([sequence], face_model, config, SETTINGS, whole, silence)
-    counts = []
-    for crash_after in (3, 5):
-        steps = 0
-
-        def watch(avatar: Avatar, last: int = crash_after) -> None:
-            nonlocal steps
-            steps += 1
-            counts.append(avatar.extras.frames_per_step())
-            if steps == last:
-                raise StoppedError
-
-        with pytest.raises(StoppedError):
-            train([sequence], face_model, config, SETTINGS, stopped, silence, watch)
-    assert checkpoint_files(stopped / "checkpoints")
-    assert set(counts) == {4, 2}
-    train([sequence], face_model, config, SETTINGS, stopped, silence)
-    assert_same_results(stopped, whole)
-    assert read_curves(whole)["step"][-1] == SETTINGS.steps
-
-
 def test_steps_pass_every_multiple_once() -> None:
     assert [now for now in range(1, 30, 4) if passed(now - 4 if now > 1 else 0, now, 10)] == [13, 21]
     assert not passed(10, 11, 10)
@@ -211,3 +184,76 @@ def test_views_with_their_own_backgrounds_and_sizes_are_drawn_as_alone() -> None
     assert len(pulls) == 3
     for a, b in zip(pulls, pulls_alone, strict=True):
         torch.testing.assert_close(a, b)
+
+
+COARSE = replace(train_toy.SETTINGS, steps=10, coarse=0.5, record_every=1)
+
+
+@pytest.fixture
+def _halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The toy's pictures are large enough to be halved."""
+    monkeypatch.setattr("mien.training.batch.TRAINING", replace(TRAINING, least_halved=32))
+
+
+def sizes_of(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The sizes of targets and renderings of a run's steps."""
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    seen, compare = [], trainer.compare
+
+    def looked(state, batch, shown):  # noqa: ANN001, ANN202
+        camera = batch[0].camera
+        seen.append((camera.width, batch[0].target.picture.shape[0], shown[0].image.shape[0]))
+        return compare(state, batch, shown)
+
+    monkeypatch.setattr(trainer, "compare", looked)
+    train([sequence], face_model, train_toy.CONFIG, COARSE, run_dir)
+    return seen
+
+
+@pytest.mark.unchecked
+@pytest.mark.usefixtures("_halved")
+def test_the_first_half_of_a_run_sees_pictures_of_half_the_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are forgotten after their last step."""
+    forgotten, forget = [], Targets.forget
+    monkeypatch.setattr(Targets, "forget", lambda self: forgotten.append(self.width) or forget(self))
+    assert sizes_of(tmp_path, monkeypatch) == [(16, 16, 16)] * 5 + [(32, 32, 32)] * 5
+    assert forgotten == [16]
+
+
+@pytest.mark.unchecked
+def test_small_pictures_keep_their_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert sizes_of(tmp_path, monkeypatch) == [(32, 32, 32)] * 10
+
+
+@pytest.mark.unchecked
+@pytest.mark.usefixtures("_halved")
+def test_a_run_that_is_stopped_near_the_change_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    train([sequence], face_model, train_toy.CONFIG, COARSE, tmp_path / "whole", silence)
+    settings = replace(COARSE, checkpoint_every=1)
+    for last in (3, 5, 6):
+        with pytest.raises(KeyboardInterrupt):
+            train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / "stopped", stopped_at(last))
+    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / "stopped", silence)
+    assert_same_results(tmp_path / "stopped", tmp_path / "whole")
+
+
+def test_halved_targets_show_the_same() -> None:
+    sequence = toy_sequence(timesteps=3, size=33)[1]
+    targets = Targets(sequence, 0)
+    halved = targets.halved()
+    assert (halved.width, halved.height) == (17, 17)
+    camera, small = targets.camera(0), halved.camera(0)
+    assert small.K[0, 0] == pytest.approx(camera.K[0, 0] * 17 / 33)
+    white = np.full(3, 255, np.uint8)
+    large, low = (one.target(0, 0, white, keep=False).picture.float().mean() for one in (targets, halved))
+    assert float(low) == pytest.approx(float(large), abs=1)
+
+
+@pytest.mark.usefixtures("_halved")
+def test_the_share_says_how_many_steps() -> None:
+    targets = [Targets(toy_sequence(timesteps=3, size=32)[1], 0)]
+    found = [coarse_steps(targets, replace(COARSE, coarse=share)) for share in (0.0, 0.5, 1.0)]
+    assert found == [0, 5, 10]

@@ -1,16 +1,46 @@
-"""The native parts of a training step agree with their plain PyTorch twins."""
+"""The native parts of posing and of training steps agree with their plain PyTorch twins, on every instruction set.
+
+A table has them all. tests/test_feature_network.py, tests/test_point_network.py and others hold what is special.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+import test_feature_network as features
+import test_point_network as points
 from mien import _native
-from mien.avatar import Moments
-from mien.training.adam import Update, update_all, update_reference
+from mien.adam import FactoredMoments
+from mien.avatar import GaussianStore, Moments
+from mien.avatar.gaussian_avatars.settings import SurfaceLimits
+from mien.avatar.gaussian_avatars.surface_limits import (
+    keep_on_surface,
+    keep_on_surface_reference,
+    limits_of_triangles,
+    pull_colors,
+)
+from mien.avatar.ops.skin_points import skin_points, skin_points_reference
+from mien.avatar.ops.triangle_frames import bind_to_world
+from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
+from mien.training.adam import (
+    FactoredAdamUpdate,
+    FactoredUpdate,
+    Update,
+    factored_adam_update,
+    factored_update,
+    factored_update_reference,
+    update_all,
+    update_reference,
+)
 from mien.training.density_control.gradient import observe_reference
 from mien.training.losses import alpha_loss, alpha_loss_reference
 
-COUNTS = (0, 1, 15, 16, 4097)
+Tensors = list[Tensor]
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -18,20 +48,268 @@ def random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("count", COUNTS)
-def test_adam_update_equals_its_reference(isa: str, count: int) -> None:
-    def twin() -> Update:
-        moments = Moments(0.1 * random(count, seed=1), random(count, seed=2).square(), torch.tensor(3.0))
-        return Update(random(count, seed=3), random(count, seed=4), moments, 0.01)
+def some_radii(count: int) -> Tensor:
+    return torch.randint(0, 3, (count,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
 
-    ours, theirs = twin(), twin()
-    update_all([ours, twin()])
-    update_reference(theirs)
-    assert ours.moments.step == theirs.moments.step == 4
+
+def near(rtol: float, atol: float) -> Callable[[int, Tensor, Tensor], None]:
+    """Compare number by number."""
+    return lambda index, own, truth: torch.testing.assert_close(
+        own.double(), truth.double(), rtol=rtol, atol=atol, msg=lambda text: f"{index}: {text}"
+    )
+
+
+def near_by_norm(most: float) -> Callable[[int, Tensor, Tensor], None]:
+    """Compare whole tensors, for sums whose terms cancel."""
+
+    def compare(index: int, own: Tensor, truth: Tensor) -> None:
+        assert own.shape == truth.shape
+        assert float((own.double() - truth).norm() / truth.norm().clamp_min(1e-6)) < most, index
+
+    return compare
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Something with two implementations. `run(inputs, native)` returns what it computes from inputs of a size."""
+
+    make: Callable[[Any], Tensors]
+    run: Callable[[Tensors, bool], Tensors]
+    sizes: tuple[Any, ...]
+    large: Any
+    """A size that is divided among threads."""
+    compare: Callable[[int, Tensor, Tensor], None]
+
+
+def adam_inputs(count: int) -> Tensors:
+    return [0.1 * random(count, seed=1), random(count, seed=2).square(), random(count, seed=3), random(count, seed=4)]
+
+
+def adam(given: Tensors, native: bool) -> Tensors:
+    def update() -> Update:
+        first, second, values, gradient = (tensor.clone() for tensor in given)
+        return Update(values, gradient, Moments(first, second, torch.tensor(3.0)), 0.01)
+
+    one = update()
+    update_all([one, update()]) if native else update_reference(one)
+    return [one.values, one.moments.first, one.moments.second, one.moments.step]
+
+
+def observed_inputs(count: int) -> Tensors:
+    view = [random(count, 2), some_radii(count), random(count, seed=5).sigmoid()]
+    views = torch.ones(count, dtype=torch.int32)
+    return [*view, random(count, seed=6).abs(), random(count, seed=7).abs(), views, random(count, seed=8).sigmoid()]
+
+
+def observed(given: Tensors, native: bool) -> Tensors:
+    (gradient, radii, opacities), scale = given[:3], (256.0, 128.0)
+    statistics = [tensor.clone() for tensor in given[3:]]
+    if native:
+        _native.observe_view(scale, gradient, radii, opacities, *statistics)
+    else:
+        observe_reference(gradient, radii, opacities, scale, *statistics)
+    return statistics
+
+
+def opacity_inputs(size: tuple[int, int]) -> Tensors:
+    alpha, matte = random(*size).sigmoid(), (255 * random(*size, seed=1).sigmoid()).to(torch.uint8)
+    alpha[0] = matte[0].float() * (1 / 255)
+    return [alpha, matte]
+
+
+def opacity_loss(given: Tensors, native: bool) -> Tensors:
+    """Where alpha is the matte, as in the first row, the gradient is 0."""
+    alpha = given[0].clone().requires_grad_()
+    loss = 2 * (alpha_loss if native else alpha_loss_reference)(alpha, given[1], 0.7)
+    (gradient,) = torch.autograd.grad(loss, alpha)
+    assert not native or not gradient[0].any()
+    return [loss.detach(), gradient[1:]]
+
+
+def square_inputs(size: tuple[int, int]) -> Tensors:
+    return [random(*size, 3), (255 * random(*size, 3, seed=1).sigmoid()).to(torch.uint8)]
+
+
+def mean_square(given: Tensors, native: bool) -> Tensors:
+    image, picture = given
+    if native:
+        return [torch.tensor(_native.mean_squared_difference(image, picture))]
+    return [(image - picture.double() / 255).square().sum() / max(image.numel(), 1)]
+
+
+def penalty_inputs(count: int) -> Tensors:
+    means = random(count, 3)
+    means[:2] = 0  # whose length has no derivative
+    return [means, random(count, 3, seed=1), some_radii(count)]
+
+
+def penalties(given: Tensors, native: bool) -> Tensors:
+    means, log_scales = (tensor.clone().requires_grad_() for tensor in given[:2])
+    function = triangle_penalties if native else triangle_penalties_reference
+    position, scale = function(means, log_scales, given[2], thresholds=(1.0, 0.6), weights=(0.5, 2.0))
+    return [position.detach(), scale.detach(), *torch.autograd.grad(3 * position + scale, [means, log_scales])]
+
+
+def factored_inputs(size: tuple[int, int]) -> Tensors:
+    """An update of rows of so many features, with so many terms, of which some lack rows that others have."""
+    f, terms = size
+    update = features.update_of(f=f)
+    more = [random(2000, f, seed=7), random(5, seed=8), random(2000, f, seed=9), torch.zeros(5)]
+    more[0][1::3] = 0
+    both = [*update.terms[0], *more[: 2 * (terms - 1)]]
+    return [update.values, update.moments.second, update.moments.weights, *both]
+
+
+def factored(given: Tensors, native: bool) -> Tensors:
+    values, second, weights, *terms = (tensor.clone() for tensor in given)
+    moments = FactoredMoments(second, weights)
+    update = FactoredUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01)
+    for one in (update._replace(rate=0.0), update, update, update):
+        (factored_update if native else factored_update_reference)(one)
+    return [values, second, weights]
+
+
+def published_inputs(size: tuple[int, int]) -> Tensors:
+    update = features.published(torch.float32, *size)
+    return [update.values, update.moments.first, update.moments.second, *(one for term in update.terms for one in term)]
+
+
+def published(given: Tensors, native: bool) -> Tensors:
+    """Adam as published, by factors. The reference is another dtype."""
+    values, first, second, *terms = (tensor.clone() for tensor in given)
+    moments = Moments(first, second, torch.tensor(3.0))
+    factored_adam_update(FactoredAdamUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01))
+    return [values, first, second, moments.step]
+
+
+def skin_inputs(size: tuple[int, int, int]) -> Tensors:
+    """Points, displacements, weights, and bones in both poses, of points, poses, bones."""
+    n, b, k = size
+    bones = [torch.eye(3, 4) + 0.1 * random(k, 3, 4), torch.eye(3, 4) + 0.2 * random(b, k, 3, 4, seed=1)]
+    return [random(n, 3, seed=2), 0.1 * random(b, n, 3, seed=3), random(n, k, seed=4).softmax(-1), *bones]
+
+
+def skinned(given: Tensors, native: bool) -> Tensors:
+    """Posed points and gradients. Every third point has none."""
+    leaves = [tensor.clone().requires_grad_(index != 3) for index, tensor in enumerate(given)]
+    posed = (skin_points if native else skin_points_reference)(*leaves)
+    by = random(*posed.shape, seed=1)
+    by[:, ::3] = 0
+    return [posed.detach(), *torch.autograd.grad(posed, [leaf for leaf in leaves if leaf.requires_grad], by.to(posed))]
+
+
+def bound_inputs(size: tuple[tuple[int, ...], int]) -> Tensors:
+    """Vertices at timesteps, faces, and the face, mean, quaternion and scales of Gaussians.
+
+    They are turned in every way, so that each of the four quaternion formulas is used; quaternions have any length.
+    """
+    timesteps, count = size
+    faces = torch.stack([torch.randperm(20, generator=torch.Generator().manual_seed(i))[:3] for i in range(30)])
+    index = torch.randint(0, 30, (count,), generator=torch.Generator().manual_seed(1))
+    local = [random(count, width, seed=width) for width in (3, 4)]
+    return [0.1 * random(*timesteps, 20, 3), faces, index, *local, random(count, 3, seed=5)]
+
+
+def bound(given: Tensors, native: bool) -> Tensors:
+    """In the world, and gradients of a loss that weighs every number differently. The reference is another dtype."""
+    vertices, *local = [tensor.clone().requires_grad_() for tensor in (given[0], *given[3:])]
+    world = bind_to_world(vertices, given[1], given[2], *local)
+    loss = torch.stack([(one * random(*one.shape, seed=9).to(one)).sum() for one in world]).sum()
+    return [*(one.detach() for one in world), *torch.autograd.grad(loss, [vertices, *local])]
+
+
+def compare_bound(index: int, own: Tensor, truth: Tensor) -> None:
+    """20 vertices carry 100 Gaussians, so gradients are sums of many float32 terms."""
+    near(2e-6, 1e-6)(index, own, truth) if index < 3 else near_by_norm(2e-5)(index, own, truth)
+
+
+def limited_inputs(count: int) -> Tensors:
+    quats = random(count, 4, seed=1)
+    quats[:2] = 0
+    pulls = torch.tensor([[1.0, -1, 0.5, 0.1]] * 4 + [[1.0, -1, 0.5, 0]])
+    return [random(count, 3), quats, random(count, 3, seed=2), random(count, 1, 3, seed=3), pulls]
+
+
+def limited(given: Tensors, native: bool, pulled: bool) -> Tensors:
+    """Gaussians within the limits of the surface, with colours that are pulled to those of triangles, or not."""
+    names, limits = ("means", "quats", "log_scales", "sh_constant"), SurfaceLimits(enabled=True)
+    made = {name: tensor.clone() for name, tensor in zip(names, given[:4], strict=True)}
+    store = GaussianStore(made, {"face_index": torch.arange(len(given[0])) % 5})
+    sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
+    table = limits_of_triangles(limits, sizes, torch.tensor([0, 0.01, 0, 0.02, 0]), torch.tensor([1, 1, 2, 2, 50.0]))
+    if native:
+        keep_on_surface(store, table, limits.ratio, given[4] if pulled else None)
+    else:
+        keep_on_surface_reference(store, table.to(given[0]), limits.ratio)
+        if pulled:
+            pull_colors(store, given[4])
+    moved = not torch.equal(store["sh_constant"].detach(), given[3])
+    assert moved == (pulled and len(given[0]) > 0)
+    return [store[name].detach() for name in names]
+
+
+def feature_inputs(size: features.Sizes) -> Tensors:
+    return [*features.arguments(size), *features.gradients_of(size)]
+
+
+def feature_network(given: Tensors, native: bool) -> Tensors:
+    return (features.ours if native else features.theirs)(given[:-2], (given[-2], given[-1]))
+
+
+COUNTS, PICTURES = (0, 1, 15, 16, 4097), ((1, 1), (7, 5), (40, 130), (200, 301))
+KERNELS = {
     # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
-    torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(ours.moments.first, theirs.moments.first, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(ours.moments.second, theirs.moments.second, rtol=1e-5, atol=1e-6)
+    "adam": Kernel(adam_inputs, adam, COUNTS, 20_000, near(1e-5, 1e-5)),
+    "factored": Kernel(factored_inputs, factored, ((1, 1), (16, 3), (19, 1), (32, 3)), (32, 1), near(1e-5, 1e-6)),
+    "published": Kernel(published_inputs, published, ((1, 1), (16, 1), (19, 3), (32, 2)), (32, 1), near(1e-5, 1e-6)),
+    "observed": Kernel(observed_inputs, observed, COUNTS, 20_000, near(1.3e-6, 1e-5)),
+    "alpha": Kernel(opacity_inputs, opacity_loss, PICTURES, (200, 301), near(1e-5, 1e-7)),
+    "squares": Kernel(square_inputs, mean_square, ((0, 5), (1, 1), (40, 130)), (200, 301), near(1e-5, 0)),
+    "penalties": Kernel(penalty_inputs, penalties, COUNTS, 20_000, near(1e-5, 1e-7)),
+    "skinned": Kernel(skin_inputs, skinned, ((3000, 1, 6), (7, 3, 2), (1, 1, 1), (0, 2, 3)), (3000, 1, 6),
+                      near_by_norm(1e-5)),
+    "bound": Kernel(bound_inputs, bound, (((), 100), ((3,), 100), ((2, 2), 100), ((0,), 100)), ((), 9000),
+                    compare_bound),
+    "limited": Kernel(limited_inputs, partial(limited, pulled=False), (0, 1, 5000), 5000, near(1e-5, 1e-6)),
+    "pulled": Kernel(limited_inputs, partial(limited, pulled=True), (0, 1, 5000), 5000, near(1e-5, 1e-6)),
+    "features": Kernel(feature_inputs, feature_network, tuple(features.SIZES), features.SIZES[3], near_by_norm(1e-5)),
+    **{
+        f"points{number}": Kernel(partial(points.arguments), partial(points.results, sizes), (sizes,), sizes,
+                                  near_by_norm(1e-5))
+        for number, sizes in enumerate(points.NETWORKS)
+    },
+}  # fmt: skip
+every_kernel = pytest.mark.parametrize("name", KERNELS)
+
+
+@every_kernel
+def test_native_equals_its_reference(isa: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = KERNELS[name]
+    for size in kernel.sizes:
+        given = kernel.make(size)
+        exact = [tensor.double() if tensor.is_floating_point() else tensor for tensor in given]
+        expected = kernel.run(exact, False)
+        with monkeypatch.context() as only_native:
+            for reference in ("update_reference", "factored_update_reference"):
+                only_native.setattr(f"mien.training.adam.{reference}", None)
+            found = kernel.run(given, True)
+        for index, (own, truth) in enumerate(zip(found, expected, strict=True)):
+            kernel.compare(index, own, truth)
+
+
+@pytest.mark.exact
+@every_kernel
+def test_threads_do_not_change_a_bit(name: str) -> None:
+    kernel, before, results = KERNELS[name], _native.thread_count(), []
+    given = kernel.make(kernel.large)
+    try:
+        for threads in (1, 2, 3):
+            _native.set_thread_count(threads)
+            results.append(kernel.run(given, True))
+    finally:
+        _native.set_thread_count(before)
+    for other in results[1:]:
+        assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
 
 
 def test_adam_takes_what_is_not_dense_by_the_reference() -> None:
@@ -40,20 +318,13 @@ def test_adam_takes_what_is_not_dense_by_the_reference() -> None:
     torch.testing.assert_close(values, torch.full((4, 3), -0.1))
 
 
-@pytest.mark.parametrize("count", COUNTS)
-def test_observing_a_view_equals_its_reference(isa: str, count: int) -> None:
-    radii = torch.randint(0, 3, (count,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
-    arguments = (random(count, 2), radii, random(count, seed=5).sigmoid(), (256.0, 128.0))
-
-    def statistics() -> tuple[Tensor, ...]:
-        floats = (random(count, seed=6).abs(), random(count, seed=7).abs(), random(count, seed=8).sigmoid())
-        return floats[0], floats[1], torch.ones(count, dtype=torch.int32), floats[2]
-
-    ours, theirs = statistics(), statistics()
-    _native.observe_view(arguments[3], *arguments[:3], *ours)
-    observe_reference(*arguments, *theirs)
-    for one, other in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(one, other)
+def test_another_epsilon_is_that_of_the_formula() -> None:
+    """The core has one epsilon. An update with another is made in PyTorch, and is as small as the formula says."""
+    for epsilon, moved in ((1e-15, 0.1), (1e-8, 0.1 / 11), (1e-9, 0.05)):
+        values = torch.zeros(3)
+        gradient = torch.full((3,), 1e-9)
+        update_all([Update(values, gradient, Moments.zeros(values), 0.1, epsilon)])
+        torch.testing.assert_close(values, torch.full((3,), -moved), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
@@ -66,49 +337,3 @@ def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
         rows, columns = values.nonzero().T
         left, top = int(columns.min()), int(rows.min())
         assert _native.box_of_nonzero(values) == (left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
-
-
-@pytest.mark.parametrize("size", [(0, 5), (1, 1), (40, 130)])
-def test_mean_squared_difference(isa: str, size: tuple[int, int]) -> None:
-    """The mean squared difference agrees with float64."""
-    image, picture = random(*size, 3), (255 * random(*size, 3, seed=1).sigmoid()).to(torch.uint8)
-    expected = (image.double() - picture.double() / 255).square().sum() / max(image.numel(), 1)
-    assert _native.mean_squared_difference(image, picture) == pytest.approx(float(expected), rel=1e-5)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130), (200, 301)])
-def test_the_loss_of_alpha(isa: str, size: tuple[int, int]) -> None:
-    """Value and gradient agree with PyTorch's in float64. Where alpha is the matte, the gradient is 0."""
-    alpha, matte = random(*size).sigmoid(), (255 * random(*size, seed=1).sigmoid()).to(torch.uint8)
-    alpha[0] = matte[0].float() * (1 / 255)
-    own, exact = alpha.clone().requires_grad_(), alpha.double().requires_grad_()
-    loss, expected = 2 * alpha_loss(own, matte, 0.7), 2 * alpha_loss_reference(exact, matte, 0.7)
-    torch.autograd.backward([loss, expected])
-    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5, abs=1e-7)
-    assert own.grad is not None
-    assert exact.grad is not None
-    assert not own.grad[0].any()
-    torch.testing.assert_close(own.grad[1:].double(), exact.grad[1:], rtol=1e-5, atol=0)
-
-
-def test_the_same_bits_for_any_number_of_threads() -> None:
-    """The number of threads does not change a bit."""
-    values, gradient = random(20_000, 3), random(20_000, 3, seed=1)
-    before, results = _native.thread_count(), []
-    for threads in (1, 2, 3):
-        _native.set_thread_count(threads)
-        update = Update(values.clone(), gradient, Moments.zeros(values), 0.1)
-        update_all([update])
-        results.append((update.values, update.moments.first, update.moments.second))
-    _native.set_thread_count(before)
-    for other in results[1:]:
-        assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
-
-
-def test_another_epsilon_is_that_of_the_formula() -> None:
-    """The core has one epsilon. An update with another is made in PyTorch, and is as small as the formula says."""
-    for epsilon, moved in ((1e-15, 0.1), (1e-8, 0.1 / 11), (1e-9, 0.05)):
-        values = torch.zeros(3)
-        gradient = torch.full((3,), 1e-9)
-        update_all([Update(values, gradient, Moments.zeros(values), 0.1, epsilon)])
-        torch.testing.assert_close(values, torch.full((3,), -moved), rtol=1e-4, atol=0)

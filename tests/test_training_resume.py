@@ -1,8 +1,6 @@
 """A run that is stopped at any moment and started again ends with the same bytes as an uninterrupted one."""
 
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -13,8 +11,9 @@ import pytest
 import torch
 
 import train_toy
+from forked import ForkServer
 from mien import _native
-from mien.avatar import METHODS, Avatar, MethodConfig
+from mien.avatar import Avatar
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
@@ -24,9 +23,9 @@ from mien.storage import read_tensors, write_tensors
 from mien.training import read_curves, read_training_summary, train
 from mien.training.checkpoint import checkpoint_files
 from mien.training.trainer import step
-from plain_settings import plain_config
 from toy_scene import toy_sequence
 
+pytestmark = pytest.mark.unchecked
 STEPS = train_toy.SETTINGS.steps
 RESULTS = ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors")
 
@@ -38,21 +37,21 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_dir
 
 
-def train_until(run_dir: Path, signal_at_step: int, signal_number: int) -> tuple[int, int]:
-    """Train in another process until a step, and send it a signal. Return its exit code and its first step."""
-    script = Path(train_toy.__file__)
-    process = subprocess.Popen(
-        [sys.executable, str(script), str(run_dir), str(STEPS)], stdout=subprocess.PIPE, text=True, cwd=script.parent
-    )
-    assert process.stdout is not None
-    began = -1
-    with process.stdout:
-        for line in process.stdout:
-            word, number = line.split()
-            began = int(number) if word == "start" else began
-            if word == "step" and int(number) == signal_at_step:
-                process.send_signal(signal_number)
-    return process.wait(), began
+def train_until_step(run_dir: Path, last: int, stop: Callable[[], None], **changed: Any) -> None:
+    """Train in this process, and call `stop` after a step of this process."""
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    steps = iter(range(1, STEPS + 1))
+
+    def watch(_: Avatar) -> None:
+        if next(steps) == last:
+            stop()
+
+    settings = replace(train_toy.SETTINGS, **changed)
+    train([sequence], face_model, train_toy.CONFIG, settings, run_dir, watch=watch)
+
+
+def interrupt() -> None:
+    signal.raise_signal(signal.SIGINT)
 
 
 def assert_same_results(run_dir: Path, undisturbed: Path) -> None:
@@ -63,72 +62,18 @@ def assert_same_results(run_dir: Path, undisturbed: Path) -> None:
         assert ours[name].tolist() == theirs[name].tolist(), f"curve {name} differs"
 
 
-def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, undisturbed: Path) -> None:
-    # Stop before the first checkpoint, during density control, and again after resuming.
-    for kill_at in (2, 13, 22):
-        code, _ = train_until(tmp_path, kill_at, signal.SIGKILL)
-        assert code == -signal.SIGKILL
+def test_killed_runs_end_with_the_same_bytes(fork_server: ForkServer, tmp_path: Path, undisturbed: Path) -> None:
+    """Stopped before the first checkpoint, during density control, and after resuming, with a damaged checkpoint."""
+    for kill_at, checkpoints in ((2, []), (13, [8, 12]), (22, [16, 20])):
+        process = fork_server.call("train_toy:main", str(tmp_path), STEPS, kill_at)
+        assert process.wait() == -signal.SIGKILL, process.stderr
+        assert steps_of_checkpoints(tmp_path) == checkpoints
     (tmp_path / "checkpoints" / ".step_0000024.safetensors.x.safetensors").write_bytes(b"half a checkpoint")
-    train_toy.main(tmp_path, STEPS)
-    assert_same_results(tmp_path, undisturbed)
-    assert len(list((tmp_path / "checkpoints").iterdir())) == 2
-
-
-def test_interrupt_leaves_a_checkpoint_of_the_step_it_came_in(tmp_path: Path, undisturbed: Path) -> None:
-    code, _ = train_until(tmp_path, 6, signal.SIGINT)
-    assert code != 0
-    last = checkpoint_files(tmp_path / "checkpoints")[-1]
-    assert last.stem >= "step_0000006"
-    code, began = train_until(tmp_path, -1, signal.SIGKILL)
-    assert (code, began) == (0, int(last.stem.removeprefix("step_")))
-    assert_same_results(tmp_path, undisturbed)
-
-
-def test_goes_on_from_the_older_checkpoint_if_the_newest_is_damaged(tmp_path: Path, undisturbed: Path) -> None:
-    train_until(tmp_path, 18, signal.SIGKILL)
     newest = checkpoint_files(tmp_path / "checkpoints")[-1]
     newest.write_bytes(newest.read_bytes()[:1000])
     train_toy.main(tmp_path, STEPS)
     assert_same_results(tmp_path, undisturbed)
-
-
-def train_until_step(
-    run_dir: Path, last: int, stop: Callable[[], None], config: MethodConfig = train_toy.CONFIG, **changed: Any
-) -> None:
-    """Train in this process, and call `stop` after a step."""
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    steps = iter(range(1, STEPS + 1))
-
-    def watch(avatar: Avatar) -> None:
-        if next(steps) == last:
-            stop()
-
-    train([sequence], face_model, config, replace(train_toy.SETTINGS, **changed), run_dir, watch=watch)
-
-
-@pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
-def test_a_stop_before_the_first_record(
-    number: signal.Signals, kind: type[BaseException], tmp_path: Path, undisturbed: Path
-) -> None:
-    """Ctrl-C and SIGTERM leave a checkpoint of their step. Its curves are empty, and the run continues from it."""
-    with pytest.raises(kind):
-        train_until_step(tmp_path, 1, partial(signal.raise_signal, number))
-    assert [path.stem for path in checkpoint_files(tmp_path / "checkpoints")] == ["step_0000001"]
-    train_toy.main(tmp_path, STEPS)
-    assert_same_results(tmp_path, undisturbed)
-
-
-@pytest.mark.parametrize(
-    ("method", "number"), [*((name, signal.SIGTERM) for name in METHODS), ("headgas", signal.SIGHUP)]
-)
-def test_every_method_continues_after_a_termination(method: str, number: signal.Signals, tmp_path: Path) -> None:
-    config, settings = plain_config(method), {"steps": 4, "record_every": 10, "checkpoint_every": 1000}
-    with pytest.raises(Terminated):
-        train_until_step(tmp_path, 1, partial(signal.raise_signal, number), config, **settings)
-    begun = int(checkpoint_files(tmp_path / "checkpoints")[-1].stem.removeprefix("step_"))
-    assert 1 <= begun < 4
-    train_until_step(tmp_path, 99, lambda: None, config, **settings)
-    assert read_training_summary(tmp_path)["steps"] == read_curves(tmp_path)["step"].tolist()[0] == 4
+    assert len(list((tmp_path / "checkpoints").iterdir())) == 2
 
 
 def test_a_kill_before_the_first_record(tmp_path: Path, undisturbed: Path) -> None:
@@ -137,7 +82,26 @@ def test_a_kill_before_the_first_record(tmp_path: Path, undisturbed: Path) -> No
 
     with pytest.raises(ZeroDivisionError):
         train_until_step(tmp_path, 3, killed, checkpoint_every=1)
-    assert [path.stem for path in checkpoint_files(tmp_path / "checkpoints")] == ["step_0000001", "step_0000002"]
+    assert steps_of_checkpoints(tmp_path) == [1, 2]
+    train_toy.main(tmp_path, STEPS)
+    assert_same_results(tmp_path, undisturbed)
+
+
+def steps_of_checkpoints(run_dir: Path) -> list[int]:
+    return [int(path.stem.removeprefix("step_")) for path in checkpoint_files(run_dir / "checkpoints")]
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, Terminated)]
+)
+def test_a_stop_leaves_a_checkpoint_of_its_step(
+    number: signal.Signals, kind: type[BaseException], tmp_path: Path, undisturbed: Path
+) -> None:
+    """Also before the first record, when its curves are empty."""
+    for last, stopped in ((1, 1), (6, 7)):
+        with pytest.raises(kind):
+            train_until_step(tmp_path, last, partial(signal.raise_signal, number))
+        assert steps_of_checkpoints(tmp_path)[-1] == stopped
     train_toy.main(tmp_path, STEPS)
     assert_same_results(tmp_path, undisturbed)
 
@@ -146,7 +110,7 @@ def test_a_kill_before_the_first_record(tmp_path: Path, undisturbed: Path) -> No
 def test_a_checkpoint_that_has_lost_its_curves_is_refused(last: int, tmp_path: Path) -> None:
     """Curves are empty only before the first record, which is at step 3."""
     with pytest.raises(KeyboardInterrupt):
-        train_until_step(tmp_path, last, partial(signal.raise_signal, signal.SIGINT))
+        train_until_step(tmp_path, last, interrupt)
     path = checkpoint_files(tmp_path / "checkpoints")[-1]
     tensors = {name: tensor for name, tensor in read_tensors(path).items() if not name.startswith("curves.")}
     write_tensors(path, tensors, {"format": "mien.checkpoint", "version": "1"})
@@ -158,7 +122,7 @@ def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     """What a run sums up over its steps counts the processes before a stop: time, peak memory, records, steps."""
     for last in (2, 4):  # the second process takes four steps, up to step 6
         with pytest.raises(KeyboardInterrupt):
-            train_until_step(tmp_path, last, partial(signal.raise_signal, signal.SIGINT))
+            train_until_step(tmp_path, last, interrupt)
     path = checkpoint_files(tmp_path / "checkpoints")[-1]
     assert path.stem == "step_0000006"
     tensors = read_tensors(path)
@@ -195,7 +159,7 @@ def test_threads_do_not_change_a_bit() -> None:
         for threads in (1, 2, 3):
             _native.set_thread_count(threads)
             state, data = training_case(load_face_model(), 6000, 128, 160)
-            for _ in range(8):
+            for _ in range(3):
                 step(state, data, BENCHMARK_SETTINGS)
             store = state.avatar.gaussian_store()
             tensors = {name: store[name].detach().clone() for name in store.names()}

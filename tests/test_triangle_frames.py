@@ -1,12 +1,21 @@
-"""Triangle frames are right, and bound Gaussians move with them."""
+"""Triangle frames are right, bound Gaussians move with them, and points with bones."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from mien import _native
+from mien.avatar.ops.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
+from mien.avatar.ops.skin_points import blend_transforms, skin_points_reference, unskin
 from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, frames_to_world, triangle_frames
+from mien.avatar.store import GaussianStore
+from mien.face import FaceModel, FaceParams
+from mien.gaussians import Gaussians
 from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
+from test_training_native import skin_inputs
+from toy_scene import toy_face, toy_face_model
 
 
 def random_rig(
@@ -21,14 +30,6 @@ def random_rig(
     quats = torch.randn(100, 4, generator=generator, dtype=dtype)
     log_scales = torch.randn(100, 3, generator=generator, dtype=dtype)
     return vertices, faces, face_index, means, quats, log_scales
-
-
-def gradients(outputs: tuple[Tensor, ...], inputs: list[Tensor]) -> tuple[Tensor, ...]:
-    """Return gradients of a loss that weighs every number of the outputs differently."""
-    generator = torch.Generator().manual_seed(9)
-    loss = sum((o * torch.randn(o.shape, generator=generator, dtype=torch.float64).to(o)).sum() for o in outputs)
-    assert isinstance(loss, Tensor)
-    return torch.autograd.grad(loss, inputs)
 
 
 def test_frame_of_a_known_triangle():
@@ -103,23 +104,6 @@ def test_degenerate_triangles_stay_finite(dtype: torch.dtype):
     assert vertices.grad[5].abs().sum() > 0
 
 
-@pytest.mark.parametrize("timesteps", [(), (3,), (2, 2), (0,)])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_native_equals_the_float64_reference(timesteps: tuple[int, ...], seed: int):
-    vertices, faces, face_index, *local = random_rig(seed, timesteps)
-    # Turned in every way, so that each of the four quaternion formulas is used; quaternions of any length.
-    inputs = [tensor.requires_grad_() for tensor in (vertices, *local)]
-    expected = bind_to_world(vertices, faces, face_index, *local)
-    single = [tensor.detach().float().requires_grad_() for tensor in inputs]
-    native = bind_to_world(single[0], faces, face_index, *single[1:])
-    for value, reference in zip(native, expected, strict=True):
-        assert value.dtype == torch.float32
-        torch.testing.assert_close(value.double(), reference, atol=1e-6, rtol=2e-6)
-    for value, reference in zip(gradients(native, single), gradients(expected, inputs), strict=True):
-        error = (value.double() - reference).norm()
-        assert error <= 2e-5 * reference.norm()  # 20 vertices carry 100 Gaussians: sums of many float32 terms
-
-
 def test_native_uses_every_quaternion_formula():
     _, faces, *_ = random_rig()
     vertices = random_rig()[0]
@@ -152,21 +136,93 @@ def test_indices_are_checked():
         bind_to_world(vertices, faces, face_index - 1, *local)
 
 
-@pytest.mark.exact
-def test_threads_do_not_change_a_bit():
-    generator = torch.Generator().manual_seed(0)
-    vertices, faces, *_ = random_rig(dtype=torch.float32)
-    face_index = torch.randint(0, 30, (9000,), generator=generator)
-    inputs = [vertices] + [torch.randn(9000, width, generator=generator) for width in (3, 4, 3)]
-    for tensor in inputs:
-        tensor.requires_grad_()
-    results = []
+def test_reference_of_skinning_has_the_gradients_of_finite_differences() -> None:
+    given = [tensor.double().requires_grad_(index != 3) for index, tensor in enumerate(skin_inputs((4, 2, 3)))]
+    assert torch.autograd.gradcheck(skin_points_reference, given)
+
+
+def test_unskin_undoes_blended_transforms() -> None:
+    torch.manual_seed(0)
+    face_model = toy_face_model()
+    face = replace(toy_face(5), joints=torch.randn(5, 1, 3))
+    weights = torch.rand(20, 3).softmax(-1)
+    transforms = blend_transforms(weights, face_model.joint_transforms(face)[:, :, :3])[2]
+    points = torch.randn(20, 3)
+    moved = torch.stack(
+        [transform[:, :3] @ x + transform[:, 3] for transform, x in zip(transforms, points, strict=True)]
+    )
+    torch.testing.assert_close(unskin(moved, transforms), points, atol=1e-5, rtol=1e-5)
+
+
+FACE_FIELDS = ("expression", "joints", "head_rotation", "head_translation")
+COUNT = 20_000
+
+
+def a_face(face_model: FaceModel) -> FaceParams:
+    generator = torch.Generator().manual_seed(3)
+    neutral = face_model.neutral(1)
+
+    def some(like: Tensor) -> Tensor:
+        return (0.2 * torch.randn(like.shape, generator=generator)).requires_grad_()
+
+    return replace(neutral, **{name: some(getattr(neutral, name)) for name in FACE_FIELDS})
+
+
+def a_store(face_model: FaceModel) -> GaussianStore:
+    generator = torch.Generator().manual_seed(4)
+    shapes = {"means": (COUNT, 3), "quats": (COUNT, 4), "log_scales": (COUNT, 3), "opacity_logits": (COUNT,)}
+    trained = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    face_index = torch.randint(len(face_model.faces), (COUNT,), generator=generator)
+    return GaussianStore(trained | {"sh": torch.zeros(COUNT, 1, 3)}, {"face_index": face_index})
+
+
+def results(gaussians: Gaussians, face: FaceParams, store: GaussianStore) -> list[Tensor]:
+    """Return values, and gradients of a loss that weighs every number differently."""
+    parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+    parts += [] if gaussians.T_world_local is None else [gaussians.T_world_local]
+    generator = torch.Generator().manual_seed(5)
+    loss = torch.stack([(part * torch.randn(part.shape, generator=generator)).sum() for part in parts]).sum()
+    inputs = [getattr(face, name) for name in FACE_FIELDS]
+    inputs += [store[name] for name in ("means", "quats", "log_scales", "opacity_logits")]
+    found = torch.autograd.grad(loss, inputs, allow_unused=True)
+    gradients = [torch.zeros_like(i) if g is None else g for i, g in zip(inputs, found, strict=True)]
+    return [*(part.detach() for part in parts), *gradients]
+
+
+@pytest.mark.parametrize("in_head", [True, False])
+def test_posing_in_one_call_equals_its_parts_to_the_bit(anny: FaceModel, in_head: bool) -> None:
+    face, store = a_face(anny), a_store(anny)
+    expected = results(pose_bound_gaussians_reference(anny, face, store, store["sh"], in_head), face, store)
+    before = _native.thread_count()
     try:
-        for threads in (1, 2, 3):
+        for threads in (1, 3):
             _native.set_thread_count(threads)
-            world = bind_to_world(inputs[0], faces, face_index, *inputs[1:])
-            results.append((*world, *gradients(world, inputs)))
+            native = results(pose_bound_gaussians(anny, face, store, store["sh"], in_head), face, store)
+            assert all(torch.equal(one, other) for one, other in zip(native, expected, strict=True))
+            assert all(bool(tensor.abs().sum() > 0) for tensor in native)
     finally:
-        _native.set_thread_count(0)
-    for result in results[1:]:
-        assert all(torch.equal(one, other) for one, other in zip(result, results[0], strict=True))
+        _native.set_thread_count(before)
+
+
+def test_a_fixed_face_gets_no_gradient(anny: FaceModel) -> None:
+    face, store = a_face(anny).detach(), a_store(anny)
+    gaussians = pose_bound_gaussians(anny, face, store, store["sh"], in_head=True)
+    gaussians.means.sum().backward()
+    assert store["means"].grad is not None
+    assert gaussians.T_world_local is not None
+    torch.testing.assert_close(gaussians.T_world_local, face.T_world_head)
+
+
+def test_a_new_store_and_changed_indices_are_noticed(anny: FaceModel) -> None:
+    face, store = a_face(anny).detach(), a_store(anny)
+    before = pose_bound_gaussians(anny, face, store, store["sh"], in_head=True).means
+    store["face_index"].copy_(store["face_index"].flip(0))
+    changed = pose_bound_gaussians(anny, face, store, store["sh"], in_head=True).means
+    expected = pose_bound_gaussians_reference(anny, face, store, store["sh"], in_head=True).means
+    assert torch.equal(changed, expected)
+    assert not torch.equal(changed, before)
+    store.select(torch.arange(100))
+    assert pose_bound_gaussians(anny, face, store, store["sh"], in_head=True).means.shape == (1, 100, 3)
+    store["face_index"][0] = len(anny.faces)
+    with pytest.raises(IndexError, match="face"):
+        pose_bound_gaussians(anny, face, store, store["sh"], in_head=True)

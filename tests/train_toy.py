@@ -1,6 +1,7 @@
-"""Train the toy scene into the folder given as argument. Tests kill this process at any moment."""
+"""Train the toy scene into a folder."""
 
-import sys
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -22,25 +23,22 @@ CONFIG = plain_config(
 SETTINGS = plain_run(steps=30, split="none", background="random", checkpoint_every=4, record_every=3)
 
 
-@contextmanager
-def report_steps(title: str, total: int, completed: int) -> Iterator[Advance]:
-    """Print the number of every step that is done."""
-    print("start", completed, flush=True)
-    done = completed
+def main(run_dir: Path | str, steps: int, kill_at: int = 0) -> None:
+    """Train so many steps, print the number of each, and kill this process with SIGKILL after one of them."""
 
-    def advance(amount: int = 1, status: str = "") -> None:
-        nonlocal done
-        done += amount
-        print("step", done, flush=True)
+    @contextmanager
+    def report_steps(title: str, total: int, completed: int) -> Iterator[Advance]:
+        done = completed
 
-    yield advance
+        def advance(amount: int = 1, status: str = "") -> None:
+            nonlocal done
+            done += amount
+            print("step", done, flush=True)
+            if done == kill_at:
+                os.kill(os.getpid(), signal.SIGKILL)
 
+        yield advance
 
-def main(run_dir: Path, steps: int) -> None:
     torch.set_num_threads(1)
     face_model, sequence = toy_sequence(timesteps=5, size=32)
-    train([sequence], face_model, CONFIG, replace(SETTINGS, steps=steps), run_dir, report_steps)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    train([sequence], face_model, CONFIG, replace(SETTINGS, steps=steps), Path(run_dir), report_steps)

@@ -1,0 +1,210 @@
+"""Hair that no picture shows: its height from mattes' outlines, what hangs behind the neck, and strands on the back."""
+
+import numpy as np
+import pytest
+import torch
+
+from mien.avatar import SurfacePrior, method_named
+from mien.avatar.gaussian_avatars.hair_strands import strand_gaussians
+from mien.avatar.ops.triangle_frames import frames_to_world, triangle_frames
+from mien.camera import camera_from_fov
+from mien.capture import Capture
+from mien.face import FaceModel
+from mien.face.head_parts import head_parts
+from mien.face.mirror import triangle_geometry
+from mien.render.mesh import rasterize_mesh, vertex_normals
+from mien.rotation import matrix_from_quaternion
+from mien.tracking import NeckParts, Tracking, fit_neck_cut
+from mien.tracking.neck_cut import above_neck_cut
+from mien.training import PRESETS, Sequence
+from mien.training.footage.frames import Frame
+from mien.training.whole_head.back_hair import back_hair
+from mien.training.whole_head.hair_height import hair_height, hanging_hair
+from sh_colors import rgb_from_sh
+from toy_scene import surface_of
+
+_HAIR = 0.02
+_SIZE, _TIMESTEPS = 160, 7
+
+
+def _sequence(model: FaceModel, height: float, grows: torch.Tensor | None = None) -> Sequence:
+    """A head that turns and nods, in mattes on which some triangles (the scalp) stand out by a height in metres."""
+    angles = torch.linspace(-0.4, 0.4, _TIMESTEPS)
+    face = model.neutral(_TIMESTEPS)
+    face.head_rotation[:, 1], face.head_rotation[:, 0] = angles, 0.5 * angles.abs() - 0.1
+    face.head_translation[:, 2] = -0.8
+    camera = camera_from_fov(0.5, _SIZE, _SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+    grown = torch.zeros(len(model.template), dtype=torch.bool)
+    grown[model.faces[head_parts(model).scalp if grows is None else grows]] = True
+    mattes = np.zeros((_TIMESTEPS, 1, _SIZE, _SIZE), np.uint8)
+    for timestep in range(_TIMESTEPS):
+        vertices = model(face[timestep])[0]
+        vertices = vertices + height * grown[:, None] * vertex_normals(vertices, model.faces)
+        mattes[timestep, 0] = 255 * (rasterize_mesh(vertices, model.faces, camera).face_index >= 0).numpy()
+    images = np.zeros((*mattes.shape, 3), np.uint8)
+    capture = Capture(
+        name="head", camera_ids=("front",), fps=25.0, timestamps=np.arange(_TIMESTEPS) / 25, images=images,
+        mattes=mattes, landmarks=np.zeros((_TIMESTEPS, 1, 478, 2), np.float32),
+        valid=np.ones((_TIMESTEPS, 1), bool), principal_point=np.full((1, 2), _SIZE / 2, np.float32), source={},
+    )  # fmt: skip
+    tracking = Tracking(
+        face_model=model.name, face_model_hash=model.content_hash, face=face,
+        valid=torch.ones(_TIMESTEPS, dtype=torch.bool), cameras=(camera,),
+        neck_lines=torch.tensor([0.0, 1.0, 1e6]).expand(_TIMESTEPS, 1, 3), residuals=torch.zeros(_TIMESTEPS, 1),
+    )  # fmt: skip
+    return Sequence("head", capture, tracking, mattes)
+
+
+def _height(model: FaceModel, sequence: Sequence) -> torch.Tensor:
+    frames = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
+    return hair_height(model, [sequence], [sequence.tracking.face], frames, threads=1)
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("height", [0.0, 0.012, 0.03])
+def test_the_height_of_a_scalp_that_stands_out(anny, height):
+    found = _height(anny, _sequence(anny, height))
+    middles, scalp = anny.template[anny.faces].mean(1), head_parts(anny).scalp
+    top = scalp & (middles[:, 1] > 0.07)
+    back = scalp & (middles[:, 2] < -0.06)
+    assert abs(float(found[top].median()) - height) < 0.004
+    assert abs(float(found[back].median()) - height) < 0.006
+    assert not found[~scalp].any()
+
+
+def test_without_an_outline_there_is_no_height(anny):
+    sequence = _sequence(anny, 0.01)
+    sequence.capture.mattes[:] = 255
+    found = _height(anny, sequence)
+    assert (found == 0).all()
+
+
+@pytest.mark.unchecked
+def test_hair_that_hangs_beside_the_neck(anny):
+    """The sides of the neck stand out by two centimetres, as hair does that hangs there; cheeks and scalp do not."""
+    parts, middles = head_parts(anny), anny.template[anny.faces].mean(1)
+    neck = parts.neck & (middles[:, 0].abs() > 0.03)
+    sequence = _sequence(anny, 0.02, neck)
+    frames = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
+    found = hanging_hair(anny, [sequence], [sequence.tracking.face], frames, threads=1)
+    sides = neck & (middles[:, 0].abs() > 0.05) & (middles[:, 1] > middles[neck, 1].median())
+    assert 0.012 < float(found[sides].median()) < 0.03
+    bare = _sequence(anny, 0.0)
+    without = hanging_hair(anny, [bare], [bare.tracking.face], frames, threads=1)
+    assert float(without[sides].median()) < 0.004
+    assert float(found[parts.face].median()) < 0.004
+    assert not found[parts.scalp | parts.interior].any()
+
+
+def _beside(model: FaceModel, *, low: float = -1.0, left: float = 0.05, right: float = 0.05) -> torch.Tensor:
+    """Heights beside skin and neck as `hanging_hair` measures them, from the scalp down to a level."""
+    middles, parts = model.template[model.faces].mean(1), head_parts(model)
+    hanging = torch.where(middles[:, 0] > 0, left, right)
+    return torch.where((parts.skin | parts.neck) & (middles[:, 1] > low), hanging, 0.0)
+
+
+def _back_hair(model: FaceModel, hanging: torch.Tensor, hair: float = _HAIR) -> torch.Tensor:
+    return back_hair(model, model.template, hair * head_parts(model).scalp.float(), hanging)
+
+
+def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
+    middles, _, normals = triangle_geometry(anny.template, anny.faces)
+    found = _back_hair(anny, _beside(anny))
+    nape = (found > 0) & (normals[:, 2] < -0.8) & (middles[:, 0].abs() < 0.02)
+    assert int(nape.sum()) > 10
+    scalp = middles[head_parts(anny).scalp]
+    axis = (scalp[:, 2].min() + scalp[:, 2].max()) / 2
+    back = axis - (scalp[:, 2].min() - _HAIR)
+    behind = axis - (middles + found[:, None] * normals)[nape, 2]
+    level = middles[nape, 1] > middles[nape, 1].median()
+    assert (behind[level] - back).abs().median() < 0.006
+    assert not found[normals[:, 2] >= 0].any()
+    assert not found[head_parts(anny).face].any()
+    cut = fit_neck_cut(NeckParts.of(anny), anny.template, torch.tensor([0.0, 1.0, 0.0]))
+    assert (cut.margins((middles + found[:, None] * normals)[found > 0]) > 0).all(), "no hair hangs below the cut"
+    shorter = _back_hair(anny, _beside(anny, low=-0.09))
+    assert float(middles[found > 0][:, 1].min()) < float(middles[shorter > 0][:, 1].min()) - 0.01, "as at the sides"
+
+
+def test_hair_that_does_not_hang_at_both_sides_has_no_back_hair(anny):
+    for hanging in ({"left": 0.0, "right": 0.0}, {"left": 0.05, "right": 0.005}, {"low": 1.0}):
+        assert not _back_hair(anny, _beside(anny, **hanging)).any(), hanging
+    assert not _back_hair(anny, _beside(anny), hair=0.0).any(), "a bald head"
+    # A collar below a bare neck: shoulders stand out beside its lowest part, with nothing between them and the scalp.
+    collar = torch.where(anny.template[anny.faces].mean(1)[:, 1] < -0.11, _beside(anny), 0.0)
+    assert not _back_hair(anny, collar).any()
+
+
+def test_margins_are_those_of_pictures(anny):
+    """A camera sees what is cut off where the margin of the points nearest to the neck's axis is negative."""
+    cut = fit_neck_cut(NeckParts.of(anny), anny.template, torch.tensor([0.0, 1.0, 0.0]))
+    camera = camera_from_fov(0.5, 128, 128, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+    camera.viewmat[2, 3] = 1.0
+    origin = torch.from_numpy(cut.origin).float()
+    for offset in ([0.09, 0.02, 0.0], [0.09, 0.12, 0.0], [0.07, -0.02, 0.0]):
+        point = (origin + torch.tensor(offset))[None]
+        column, row = camera.project(point)[0][0].floor().int().tolist()
+        assert (float(cut.margins(point)) > 0) == (above_neck_cut(cut, camera)[row, column] > 0.5)
+
+
+def _back(model: FaceModel) -> torch.Tensor:
+    """The scalp behind the ears, where the surface is steep."""
+    middles = model.template[model.faces].mean(1)
+    return head_parts(model).scalp & (middles[:, 2] < -0.05)
+
+
+def _strands(model: FaceModel) -> dict[str, torch.Tensor]:
+    count = len(model.faces)
+    heights, colors = torch.full((count,), _HAIR), torch.full((count, 3), 0.4)
+    return strand_gaussians(model.template, model.faces, _back(model), heights, colors)
+
+
+def test_strands_cover_the_chosen_triangles_and_hang_in_the_surface(anny):
+    strands, frames = _strands(anny), triangle_frames(anny.template, anny.faces)
+    counts = torch.bincount(strands["face_index"], minlength=len(anny.faces)).double()
+    assert not counts[~_back(anny)].any()
+    a, b, c = (anny.template[anny.faces[:, corner].long()].double() for corner in range(3))
+    expected = 150_000 * 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1) * _back(anny)
+    assert float((counts - expected).abs().max()) <= 1
+    assert len(strands["means"]) > 1000
+    # Just below the top of the hair.
+    above = strands["means"][:, 1] * frames.k[strands["face_index"]]
+    assert float(above.min()) > _HAIR - 0.0031
+    assert float(above.max()) <= _HAIR + 1e-6
+    # Down, in the surface.
+    quats = frames_to_world(frames, *(strands[name] for name in ("face_index", "means", "quats", "log_scales")))[1]
+    along = matrix_from_quaternion(quats)[..., 0]
+    normals = frames.R[strands["face_index"]][..., 1]
+    assert float((along * normals).sum(-1).abs().max()) < 1e-4
+    assert float(along[:, 1].median()) < -0.8
+    assert float(along[:, 0].abs().median()) < 0.4
+
+
+def test_strands_differ_in_brightness_and_not_in_tint_or_between_calls(anny):
+    strands = _strands(anny)
+    colors = rgb_from_sh(strands["sh_constant"][:, 0])
+    assert abs(float(colors.mean()) - 0.4) < 0.01
+    assert 0.06 < float(colors[:, 0].std()) < 0.1
+    torch.testing.assert_close(colors[:, 0], colors[:, 2])
+    again = _strands(anny)
+    assert all(strands[name].equal(again[name]) for name in strands)
+    count, none = len(anny.faces), torch.zeros(len(anny.faces), dtype=torch.bool)
+    empty = strand_gaussians(anny.template, anny.faces, none, torch.zeros(count), torch.zeros(count, 3))
+    assert all(len(values) == 0 for values in empty.values())
+
+
+def test_a_closed_head_has_strands_that_keep_their_colors(anny):
+    face, count = anny.neutral(1), len(anny.faces)
+    avatar = method_named("gaussian_avatars").avatar(PRESETS["standard"].config("gaussian_avatars"), anny, face)
+    store = avatar.gaussian_store()
+    bald = len(store)
+    chosen, color = _back(anny), torch.full((count, 3), 0.4)
+    hair, doubt = torch.full((count,), _HAIR), chosen.float()
+    prior = SurfacePrior(hair, colors=color, doubt=doubt, filled_in=chosen, strands=chosen)
+    surface_of(avatar).close(prior)
+    own = len(_strands(anny)["means"])
+    assert len(store) == bald + own
+    before = store["sh_constant"][bald:].detach().clone()
+    for _ in range(20):
+        surface_of(avatar).keep_to(prior)
+    assert store["sh_constant"][bald:].equal(before)
