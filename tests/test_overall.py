@@ -1,4 +1,4 @@
-"""The remaining time of a whole command converges, on a clock that the test sets."""
+"""Progress in a bar and in a log, and the remaining time of a whole command, on a clock that the test sets."""
 
 import sys
 from collections.abc import Iterator
@@ -37,9 +37,10 @@ def pieces_of(frames: int, settings: TrainSettings = SETTINGS) -> list[Piece]:
     return expected_pieces([frames], count_scored([frames], ["me"], settings), TrackingSettings(), settings, "auto")
 
 
-def work(overall: Overall, clock: Clock, seconds: list[float]) -> Iterator[tuple[int, float, float]]:
+def work(pieces: list[Piece], clock: Clock, seconds: list[float]) -> Iterator[tuple[int, float, float]]:
     """Do pieces that take so long, and yield the stage, the moment and the remaining time after each tenth of each."""
-    for piece, each in zip(overall._pieces, seconds, strict=True):
+    overall = Overall(pieces, clock)
+    for piece, each in zip(pieces, seconds, strict=True):
         assert overall.begin(f"{piece.title} me", 0.0)
         for tenth in range(1, 11):
             clock.now += each / 10
@@ -52,10 +53,9 @@ def work(overall: Overall, clock: Clock, seconds: list[float]) -> Iterator[tuple
 def test_the_estimate_converges(slower: float) -> None:
     """On a machine of any speed, the error shrinks: a quarter of all after the capture, a tenth in half of training."""
     clock, pieces = Clock(), pieces_of(1000)
-    overall = Overall(pieces, clock)
     seconds = [slower * piece.seconds for piece in pieces]
     whole = sum(seconds)
-    moments = list(work(overall, clock, seconds))
+    moments = list(work(pieces, clock, seconds))
     errors = [(stage, abs(now + left - whole) / whole) for stage, now, left in moments]
     for stage, most in ((2, 0.25), (3, 0.1), (4, 0.05)):
         assert max(error for at, error in errors if at == stage) < most, stage
@@ -66,14 +66,13 @@ def test_a_method_that_takes_longer_is_noticed_while_it_trains() -> None:
     clock, pieces = Clock(), pieces_of(500)
     seconds = [piece.seconds * (5.0 if piece.stage == "training" else 1.0) for piece in pieces]
     whole = sum(seconds)
-    errors = [abs(now + left - whole) / whole for stage, now, left in work(Overall(pieces, clock), clock, seconds)
-              if stage == 3]  # fmt: skip
+    errors = [abs(now + left - whole) / whole for stage, now, left in work(pieces, clock, seconds) if stage == 3]
     assert max(errors) < 0.25
 
 
 def test_stages_come_in_order_and_current_ones_take_no_time() -> None:
     clock, pieces = Clock(), pieces_of(500)
-    stages = [stage for stage, _, _ in work(Overall(pieces, clock), clock, [1.0] * len(pieces))]
+    stages = [stage for stage, _, _ in work(pieces, clock, [1.0] * len(pieces))]
     assert all(before <= after for before, after in pairwise(stages))
     assert set(stages) == {1, 2, 3, 4}
     overall = Overall(pieces, clock)
@@ -167,4 +166,29 @@ def test_a_log_has_a_line_at_each_stage_and_now_and_then(
         "stage 2 of 2 (training), about 2 min left of the whole command",
         "stage 2 of 2 (training), about 70 s left of the whole command",
         "stage 2 of 2 (training), less than 10 s left of the whole command",
+    ]
+
+
+def test_the_last_line_is_printed_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    with progress_bar("Tracking", 2) as advance:
+        for _ in range(2):
+            clock.now += 10.0
+            advance(status="clip")
+    assert capsys.readouterr().err.splitlines() == ["Tracking: 1/2 in 10 s; clip", "Tracking: 2/2 in 20 s; clip"]
+
+
+def test_a_slow_first_item_does_not_count(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    with progress_bar("evaluate", 20) as advance:
+        for seconds in (100.0, 10.0, 10.0, *[0.0] * 17):
+            clock.now += seconds
+            advance()
+    assert capsys.readouterr().err.splitlines() == [
+        "evaluate: 1/20 in 100 s",
+        "evaluate: 2/20 in 110 s",
+        "evaluate: 3/20 in 120 s, ETA 170 s",
+        "evaluate: 20/20 in 120 s",
     ]

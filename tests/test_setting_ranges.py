@@ -1,5 +1,6 @@
-"""Every setting has a sentence and every number a range; values outside the range are refused."""
+"""Settings and constants have a sentence, numbers a range outside of which they are refused; constants are used."""
 
+import ast
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -8,6 +9,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import pytest
 
+import mien
 import train_toy
 from mien import _native
 from mien.avatar import (
@@ -19,9 +21,13 @@ from mien.avatar import (
     Rate,
     RefillSettings,
 )
+from mien.capture.constants import CAPTURE
 from mien.commands.help_text import field_docs
+from mien.driving.constants import DRIVING
 from mien.errors import UserError
+from mien.face.constants import FACE
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges
+from mien.tracking.constants import TRACKING
 from mien.training import PRESETS, TrainSettings, train
 from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_sequence
@@ -59,6 +65,37 @@ def test_every_field_has_a_sentence(settings: Any) -> None:
             test_every_field_has_a_sentence(getattr(settings, field.name))
 
 
+def constants(name: str, room: Any) -> Iterator[tuple[str, str, bool]]:
+    """Yield each constant's name, its name behind the local name `known`, and whether its class documents it."""
+    docs = field_docs(type(room))
+    for field in fields(room):
+        value = getattr(room, field.name)
+        if is_dataclass(value):
+            yield from constants(f"{name}.{field.name}", value)
+        else:
+            yield f"{name}.{field.name}", f"known.{field.name}", bool(docs.get(field.name))
+
+
+def dotted(node: ast.AST) -> str:
+    """Return `A.b.c` of an expression that is a chain of names, and nothing of another one."""
+    if isinstance(node, ast.Attribute):
+        before = dotted(node.value)
+        return f"{before}.{node.attr}" if before else ""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def test_every_constant_says_what_it_is_and_is_used() -> None:
+    rooms = {"CAPTURE": CAPTURE, "DRIVING": DRIVING, "FACE": FACE, "TRACKING": TRACKING}
+    texts = [path.read_text(encoding="utf-8") for path in Path(str(mien.__file__)).parent.rglob("*.py")]
+    trees = [ast.parse(text) for text in texts if any(f"{name}." in text for name in (*rooms, "known"))]
+    used = {dotted(node) for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    for room, values in rooms.items():
+        for name, local, documented in constants(room, values):
+            assert documented, name
+            assert {name, local} & used, f"nothing uses {name}"
+
+
+@pytest.mark.unchecked
 @pytest.mark.parametrize("settings", EVERYTHING, ids=lambda settings: type(settings).__name__)
 def test_every_number_has_a_range_that_is_checked(settings: Any) -> None:
     names = [name for name, *_ in numbers(settings)]
