@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from random import Random
 
@@ -14,22 +15,10 @@ import numpy as np
 import pytest
 import torch
 
-import dataset_writers
+import dataset_layouts as layouts
+import dataset_writers as writers
 from capture_helpers import tree_bytes
-from dataset_layouts import draw_at, write_larger, write_masked, write_tracker_output
-from dataset_scene import Scene, scene_of
-from dataset_writers import (
-    FRONTAL,
-    write_benchmark,
-    write_flash_avatar,
-    write_imavatar,
-    write_insta,
-    write_nerf_blendshape,
-    write_nerface,
-    write_nersemble,
-    write_take,
-    write_vhap,
-)
+from dataset_scene import NoDetector, Scene, scene_of, unfound
 from flame_like import write_npz
 from fuzzing.dataset_faults import faulty_dataset
 from fuzzing.faults import Place, faulty_file, faulty_place
@@ -40,7 +29,7 @@ from mien.capture.video import read_video_frames, write_video
 from mien.cli import main
 from mien.commands.stages import import_footage
 from mien.commands.stages.importing import run_import_stage
-from mien.datasets import Dataset, Footage, datasets, matting, overlay, sequences, write_sequence
+from mien.datasets import Footage, datasets, matting, overlay, sequences, write_sequence
 from mien.errors import UserError
 from mien.face import FaceModel, Landmarks, add_face_model
 from mien.face.coefficients import coefficient_head
@@ -62,16 +51,14 @@ _LARGEST = 1e3
 COEFFICIENTS = "nerf-blendshape, on its coefficients"
 
 
-_COLORS = {serial: np.eye(3, 11) for serial in ("222200036", FRONTAL)}
+_COLORS = {serial: np.eye(3, 11) for serial in ("222200036", writers.FRONTAL)}
 
 
 def _film(path: Path, _: str = "") -> None:
-    """Write three small pictures as a video."""
     write_video(path, iter(np.full((3, SIDE, SIDE, 3), 90, np.uint8)), 25.0)
 
 
-def _write_avatar(folder: Path, scene: Scene) -> Path:
-    """Write the folder of an avatar, as `mien export` does."""
+def _write_avatar(folder: Path, _: Scene) -> Path:
     workspace = folder.with_name("toy")
     write_toy_workspace(workspace)
     assert main(["export", str(workspace), "--out", str(folder), "--format", "gaussian-avatars"]) == 0
@@ -79,44 +66,23 @@ def _write_avatar(folder: Path, scene: Scene) -> Path:
 
 
 LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
-    "insta": lambda folder, scene: write_insta(folder, scene, held_out=2),
-    "insta, without checkpoints": lambda folder, scene: write_insta(folder, scene, checkpoints=False),
-    "flash-avatar": write_flash_avatar,
-    "metrical-tracker": write_tracker_output,
-    "insta, image_mask": write_masked,
-    "insta, images.HQ": write_larger,
-    "imavatar": write_imavatar,
-    "vhap": write_vhap,
-    "nerface": write_nerface,
-    "nerf-blendshape": write_nerf_blendshape,
-    COEFFICIENTS: lambda folder, scene: write_nerf_blendshape(folder, scene, 7.0, True),
-    "nersemble-benchmark": lambda folder, scene: write_benchmark(folder, scene, (FRONTAL,)),
-    "nersemble-benchmark, novel views": lambda folder, scene: write_benchmark(folder, scene, ("7", FRONTAL), False),
-    "nersemble": lambda folder, scene: write_nersemble(folder, film=_film, colors=_COLORS),
-    "live-link-face": lambda folder, scene: write_take(folder, film=_film),
+    "insta": partial(writers.write_insta, held_out=2),
+    "insta, without checkpoints": partial(writers.write_insta, checkpoints=False),
+    "flash-avatar": writers.write_flash_avatar,
+    "metrical-tracker": layouts.write_tracker_output,
+    "insta, image_mask": layouts.write_masked,
+    "insta, images.HQ": layouts.write_larger,
+    "imavatar": writers.write_imavatar,
+    "vhap": writers.write_vhap,
+    "nerface": writers.write_nerface,
+    "nerf-blendshape": writers.write_nerf_blendshape,
+    COEFFICIENTS: partial(writers.write_nerf_blendshape, scale=7.0, detected=True),
+    "nersemble-benchmark": writers.write_benchmark,
+    "nersemble-benchmark, novel views": partial(writers.write_benchmark, serials=("7", writers.FRONTAL), tracked=False),
+    "nersemble": lambda folder, scene: writers.write_nersemble(folder, film=_film, colors=_COLORS),
+    "live-link-face": lambda folder, scene: writers.write_take(folder, film=_film),
     "gaussian-avatars": _write_avatar,
 }
-
-
-class NoDetector:
-    """A detector that finds nothing, since loading the real one for each case would take minutes."""
-
-    def __init__(self, several_faces: bool) -> None:
-        pass
-
-    def __enter__(self) -> "NoDetector":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def detect(self, image: np.ndarray) -> np.ndarray:
-        return np.zeros((0, 478, 2))
-
-
-def unfound(images: np.ndarray) -> np.ndarray:
-    """Return landmarks of pictures in which a detector finds no face."""
-    return np.full((*images.shape[:2], 478, 2), 5, np.float32)
 
 
 def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +92,7 @@ def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matting, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
     monkeypatch.setattr(import_footage, "capture_video", _film_is_read)
     monkeypatch.setattr(import_footage, "capture_cameras", _rig_is_read)
-    draw_at(SIDE / dataset_writers.SIDE, monkeypatch)
+    layouts.draw_at(SIDE / writers.SIDE, monkeypatch)
 
 
 def _film_is_read(video: Path, out: Path, settings: CaptureSettings, name: str) -> None:
@@ -156,9 +122,9 @@ def tiny_scene(folder: Path) -> Scene:
 
 def another_flame(scene: Scene, folder: Path) -> FaceModel:
     """Return a head of another version: as many vertices, with other bases and in another order."""
-    arrays = {**scene.arrays, "shapedirs": 40 * np.roll(scene.arrays["shapedirs"], 31, 0)}
-    arrays |= {"v_template": np.roll(scene.arrays["v_template"], 31, 0), "weights": np.roll(arrays["weights"], 31, 0)}
-    arrays |= {"f": (scene.arrays["f"] + 31) % len(arrays["weights"])}
+    arrays = {**scene.arrays, "f": (scene.arrays["f"] + 31) % len(scene.arrays["weights"])}
+    arrays |= {name: np.roll(arrays[name], 31, 0) for name in ("shapedirs", "v_template", "weights")}
+    arrays["shapedirs"] = 40 * arrays["shapedirs"]
     path = write_npz(folder / "other.npz", arrays)
     return replace(flame_face_model(read_flame(path), "other"), landmarks=scene.model.landmarks)
 
@@ -176,15 +142,10 @@ class Outcome:
 
 
 class Campaign:
-    """A dataset of one layout, and the cases that damage copies of it.
-
-    Args:
-        layout: The name of the layout.
-        folder: An empty folder for everything.
-        capsys: What commands say is taken from there.
-    """
+    """A dataset of one layout, and the cases that damage copies of it."""
 
     def __init__(self, layout: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """Write the dataset into an empty folder, and import it whole, on its tracking and without."""
         self.layout, self.folder, self.capsys = layout, folder, capsys
         scene = tiny_scene(folder)
         self.models = {model.name: model for model in (scene.model, another_flame(scene, folder))}
@@ -193,11 +154,9 @@ class Campaign:
         if layout == COEFFICIENTS:
             self.models["tiny"] = coefficient_head(scene.model, 46)
         self.material = LAYOUTS[layout](folder / "material", scene)
-        whole = folder / "whole"
-        self.use(self.material, "tiny", whole, retrack=False)
-        self.check_written(whole)
-        self.use(self.material, "tiny", folder / "pictures", retrack=True)
-        self.check_written(folder / "pictures")
+        for name, retrack in (("whole", False), ("pictures", True)):
+            self.use(self.material, "tiny", folder / name, retrack)
+            self.check_written(folder / name)
 
     def run(self, number: int) -> Outcome:
         """Make one fault in a copy of the dataset, and import it."""
@@ -216,7 +175,8 @@ class Campaign:
         complaint, wrong, start = "", "", time.perf_counter()
         try:
             if by_command:
-                complaint = self.complaint_of(["import", str(root), "--out", str(out), *self.options(name)])
+                options = [] if self.layout == "gaussian-avatars" else ["--face-model", name]
+                complaint = self.complaint_of(["import", str(root), "--out", str(out), *options])
             else:
                 self.use(root, name, out, retrack)
         except UserError as error:
@@ -247,9 +207,6 @@ class Campaign:
             return f"wrote what cannot be used: {type(error).__name__}: {error}"
         return ""
 
-    def options(self, model: str) -> list[str]:
-        return [] if self.layout == "gaussian-avatars" else ["--face-model", model]
-
     def complaint_of(self, command: list[str]) -> str:
         """Run a command, and return its complaint without its beginning; nothing if it succeeds."""
         self.capsys.readouterr()
@@ -275,19 +232,13 @@ class Campaign:
             return
         assert known[0].survey is not None
         known[0].survey(path)
-        if retrack and known[0].read_pictures is not None:
-            self.write(known[0], path, known[0].read_pictures(path), out)
-        else:
-            self.write(known[0], path, known[0].read(path, self.models[model]), out)
-
-    def write(self, dataset: Dataset, path: Path, content: object, out: Path) -> None:
-        for sequence in content:  # type: ignore[attr-defined]
+        pictures = known[0].read_pictures if retrack else None
+        for sequence in known[0].read(path, self.models[model]) if pictures is None else pictures(path):  # type: ignore[union-attr]
             if isinstance(sequence, Footage):
-                import_footage.write_footage(out / "sequences" / sequence.name, sequence, dataset, path)
-                continue
-            folder = out / "sequences" / sequence.capture.name
-            write_sequence(folder, sequence, dataset, path)
-            read_own_split(folder)
+                import_footage.write_footage(out / "sequences" / sequence.name, sequence, known[0], path)
+            else:
+                write_sequence(out / "sequences" / sequence.capture.name, sequence, known[0], path)
+                read_own_split(out / "sequences" / sequence.capture.name)
 
     def check_written(self, out: Path) -> None:
         """Check that each sequence of a workspace is whole: cameras, landmarks, and a head of a possible size."""
@@ -298,15 +249,13 @@ class Campaign:
                 assert self.layout in ("nersemble", "live-link-face"), "a sequence without a capture"
                 continue
             capture = read_capture(folder / "capture")
-            for camera in capture.calibration or ():
+            tracking = read_sequence(folder).tracking if (folder / "tracking").exists() else None
+            for camera in (*(capture.calibration or ()), *(tracking.cameras if tracking else ())):
                 assert camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height) is None
             assert np.isfinite(capture.landmarks[capture.valid]).all()
-            if not (folder / "tracking").exists():
+            if tracking is None:
                 continue
-            tracking = read_sequence(folder).tracking
-            model = self.models[tracking.face_model] if self.layout != COEFFICIENTS else self.models["tiny"]
-            for camera in tracking.cameras:
-                assert camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height) is None
+            model = self.models["tiny" if self.layout == COEFFICIENTS else tracking.face_model]
             vertices = model(tracking.face)
             size = (vertices - vertices.mean(1, keepdim=True)).abs().amax()
             assert bool(size < _LARGEST), f"a head of {float(size):g} m"

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from av.video.reformatter import Interpolation
 
-from dataset_layouts import Layout, View
+from dataset_layouts import MIRROR, Layout, View
 from dataset_scene import Scene, draw, projected
 from mien.camera import Camera
 from mien.datasets import Findings, TrackedSequence, recognised
@@ -159,6 +159,9 @@ def check_import(found: list[Any], layout: Layout, scene: Scene) -> None:
             for camera in range(len(layout.cameras)):
                 view = layout.view(timestep, camera)
                 check_projection(sequence, row, vertices, view, camera)
+                # A rig stands still in the writer's world; before a single camera, the head moves.
+                placed = view[1:] if layout.cameras[1:] else (MIRROR, np.zeros(3))
+                check_view(filmed_camera(sequence, camera), *placed)
                 check_pictures(sequence, row, draw(shown, vertices, *view, layout.size), camera)
                 marks = sequence.capture.landmarks[row, camera]
                 apart = np.abs(marks - projected(shown.marks(vertices), *view)).max()

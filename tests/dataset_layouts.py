@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 import dataset_scene
 import dataset_writers
@@ -151,53 +150,6 @@ def write_offset(folder: Path, scene: Scene) -> Path:
     return folder
 
 
-TEETH = 120
-
-
-def lip_rings(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return 15 vertices of the upper and of the lower lip, from the subject's left to the right."""
-    template = scene.arrays["v_template"]
-    middle = scene.marks(template)[13]
-    rings = []
-    for above in (0.006, -0.006):
-        wanted = middle + np.stack([np.linspace(0.02, -0.02, 15), np.full(15, above), np.zeros(15)], axis=1)
-        rings.append(np.linalg.norm(template[:, None] - wanted, axis=-1).argmin(0))
-    return rings[0], rings[1]
-
-
-def with_teeth(scene: Scene, triangles: np.ndarray) -> Scene:
-    """Return the scene of a model with GaussianAvatars' teeth: eight rows of 15 vertices, made from rings of the lips.
-
-    The upper rows (0, 2, 4, 5) move with the neck joint, the others with the jaw. The colours are those of skin.
-    """
-    arrays = scene.arrays
-    upper, lower = lip_rings(scene)
-    top, bottom = (arrays["v_template"][ring] for ring in (upper, lower))
-    size = float(np.mean(np.linalg.norm(top - bottom, axis=1)))
-    edge = 0.5 * (top + bottom)
-    edge[:, 1] = edge[:, 1].mean()
-    edge[:, 2] -= 1.5 * size
-    high, low = edge + np.array([0, 0.1, 0]) * size, edge - np.array([0, 0.1, 0.4]) * size
-    front = {0: high + np.array([0, 2, 0]) * size, 1: low - np.array([0, 2, 0]) * size, 2: high, 3: low}
-    back = {4: front[0], 5: front[2], 6: front[1], 7: front[3]}
-    rows = [*front.values(), *(row - np.array([0, 0, size]) for row in back.values())]
-    shapes = np.tile((arrays["shapedirs"][upper] + arrays["shapedirs"][lower]) / 2, (8, 1, 1))
-    shapes[..., int(arrays["identities"]) :] = 0
-    weights = np.zeros((TEETH, 5))
-    for row in range(8):
-        weights[15 * row : 15 * row + 15, 1 if row in (0, 2, 4, 5) else 2] = 1
-    grown = {
-        "v_template": np.concatenate([arrays["v_template"], *rows]),
-        "f": np.concatenate([arrays["f"], triangles + len(arrays["v_template"])]).astype(np.uint32),
-        "shapedirs": np.concatenate([arrays["shapedirs"], shapes]),
-        "posedirs": np.concatenate([arrays["posedirs"], np.zeros((TEETH, *arrays["posedirs"].shape[1:]))]),
-        "J_regressor": np.concatenate([arrays["J_regressor"], np.zeros((5, TEETH))], axis=1),
-        "weights": np.concatenate([arrays["weights"], weights]),
-    }
-    colors = torch.cat([scene.colors, torch.full((TEETH, 3), 0.7)])
-    return replace(scene, arrays={**arrays, **grown}, colors=colors)
-
-
 # The table -----------------------------------------------------------------------------------------------------------
 
 
@@ -255,17 +207,16 @@ TRACKED = {
     "flash-avatar": Layout(write_flash_avatar, retracked=True),
     "gaussian-blendshapes": Layout(write_gaussian_blendshapes, retracked=True),
     "masks": Layout(write_masked, retracked=True),
-    "masks of three channels": Layout(lambda folder, scene: write_masked(folder, scene, 3), retracked=True),
+    "masks of three channels": Layout(partial(write_masked, channels=3), retracked=True),
     "imavatar": Layout(
         write_imavatar, "imavatar", _at_the_origin, _imavatar_view,
         {"MVI_1810": range(3), "MVI_1812": range(3, 6)}, (OwnSplit(), OwnSplit(((0, 3),))),
     ),
     "splatting-avatar": Layout(write_splatting_avatar, "imavatar", _at_the_origin, _imavatar_view),
     "vhap": _VHAP,
-    "vhap, from below": replace(_VHAP, write=lambda folder, scene: write_vhap(folder, scene, True)),
+    "vhap, from below": replace(_VHAP, write=partial(write_vhap, from_below=True)),
     "vhap, one camera": replace(
-        _VHAP, write=lambda folder, scene: write_vhap(folder, scene, cameras=("0",)), cameras=("0",),
-        splits=(OwnSplit(((5, 6),)),),
+        _VHAP, write=partial(write_vhap, cameras=("0",)), cameras=("0",), splits=(OwnSplit(((5, 6),)),)
     ),
     "vhap, a union": replace(
         _VHAP, write=write_union, clips=dict.fromkeys(UNITED, range(6)),

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from dataset_cases import NoDetector
 from dataset_checks import CAMERA, PIXELS, check_intrinsics, check_projection, filmed_camera, read
-from dataset_scene import SIDE, Scene, draw, drawn_person, head_view, projected
+from dataset_scene import SIDE, NoDetector, Scene, draw, drawn_person, head_view, projected
 from dataset_writers import UNEQUAL, rotation_of
 from flame_like import posed_as_flame
 from mien.camera import Camera

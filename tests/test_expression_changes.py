@@ -1,16 +1,16 @@
-"""Changes of gaussian_avatars with the expression: their formulas, and their way through training and files."""
+"""Changes of gaussian_avatars with the expression: their formulas, and what of them is kept and refused.
 
-import json
+`test_methods` trains, resumes, saves and bakes them, as the configuration `gaussian_avatars-features`.
+"""
+
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import safetensors
 import torch
 from torch import Tensor
 
-import train_toy
 from mien import _native, runtime
 from mien.avatar import GaussianAvatars, Progress, Rate, load_avatar, make_portable, write_avatar
 from mien.avatar.gaussian_avatars.avatar import resting_opacities
@@ -26,10 +26,8 @@ from mien.avatar.ops.expression_changes import (
 )
 from mien.errors import UserError
 from mien.render.rendering import Rendering
-from mien.training import train
 from plain_settings import plain_gaussian_avatars
-from toy_scene import toy_camera, toy_face, toy_face_model, toy_sequence
-from training_progress import stopped_at
+from toy_scene import toy_camera, toy_face, toy_face_model
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
 PARTS = ("means", "quats", "scales", "opacities", "sh")
@@ -132,7 +130,7 @@ def test_directions_are_those_of_the_largest_spread() -> None:
 
 def test_rank_0_is_the_method_without_changes() -> None:
     still = {f"expression_{name}_rate": Rate(0.0) for name in ("color", "opacity", "offset")}
-    for avatar in (new_avatar(0), new_avatar(4, **still)):
+    for avatar in (new_avatar(0), new_avatar(4, True, **still)):
         assert not [name for name in avatar.state_dict() if "basis" in name or "activations" in name]
         assert avatar.pose(toy_face(5)).aux == {}
         assert avatar.bake().changes is None
@@ -187,31 +185,6 @@ def test_the_prior_is_the_mean_square_of_the_changes() -> None:
     expected = 2 * sum(posed.aux[name].detach().square().mean().item() for name in BASES)
     assert losses["expression"].item() == pytest.approx(expected, rel=1e-5)
     assert losses["expression"].item() > 0.01
-
-
-def test_training_learns_them_and_resumes_to_the_same_bytes(tmp_path: Path) -> None:
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    config = replace(train_toy.CONFIG, expression_rank=3)
-    whole = train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "whole")
-    assert all(float(whole.gaussian_store()[name].detach().abs().max()) > 0 for name in BASES)
-
-    for step in (14, 22):
-        with pytest.raises(KeyboardInterrupt):
-            train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts", stopped_at(step))
-    train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "parts")
-    for name in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
-
-
-def test_files_with_changes_and_without_come_back(tmp_path: Path) -> None:
-    for rank in (0, 2):
-        path = tmp_path / f"{rank}.mien"
-        runtime.write_portable(path, make_portable(new_avatar(rank), toy_camera(32), "toy"))
-        with safetensors.safe_open(path, framework="numpy") as file:
-            header = json.loads(file.metadata()["mien"])
-        assert (header["content"]["baked"]["changes"] is not None) == (rank > 0)
-        runtime.write_portable(tmp_path / "again.mien", runtime.read_portable(path))
-        assert (tmp_path / "again.mien").read_bytes() == path.read_bytes()
 
 
 def test_avatars_on_disk_keep_what_training_saw(tmp_path: Path) -> None:

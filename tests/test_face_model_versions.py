@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from dataset_cases import NoDetector
 from dataset_checks import read
 from dataset_layouts import draw_at
-from dataset_scene import Scene, drawn_person
+from dataset_scene import NoDetector, Scene, drawn_person
 from dataset_writers import write_benchmark, write_flash_avatar, write_imavatar, write_insta, write_vhap
 from flame_like import write_npz
 from mien.datasets import TrackedSequence, overlay

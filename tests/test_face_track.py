@@ -10,13 +10,7 @@ from mien.face import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training.adam import Adam
 from mien.training.constants import TRAINING
-from mien.training.face_track import (
-    FaceTrack,
-    mean_pose_correction,
-    spread_corrections,
-    turns_from_mean,
-    without_turns,
-)
+from mien.training.face_track import FaceTrack, mean_pose_correction, spread_corrections, turns_from_mean, without_turns
 from mien.training.trainer import tuning_for
 from toy_scene import toy_face, toy_sequence
 

@@ -57,10 +57,10 @@ def test_poses_as_gnm_does(moved: str, arrays: dict[str, Any], model: FaceModel)
 
 
 def test_the_order_of_joints_is_read_by_their_names(arrays: dict[str, Any], model: FaceModel, tmp_path) -> None:
-    swapped = [1, 0, 3, 2]
+    swapped = [1, 3, 0, 2]  # not its own inverse
     names = ("joint_names", "template_joint_positions", "skinning_weights")
     changed = {**arrays, **{name: arrays[name][swapped] for name in names}} | {
-        "joint_parent_indices": np.array([1, -1, 0, 0], np.int32),
+        "joint_parent_indices": np.array([2, 0, -1, 0], np.int32),
         "joint_identity_basis": arrays["joint_identity_basis"][:, swapped],
         "pose_correctives_regressor": arrays["pose_correctives_regressor"].reshape(4, 9, -1)[swapped].reshape(36, -1),
     }

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataset_cases import NoDetector, unfound
-from dataset_scene import Scene, drawn_person
+from dataset_scene import NoDetector, Scene, drawn_person, unfound
 from dataset_writers import write_frame, write_imavatar, write_insta
 from mien.cli import main
 from mien.commands.stages import importing
@@ -19,8 +18,6 @@ from mien.files import write_json
 from mien.training import OwnSplit, TrainSettings, read_own_split, read_sequence, with_own_split, write_own_split
 from mien.training.footage.frames import training_frames
 from toy_workspace import write_toy_workspace
-
-pytestmark = pytest.mark.unchecked
 
 CLIPS = ("MVI_1810", "MVI_1812")
 
@@ -137,6 +134,7 @@ def test_damaged_json_is_named(subject: Path, tmp_path: Path, capsys: pytest.Cap
     assert not list((tmp_path / "out").glob("sequences/*"))
 
 
+@pytest.mark.unchecked
 @pytest.mark.usefixtures("short_films")
 def test_the_protocol_of_a_dataset_scores_its_mattes_and_its_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -5,13 +5,14 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dataset_cases import NoDetector, make_quick, tiny_scene
-from dataset_scene import Scene, drawn_person, scene_of
+from dataset_cases import make_quick, tiny_scene
+from dataset_scene import NoDetector, Scene, drawn_person, scene_of
 from dataset_writers import (
     nerface_landmarks,
     write_benchmark,
@@ -35,14 +36,12 @@ pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
 TASK = ("EXP-2-eyes", "SEN-10-port_strong_smokey")
 LAYOUTS: dict[str, tuple[Callable[[Path, Scene], Path], str, str, int]] = {
     "vhap": (write_vhap, "gaussian_avatars", "dataset", 7),
-    "insta": (lambda folder, scene: write_insta(folder, scene, held_out=2), "headgas", "dataset", 2),
+    "insta": (partial(write_insta, held_out=2), "headgas", "dataset", 2),
     "imavatar": (write_imavatar, "headgas", "dataset", 3),
-    "nersemble-benchmark": (
-        lambda folder, scene: write_benchmark(folder, scene, clips=TASK), "headgas", "nersemble-benchmark", 3,
-    ),
-    "nerf-blendshape": (lambda folder, scene: write_nerf_blendshape(folder, scene, 7.0, True), "headgas", "tail", 1),
-    "nerface": (lambda folder, scene: write_nerface(folder, scene, detected=True), "headgas", "dataset", 1),
-}  # fmt: skip
+    "nersemble-benchmark": (partial(write_benchmark, clips=TASK), "headgas", "nersemble-benchmark", 3),
+    "nerf-blendshape": (partial(write_nerf_blendshape, scale=7.0, detected=True), "headgas", "tail", 1),
+    "nerface": (partial(write_nerface, detected=True), "headgas", "dataset", 1),
+}
 """Writer, method and split of each layout that has a tracking, and how many pictures the split holds out.
 
 VHAP holds out one timestep seen by two cameras, and five seen by one. The last two have coefficients without a basis,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from flame_like import exact_landmarks, flame_like, write_npz
-from mien.avatar import DEFAULT_METHOD, METHODS, load_avatar, make_portable
+from mien.avatar import load_avatar
 from mien.capture import Capture, write_capture
 from mien.cli import main
 from mien.commands.stages import face_models as stage
@@ -21,8 +21,7 @@ from mien.lab.synthetic import SyntheticRecipe, synthesize
 from mien.runtime import load as load_portable
 from mien.storage import file_digest, write_json
 from mien.tracking import TrackingSettings, read_tracking, track
-from mien.tracking.settings import PaperSettings
-from plain_settings import plain_config
+from mien.tracking.settings import PaperSettings, PhotometricSettings
 from tracking_case import capture_of, still_camera
 
 pytestmark = pytest.mark.unchecked
@@ -188,7 +187,8 @@ def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path
     # The licence is unknown until the user says that copies are allowed.
     capsys.readouterr()
     assert main(["export", root, "--run", "a", "--out", str(workspace / "a.mien")]) != 0
-    assert "--shareable" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert all(words in told for words in ("my_head", ".ply", "--face-model", "--shareable"))
     assert main(["face-models", "--add", str(path), "--shareable"]) == 0
     assert main(["export", root, "--run", "a", "--out", str(workspace / "a.mien")]) == 0
     # The avatar's mesh is drawn into the mattes, the tracked one is not.
@@ -203,15 +203,8 @@ def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path
 
 def test_the_papers_schedule_takes_it_too(added, capture):
     paper = PaperSettings(first_steps=4, steps=1, epochs=1, texture_size=64)
-    settings = TrackingSettings(schedule="paper", paper=paper)
+    pixels = PhotometricSettings(sizes=(64,), texture_size=64, shared_steps=1, keyframes=4)
+    settings = TrackingSettings(schedule="paper", paper=paper, keyframes=4, photometric=pixels)
     tracking = track(capture, load_face_model("my_head"), settings)
     assert tracking.face.vertex_offsets is not None
     assert tracking.residuals.nanmedian() < 1.0
-
-
-def test_a_model_that_may_not_be_copied_is_named_with_ways_out(added):
-    model = replace(load_face_model("my_head"), shareable=False)
-    method = METHODS[DEFAULT_METHOD]
-    avatar = method.avatar(plain_config(DEFAULT_METHOD), model, model.neutral())
-    with pytest.raises(UserError, match=r"my_head.*\.ply.*--face-model.*--shareable"):
-        make_portable(avatar, still_camera(), "someone")
