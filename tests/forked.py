@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -173,9 +173,18 @@ def _become(request: dict[str, Any]) -> None:
         os.dup2(os.open(Path(request["folder"]) / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), number)
     sys.argv = ["mien", *map(str, request["arguments"][0])] if request["exits"] else [request["function"]]
     module, name = request["function"].split(":")
-    try:
+
+    def run() -> object:
         result = getattr(importlib.import_module(module), name)(*request["arguments"])
-        _end(result if request["exits"] else 0)
+        return result if request["exits"] else 0
+
+    end_after(run)
+
+
+def end_after(run: Callable[[], object]) -> None:
+    """Call a function that returns an exit code, and end this fork as Python ends a process."""
+    try:
+        _end(run())
     except SystemExit as stop:
         _end(stop.code)
     except KeyboardInterrupt:

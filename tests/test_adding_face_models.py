@@ -17,7 +17,7 @@ from mien.face.checks import check_face_model
 from mien.tracking.landmarks import EmbeddingSettings, embedding
 
 
-@pytest.mark.slow
+@pytest.mark.unchecked
 def test_a_head_of_gnm_gets_landmarks_and_regions_by_the_detector(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,20 +3,25 @@
 import importlib
 import os
 import re
+import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args, get_type_hints
 
 import cv2
 import numpy as np
 import pytest
 
+from forked import ForkServer
 from mien.capture.video import write_video
 from mien.cli import COMMANDS, main
 from mien.commands.help_text import readable
 from mien.commands.options import check_driver
 from mien.errors import UserError
+from mien.files import write_atomically
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -25,6 +30,14 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
     assert len(lines) == 1, lines
     return lines[0]
+
+
+def help_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Ask for help, and return it."""
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 0
+    return capsys.readouterr().out
 
 
 @pytest.fixture
@@ -42,15 +55,6 @@ def test_overview_lists_every_command(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_of_every_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every command has help."""
-    with pytest.raises(SystemExit) as exit_info:
-        main([name, "--help"])
-    assert exit_info.value.code == 0
-    assert f"usage: mien {name}" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -59,17 +63,14 @@ def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(
     texts = [mark.help for hint in hints for mark in get_args(hint)[1:] if getattr(mark, "help", None)]
     assert texts or name in ("bench", "study")  # which have sub-commands alone
     assert not [text for text in texts if "\n" in text]
-    with pytest.raises(SystemExit):
-        main([name, "--help-all"])
-    shown = capsys.readouterr().out
+    shown = help_of(capsys, name, "--help-all")
+    assert f"usage: mien {name}" in shown
     assert "default: None)" not in shown
     assert "default: )" not in shown
 
 
 def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["create", "--help"])
-    shown = capsys.readouterr().out
+    shown = help_of(capsys, "create", "--help")
     assert sorted(re.findall(r"^\W*(--[a-z][\w.-]*)", shown, re.MULTILINE)) == [
         "--device", "--method", "--name", "--out", "--preset", "--view",
     ]  # fmt: skip
@@ -98,12 +99,7 @@ def test_an_unknown_option_is_told_with_the_one_that_was_meant(
 
 @pytest.mark.parametrize("name", ["capture", "track"])
 def test_help_leaves_details_to_help_all(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = []
-    for flag in ("--help", "--help-all"):
-        with pytest.raises(SystemExit):
-            main([name, flag])
-        shown.append(capsys.readouterr().out)
-    short, whole = shown
+    short, whole = (help_of(capsys, name, flag) for flag in ("--help", "--help-all"))
     assert len(short.splitlines()) < 125
     last = short.rstrip().splitlines()[-1]
     assert f": mien {name} " in last
@@ -114,38 +110,46 @@ def test_help_leaves_details_to_help_all(name: str, capsys: pytest.CaptureFixtur
     assert all(option in short for option in ("--tracking.schedule",) if name != "capture")
 
 
-def test_details_are_options_still(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert "--tracking.keyframes -1" in complaint(capsys, f"track {tmp_path} --tracking.keyframes -1")
-
-
-def test_help_is_quick_and_needs_no_torch() -> None:
-    code = "import sys, mien.cli; mien.cli.main(['--help']); assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
-
-
-def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
-    """An unknown command is named."""
-    assert "no sub-command 'crate'" in complaint(capsys, "crate")
+PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'nerface', 'nerf-blendshape'"
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ("crate", ("no sub-command 'crate'",)),
         ("create", ("--out DIR", "see mien create --help")),
         ("render here --out a.mp4 --siez 3", ("--siez", "did you mean --size?", "see mien render --help")),
+        ("render DIR --out a.png --set jawOpen=1 --set=eyeBlinkLeft=1", ("--set is given twice",)),
+        ("demo --out demo --out=", ("--out= is empty",)),  # as a path, the current folder (found by the fuzzer, seed 5)
         ("train here --method.appearance nonsense", ("nonsense", "features", "see mien train --help-all")),
         ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
+        ("create none.mp4 --out here --steps -3", ("--steps -3",)),
+        ("create none.mp4 --out here --method nerf", ("instead of 'nerf'",)),
         ("create a.mp4 --out here --preset fast", ("'fast'", "draft")),
         ("export here --out", ("--out",)),
+        ("track here --tracking.keyframes -1", ("--tracking.keyframes -1",)),
         ("bench nothing", ("nothing", "render, train-step, scaling, quality, compare")),
+        # Choices in the order of their declaration, without None, which cannot be typed.
+        ("evaluate x --protocol nope", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'nope'; see mien",)),
+        ("evaluate x --protocol None", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'None'; see mien",)),
+        ("export x --out y --mattes hair", ("mien: --mattes: give one of 'head', 'person' instead of 'hair'; see",)),
+        ("export x --out y --sh 7", ("mien: --sh: give one of '0', '1', '2', '3' instead of '7'; see mien",)),
+        ("evaluate x --edges no", ("mien: --edges: give one of 'cleaned', 'filmed' instead of 'no'; see mien",)),
+        ("capture x --out y --capture.turn 45", ("--capture.turn: give one of '0', '90', '180', '270' instead of",)),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(
-    arguments: str, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+    arguments: str,
+    words: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     message = complaint(capsys, *arguments.split())
     assert all(word in message for word in words), message
     assert not set("│╭╰─") & set(message)
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -208,36 +212,10 @@ def test_damaged_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "run `mien capture` again" in said
 
 
-def test_options_are_checked_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out")]
-    assert "instead of 'nerf'" in complaint(capsys, *arguments, "--method", "nerf")
-    assert "--steps -3" in complaint(capsys, *arguments, "--steps", "-3")
-
-
-PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'nerface', 'nerf-blendshape'"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ("evaluate x --protocol nope", f"mien: --protocol: give one of {PROTOCOLS} instead of 'nope'; see mien"),
-        ("evaluate x --protocol None", f"mien: --protocol: give one of {PROTOCOLS} instead of 'None'; see mien"),
-        ("export x --out y --mattes hair", "mien: --mattes: give one of 'head', 'person' instead of 'hair'; see mien"),
-        ("export x --out y --sh 7", "mien: --sh: give one of '0', '1', '2', '3' instead of '7'; see mien"),
-        ("evaluate x --edges no", "mien: --edges: give one of 'cleaned', 'filmed' instead of 'no'; see mien"),
-        ("capture x --out y --capture.turn 45", "--capture.turn: give one of '0', '90', '180', '270' instead of '45'"),
-    ],
-)
-def test_choices_are_told_in_their_order(capsys: pytest.CaptureFixture[str], arguments: str, told: str) -> None:
-    """Without None, which cannot be typed, and in the order of their declaration, whatever hashes say."""
-    assert told in complaint(capsys, *arguments.split())
-
-
 def test_choices_do_not_depend_on_hashes() -> None:
-    for seed in "123":
-        command = [sys.executable, "-m", "mien.cli", "evaluate", "x", "--protocol", "nope"]
-        shown = subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True)
-        assert f"give one of {PROTOCOLS} instead of" in shown.stderr
+    command = [sys.executable, "-m", "mien.cli", "evaluate", "x", "--protocol", "nope"]
+    shown = subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": "1"}, capture_output=True, text=True)
+    assert f"give one of {PROTOCOLS} instead of" in shown.stderr
 
 
 def test_a_bug_keeps_its_traceback_in_a_log(
@@ -263,49 +241,37 @@ def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureF
 STOPPED = "mien: stopped; the same command continues where it stopped, or starts again\n"
 
 
-def test_a_terminated_command_removes_what_is_unfinished(tmp_path: Path) -> None:
-    """A terminated command removes unfinished files, as after Ctrl-C, even if a second signal comes meanwhile.
-
-    By default a signal would end the process at once.
-    """
-    program = f"""
-import os, signal, sys, types
-from dataclasses import dataclass
-from pathlib import Path
-from typing import get_args, get_type_hints
-from mien.cli import main
-from mien.files import write_atomically
-
 @dataclass(frozen=True)
-class Command:
-    def check(self): pass
-    def run(self):
-        def write(path):
-            path.write_text("half")
-            try:
-                os.kill(os.getpid(), signal.SIGTERM)
-            finally:
-                os.kill(os.getpid(), signal.SIGTERM)
-                print("cleaned up")
+class Terminated:
+    """A command that is terminated while it writes, twice."""
 
-        write_atomically(Path({str(tmp_path / "film.mp4")!r}), write)
+    out: Path
 
-sys.modules["mien.commands.demo"] = types.SimpleNamespace(Command=Command)
-sys.exit(main(["demo"]))
-"""
-    ended = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (143, "cleaned up\n", STOPPED)
+    def check(self) -> None:
+        """Accept everything."""
+
+    def run(self) -> None:
+        """Write half a film."""
+        write_atomically(self.out, self._write)
+
+    def _write(self, path: Path) -> None:
+        path.write_text("half")
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+            print("cleaned up")
+
+
+def end_terminated(words: list[str]) -> int:
+    """Run that command in this process, which must be a fork."""
+    sys.modules["mien.commands.demo"] = SimpleNamespace(Command=Terminated)  # type: ignore[assignment]
+    return main(words)
+
+
+def test_a_terminated_command_removes_what_is_unfinished(fork_server: ForkServer, tmp_path: Path) -> None:
+    """A terminated command removes unfinished files, as after Ctrl-C, even if a second signal comes meanwhile."""
+    words = ["demo", "--out", str(tmp_path / "film.mp4")]
+    ended = fork_server.call("test_cli:end_terminated", words, exits=True)
+    assert (ended.wait(), ended.stdout, ended.stderr) == (143, "cleaned up\n", STOPPED)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_option_given_twice_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    """An option that is given twice is refused, because its first values would be dropped."""
-    assert main(["render", "DIR", "--out", "a.png", "--set", "jawOpen=1", "--set=eyeBlinkLeft=1"]) == 2
-    assert "--set is given twice" in capsys.readouterr().err
-
-
-def test_option_with_an_empty_value_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`--out=` is refused: as a path, an empty text is the current folder (found by the fuzzer, seed 5)."""
-    assert main(["demo", "--out", str(tmp_path / "demo"), "--out="]) == 2
-    assert "--out= is empty" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

@@ -29,7 +29,7 @@ def run_script(name: str, folder: Path, *arguments: str) -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("examples")
-    run_script("03_synthetic_capture.py", folder, "--out", SUBJECT, "--seconds", "0.4", "--size", "96")
+    run_script("03_synthetic_capture.py", folder, "--out", SUBJECT, "--seconds", "0.24", "--size", "64")
     return folder
 
 
@@ -99,10 +99,3 @@ def test_api_page(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.chdir(folder)
     exec("\n".join(blocks), {"__name__": "__main__"})
     assert "Gaussians" in capsys.readouterr().out
-
-
-def test_every_example_is_short_and_listed() -> None:
-    listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
-    for script in sorted((ROOT / "examples").glob("*.py")):
-        assert 30 <= len(script.read_text(encoding="utf-8").splitlines()) <= 80, script
-        assert script.name in listed

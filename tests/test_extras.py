@@ -1,5 +1,6 @@
 """The base install asks for five packages, and what is missing is named with the extra that brings it."""
 
+import json
 import subprocess
 import sys
 import tomllib
@@ -17,7 +18,7 @@ from viewer_alone import page_of
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 WITHOUT = """
-import importlib.util, sys
+import contextlib, importlib.util, io, json, sys
 
 class Missing:
     def find_spec(self, name, path=None, target=None):
@@ -27,11 +28,17 @@ class Missing:
 find = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *more: None if name in {missing} else find(name, *more)
 sys.meta_path.insert(0, Missing())
-from mien.cli import main
-sys.exit(main(sys.argv[1:]))
 """
-
-
+LINES = """
+from mien.cli import main
+ended = []
+for line in json.loads(sys.argv[1]):
+    sys.meta_path.insert(0, Missing())  # before the finders of the last command
+    with contextlib.redirect_stderr(io.StringIO()) as told, contextlib.redirect_stdout(io.StringIO()):
+        ended.append(main(line))
+    ended[-1] = [ended[-1], told.getvalue()]
+print(json.dumps(ended))
+"""
 STAGES = """
 import ast, importlib
 from pathlib import Path
@@ -43,10 +50,12 @@ for node in ast.walk(ast.parse(Path(create.__file__).read_text(encoding="utf-8")
 """
 
 
-def mien_without(missing: set[str], *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a command where some packages are missing."""
-    code = WITHOUT.format(missing=sorted(missing))
-    return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=300)
+def python_without(missing: set[str], code: str, *arguments: str) -> str:
+    """Run Python where some packages are missing, and return its output."""
+    words = [sys.executable, "-c", WITHOUT.format(missing=sorted(missing)) + code, *arguments]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +72,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_create_needs_no_package_of_another_extra():
     missing = {module for module, extra in extras.EXTRA_OF.items() if extra != "create"}
-    code = WITHOUT.format(missing=sorted(missing)).split("from mien.cli")[0] + STAGES
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert "mien.commands.stages.training" in done.stdout.split()
+    assert "mien.commands.stages.training" in python_without(missing, STAGES).split()
 
 
 def test_the_base_install_asks_for_five_packages():
@@ -82,47 +88,40 @@ def test_extras_bring_what_error_messages_say():
             assert asked.get(package) == extra, module
 
 
-@pytest.mark.parametrize("arguments", [("--out", "{}/still.png", "--size", "48"), ("--out", "{}/f", "--frames", "3")])
-def test_a_file_is_drawn_without_any_extra(exported: Path, tmp_path: Path, arguments: tuple[str, ...]):
-    words = [word.format(tmp_path) for word in arguments]
-    done = mien_without(set(extras.EXTRA_OF), "render", str(exported), *words)
-    assert done.returncode == 0, done.stderr
-    assert list(tmp_path.rglob("*.png"))
+WORKING = {
+    "still.png": "render {file} --out {out}/still.png --size 48",
+    "f": "render {file} --out {out}/f --frames 3",
+    "again.html": "export {file} --out {out}/again.html",
+    "again.packed": "export {file} --out {out}/again.packed",
+    "again.mien": "export {file} --out {out}/again.mien",
+}
+LACKING = {
+    "export {file} --out {out}/me.ply": ("torch", "create"),
+    "render {file} --out {out}/me.mp4": ("av", "create"),
+    "view {file}": ("viser", "viewer"),
+    "demo --out {out}/demo": ("torch", "create"),
+}
 
 
-@pytest.mark.parametrize("ending", [".html", ".packed", ".mien"])
-def test_a_file_is_exported_without_any_extra(exported: Path, tmp_path: Path, ending: str):
-    out = tmp_path / f"again{ending}"
-    done = mien_without(set(extras.EXTRA_OF), "export", str(exported), "--out", str(out))
-    assert done.returncode == 0, done.stderr
-    assert out.stat().st_size > 1000
-
-
-@pytest.mark.parametrize(
-    ("words", "package", "extra"),
-    [
-        (("export", "{file}", "--out", "{folder}/me.ply"), "torch", "create"),
-        (("render", "{file}", "--out", "{folder}/me.mp4"), "av", "create"),
-        (("view", "{file}"), "viser", "viewer"),
-        (("demo", "--out", "{folder}/demo"), "torch", "create"),
-    ],
-)
-def test_a_missing_package_is_named_with_its_extra(
-    exported: Path, tmp_path: Path, words: tuple[str, ...], package: str, extra: str
-):
-    line = [word.format(file=exported, folder=tmp_path) for word in words]
-    done = mien_without(set(extras.EXTRA_OF), *line)
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.count("\n") == 1
-    assert package in done.stderr
-    assert f"pip install 'mien[{extra}]'" in done.stderr
+def test_a_file_is_drawn_and_exported_without_any_extra_and_what_is_missing_is_named(exported: Path, tmp_path: Path):
+    lines = [line.format(file=exported, out=tmp_path).split() for line in (*WORKING.values(), *LACKING)]
+    ended = json.loads(python_without(set(extras.EXTRA_OF), LINES, json.dumps(lines)))
+    for name, (code, told) in zip(WORKING, ended[: len(WORKING)], strict=True):
+        assert code == 0, told
+        files = sorted((tmp_path / name).iterdir()) if name == "f" else [tmp_path / name]
+        assert len(files) == (3 if name == "f" else 1)
+        assert all(file.stat().st_size > (100 if file.suffix == ".png" else 1000) for file in files)
+    for (package, extra), (code, told) in zip(LACKING.values(), ended[len(WORKING) :], strict=True):
+        assert (code, told.count("\n")) == (2, 1), told
+        assert package in told
+        assert f"pip install 'mien[{extra}]'" in told
 
 
 def test_a_file_is_viewed_without_torch(exported: Path):
     """With mien[viewer] alone, the viewer serves its page. viser brings zstandard, and pillow by imageio."""
     missing = set(extras.EXTRA_OF) - {"viser", "zstandard", "PIL"}
-    words = [sys.executable, "-c", WITHOUT.format(missing=sorted(missing)), "view", str(exported), "--port", "0"]
-    told = page_of(words)
+    code = WITHOUT.format(missing=sorted(missing)) + "from mien.cli import main\nsys.exit(main(sys.argv[1:]))"
+    told = page_of([sys.executable, "-c", code, "view", str(exported), "--port", "0"])
     assert "<html" in told, told
 
 

@@ -2,45 +2,28 @@
 
 import importlib
 import json
+import os
 import shutil
 import signal
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 
-from mien.capture.video import read_video_frames
-from mien.cli import main
-from mien.commands.stages import pictures
-from toy_workspace import write_toy_workspace
-
-FRAMES = 6
-LOOK = ["--frames", str(FRAMES), "--size", "32"]
-EVALUATE = ["--no-perceptual", "--json"]
-CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 143, signal.SIGINT: 130}
-SLOWLY = """
-import signal, sys, time
+from forked import Forked, ForkServer
 from mien.capture.video import read_video_frames
 from mien.cli import main
 from mien.commands.stages import pictures
 from mien.evaluation.partial import PartialScores
+from toy_workspace import write_toy_workspace
 
-def slowed(original):
-    def step(*arguments):
-        result = original(*arguments)
-        print("step", flush=True)
-        time.sleep(0.3)
-        return result
-    return step
-
-signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell starts in the background
-pictures.draw, PartialScores.add = slowed(pictures.draw), slowed(PartialScores.add)
-sys.exit(main(sys.argv[1:]))
-"""
+pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
+FRAMES = 6
+LOOK = ["--frames", str(FRAMES), "--size", "32"]
+EVALUATE = ["--no-perceptual", "--json"]
+CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 143, signal.SIGINT: 130}
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +33,29 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def stop(arguments: list[str], steps: int, how: signal.Signals) -> int:
-    """Run the command in another process until this many pictures are done, then send it a signal."""
-    with subprocess.Popen([sys.executable, "-c", SLOWLY, *arguments], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for _ in range(steps):
-            while process.stdout.readline() not in ("step\n", ""):
-                pass
-        process.send_signal(how)
-        return process.wait(timeout=60)
+def stop(server: ForkServer, words: list[str], steps: int, how: signal.Signals) -> Forked:
+    """Run a command to its end in another process that gets a signal when this many pictures are done."""
+    process = server.call("test_interruption:stop_itself", words, steps, int(how), exits=True)
+    process.wait()
+    return process
+
+
+def stop_itself(words: list[str], steps: int, number: int) -> int:
+    done = 0
+
+    def counted(original: Callable[..., Any]) -> Callable[..., Any]:
+        def step(*arguments: Any) -> Any:
+            nonlocal done
+            result = original(*arguments)
+            done += 1
+            if done == steps:
+                os.kill(os.getpid(), number)
+            return result
+
+        return step
+
+    pictures.draw, PartialScores.add = counted(pictures.draw), counted(PartialScores.add)
+    return main(words)
 
 
 def decoded(video: Path) -> list[bytes]:
@@ -69,70 +66,55 @@ def visible(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.png", "a_%06d.png"])
-def test_interrupted_rendering(
-    name: str, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        ("a.mp4", signal.SIGKILL),
+        ("a.mp4", signal.SIGTERM),
+        ("a.webm", signal.SIGINT),
+        ("a.png", signal.SIGINT),
+        ("a_%06d.png", signal.SIGTERM),
+        ("pictures", signal.SIGKILL),
+    ],
+)
+def test_stopped_rendering_ends_alike_the_next_time(
+    name: str, how: signal.Signals, fork_server: ForkServer, workspace: Path, tmp_path: Path
 ) -> None:
-    """An interrupted rendering leaves the old file until the new one is whole. Every numbered picture is whole."""
+    """A stopped rendering leaves the old file until the new one is whole. Every numbered picture is whole."""
     command = ["render", str(workspace), *LOOK, "--out"]
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
     assert main([*command, str(undisturbed / name)]) == 0
-    numbered = "%" in name
-    if not numbered:
+    several = name in ("a_%06d.png", "pictures")
+    if not several:
         out.mkdir()
         (out / name).write_text("mine")
-    original, last = pictures.draw, 1 if name == "a.png" else 3
-    calls = iter(range(1, 100))
-
-    def interrupted(*arguments: Any) -> np.ndarray:
-        if next(calls) == last:
-            raise KeyboardInterrupt
-        return original(*arguments)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(pictures, "draw", interrupted)
-        assert main([*command, str(out / name)]) == 130
-    assert "the same command" in capsys.readouterr().err
-    assert sorted(path.name for path in out.iterdir()) == (["a_000000.png", "a_000001.png"] if numbered else [name]), (
-        "something half-written stays"
-    )
-    if not numbered:
+    stopped = stop(fork_server, [*command, str(out / name)], 1 if name == "a.png" else 3, how)
+    assert stopped.poll() == CODES[how]
+    assert ("the same command" in stopped.stderr) == (how != signal.SIGKILL)
+    folder = out / "pictures" if name == "pictures" else out
+    if several:
+        assert len(visible(folder)) == 2
+        assert all(cv2.imread(str(folder / each)) is not None for each in visible(folder))
+    else:
+        assert visible(folder) == [name]
         assert (out / name).read_text() == "mine"
+    assert how == signal.SIGKILL or len(visible(folder)) == len(list(folder.iterdir())), "something half-written stays"
     assert main([*command, str(out / name)]) == 0
     # A .webm holds a random number; its pictures are compared.
     content = decoded if name == "a.webm" else Path.read_bytes
-    assert [content(path) for path in sorted(out.iterdir())] == [
-        content(path) for path in sorted(undisturbed.iterdir())
-    ]
-
-
-@pytest.mark.parametrize(
-    ("name", "how"), [("a.mp4", signal.SIGKILL), ("a.mp4", signal.SIGTERM), ("pictures", signal.SIGINT)]
-)
-def test_stopped_rendering_ends_alike_the_next_time(
-    name: str, how: signal.Signals, workspace: Path, tmp_path: Path
-) -> None:
-    command, out = ["render", str(workspace), *LOOK, "--out"], tmp_path / "out" / name
-    assert stop([*command, str(out)], 2, how) == CODES[how]
-    assert visible(tmp_path / "out") == (["pictures"] if name == "pictures" else [])
-    for path in out.glob("[0-9]*.png"):
-        assert cv2.imread(str(path)) is not None
-    undisturbed = tmp_path / "undisturbed" / name
-    for place in (out, undisturbed):
-        assert main([*command, str(place)]) == 0
-    files = sorted(undisturbed.iterdir()) if name == "pictures" else [undisturbed]
-    assert len(files) == (FRAMES if name == "pictures" else 1)
+    files = [path for path in undisturbed.rglob("*") if path.is_file()]
+    assert len(files) == (FRAMES if several else 1)
     for path in files:
-        assert path.read_bytes() == (tmp_path / "out" / path.relative_to(tmp_path / "undisturbed")).read_bytes()
+        assert content(out / path.relative_to(undisturbed)) == content(path)
 
 
-def test_killed_scoring_goes_on(workspace: Path, tmp_path: Path) -> None:
+def test_killed_scoring_goes_on(fork_server: ForkServer, workspace: Path, tmp_path: Path) -> None:
     for name in ("undisturbed", "killed"):
         shutil.copytree(workspace, tmp_path / name)
     assert main(["evaluate", str(tmp_path / "undisturbed"), *EVALUATE]) == 0
     run = tmp_path / "killed" / "runs" / "toy"
     before = visible(run)
-    assert stop(["evaluate", str(tmp_path / "killed"), *EVALUATE], 2, signal.SIGKILL) == -signal.SIGKILL
+    stop(fork_server, ["evaluate", str(tmp_path / "killed"), *EVALUATE], 2, signal.SIGKILL)
     assert visible(run) == before, "figures of a part of the frames"
     assert len((run / ".self_reenactment_tail.partial").read_text().splitlines()) >= 3
     assert main(["evaluate", str(tmp_path / "killed"), *EVALUATE]) == 0

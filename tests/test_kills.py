@@ -1,60 +1,93 @@
-"""Commands that are killed at random moments continue to the same bytes: `fuzzing.kills` with a few kills.
+"""Commands that are killed continue to the same bytes, and nothing has to be removed by hand.
 
-`make kills KILLS=200` does the same at length.
+`make kills KILLS=200` does at length what the test marked `long` does with a few kills.
 """
 
 import os
+import shutil
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fuzzing.kills import STAGES, Tally
-from fuzzing.same_bytes import differing_files
+from forked import ForkServer
+from fuzzing.same_bytes import differing_files, hidden_files
+from mien.cli import main
+from two_commands import RANK, Studio, run, toy_studio
 
-KILLS = 6
-SECONDS = 900
-"""Time limit for a busy machine. An idle one with two cores needs a minute and a half."""
+TESTS = Path(__file__).parent
+KILLS = 12
+"""Number of kills of the long test."""
+STAGES = {
+    "capture": ("capture {pictures} --out {box}/new --name clip", signal.SIGKILL, 2),
+    "train": ("train {box} --run new --steps 6 --split tail --training.checkpoint-every 2", signal.SIGTERM, 3),
+    "evaluate": ("evaluate {box} --run alone --no-perceptual", signal.SIGINT, 1),
+    "export": ("export {box} --run alone --out {box}/me.mien", signal.SIGKILL, 1),
+}
+"""Name of a stage -> its command, a signal, and before which of its files it comes."""
+CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 143, signal.SIGINT: 130}
 
 
-@pytest.mark.slow
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    folder = tmp_path_factory.mktemp("kills")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("MIEN_CACHE", str(folder / "cache"))
+        made = toy_studio(folder / "studio", folder / "cache")
+        assert main(["train", str(made.root), "--run", "alone", "--steps", "3", "--split", "tail", *RANK]) == 0
+        yield made
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_command_that_is_stopped_before_it_puts_a_file_in_place_goes_on(
+    stage: str, studio: Studio, fork_server: ForkServer, tmp_path: Path
+) -> None:
+    line, number, file = STAGES[stage]
+    box, whole = tmp_path / "box", tmp_path / "whole"
+    words = [word.format(box=box, pictures=studio.video) for word in line.split()]
+    words += studio.capture_options if stage == "capture" else RANK if stage == "train" else []
+
+    def begin() -> None:
+        shutil.copytree(studio.root, box)
+
+    def ended(function: str, *more: int) -> int:
+        return fork_server.call(function, words, *more, exits=True).wait()
+
+    begin()
+    assert ended("two_commands:run") == 0
+    box.rename(whole)
+    begin()
+    assert ended("test_kills:run_until_a_file", int(number), file) == CODES[number]
+    assert differing_files(whole, box) != [], "the command was not stopped"
+    assert ended("two_commands:run") == 0
+    assert differing_files(whole, box) == []
+    assert number == signal.SIGKILL or not hidden_files(box)
+
+
+def run_until_a_file(words: list[str], number: int, file: int) -> int:
+    """Run a command in this process, which must be a fork, and send it a signal before it puts a file in place."""
+    replace, count = Path.replace, 0
+
+    def counted(self: Path, target: str | os.PathLike[str]) -> Path:
+        nonlocal count
+        count += 1
+        if count == file:
+            os.kill(os.getpid(), number)
+        return replace(self, target)
+
+    Path.replace = counted
+    return run(words)
+
+
+@pytest.mark.long
 def test_random_kills_leave_nothing_to_do_by_hand(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "fuzzing.kills", "--kills", str(KILLS), "--findings", str(tmp_path / "kills.jsonl")],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-        capture_output=True,
-        text=True,
-        timeout=SECONDS,
-        check=False,
-    )
-    assert result.returncode == 0, f"{result.stdout}\n{result.stderr[-3000:]}\n{(tmp_path / 'kills.jsonl').read_text()}"
+    seed, findings = os.environ.get("MIEN_SEED", "0"), tmp_path / "kills.jsonl"
+    words = ["-m", "fuzzing.kills", "--kills", str(KILLS), "--seed", seed, "--findings", str(findings)]
+    environment = {**os.environ, "PYTHONPATH": str(TESTS)}
+    result = subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, f"seed {seed}:\n{result.stdout}\n{result.stderr[-3000:]}\n{findings.read_text()}"
     assert "| all | " in result.stdout
-
-
-def test_other_bytes_are_found(tmp_path: Path) -> None:
-    """The comparison sees every visible file; measured times, hidden files and checkpoints of a stop do not count."""
-    one, other = tmp_path / "one", tmp_path / "other"
-    for folder, seconds in ((one, 1.5), (other, 2.5)):
-        (folder / "run/checkpoints").mkdir(parents=True)
-        (folder / "run/training.json").write_text(f'{{"steps": 3, "seconds": {seconds}}}')
-        (folder / "run/report.html").write_text(f"<b>{seconds} s</b> Peak memory {seconds} MB.")
-        (folder / "run/film.mp4").write_bytes(b"film")
-        (folder / f"run/checkpoints/step_{seconds}.safetensors").touch()
-        (folder / f".{seconds}.lock").touch()
-    assert differing_files(one, other) == []
-    (other / "run/training.json").write_text('{"steps": 4, "seconds": 1.5}')
-    (other / "run/report.html").write_text("<b>1.5 dB</b> Peak memory 1.5 MB.")
-    (other / "run/film.mp4").write_bytes(b"filn")
-    (other / "run/more").touch()
-    assert differing_files(one, other) == ["run/more", "run/film.mp4", "run/report.html", "run/training.json"]
-
-
-def test_the_table_counts_by_stage_and_signal() -> None:
-    tally = Tally(findings=[{"stage": "train"}])
-    tally.kills.update({("train", "SIGTERM"): 3, ("export", "SIGKILL"): 2})
-    tally.chains.update({"train": 1, "export": 2})
-    rows = tally.table().splitlines()
-    assert len(rows) == len(STAGES) + 4
-    assert "| train | 0 | 3 | 0 | 3 | 1 | 1 |" in rows
-    assert "| all | 2 | 3 | 0 | 5 | 3 | 1 |" in rows

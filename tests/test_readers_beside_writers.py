@@ -1,5 +1,6 @@
 """Readers beside writers see the old or the new files, never a mixture, and name the writer if they cannot read."""
 
+import ctypes
 import shutil
 import threading
 from pathlib import Path
@@ -13,7 +14,6 @@ from mien.errors import UserError
 from mien.files import replace_folder
 from mien.locks import BeingWrittenError, hold, read_beside_writers
 from mien.tracking import read_tracking, write_tracking
-from mien.tracking.files import _TENSORS
 from other_process import Holder
 from toy_scene import toy_face_model, toy_tracking
 
@@ -61,7 +61,7 @@ def test_a_tracking_that_is_half_replaced(other: Holder, tmp_path: Path) -> None
     write_tracking(new, toy_tracking(model, 5, 32))
     with other.holding(folder.parent):
         assert len(read_tracking(folder).valid) == 4
-        shutil.copy(new / _TENSORS, folder)
+        shutil.copy(new / "tracking.safetensors", folder)
         with pytest.raises(BeingWrittenError, match=f"clip: is being written .*process {other.pid}"):
             read_tracking(folder)
         shutil.copy(new / "tracking.json", folder)
@@ -71,26 +71,30 @@ def test_a_tracking_that_is_half_replaced(other: Holder, tmp_path: Path) -> None
 def test_readers_beside_writers_see_the_old_or_the_new(tmp_path: Path) -> None:
     path, captures = tmp_path / "capture", [random_capture(timesteps=2 + index, seed=index) for index in range(2)]
     write_capture(path, captures[0])
-    stop, failed, seen = threading.Event(), [], set()
+    stop, was_read, failed, seen = threading.Event(), threading.Event(), [], set()
 
     def rewrite() -> None:
         try:
-            for index in range(1, 1000):
-                if stop.is_set():
-                    break
-                write_capture(path, captures[index % 2])
+            while not stop.is_set():
+                write_capture(path, captures[len(written) % 2])
+                written.append(1)
+                was_read.wait()  # so that no reader meets writers five times in a row, however slow it is
+                was_read.clear()
         except BaseException as error:
             failed.append(error)
 
+    written = [1]
     writer = threading.Thread(target=rewrite)
     writer.start()
     try:
-        for _ in range(150):
+        while len(written) < 30 and not failed:
             found = read_capture(path)
+            was_read.set()
             seen.add(found.timesteps)
             assert_same_capture(found, captures[found.timesteps - 2])
     finally:
         stop.set()
+        was_read.set()
         writer.join()
     assert not failed
     assert seen == {2, 3}
@@ -108,7 +112,7 @@ def test_replaced_folders_are_never_missing(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(Path, "rename", lambda self, to: (seen.append(place.exists()), original(self, to))[1])
     replace_folder(place, folder("new", "1"))
     assert ((place / "file").read_text(), seen) == ("1", []), "exchanged, not renamed"
-    monkeypatch.setattr("mien.files._exchange", lambda *_: False)
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: object())  # a system that cannot exchange two names
     replace_folder(place, folder("new", "2"))
     assert (place / "file").read_text() == "2"
     replace_folder(tmp_path / "other", folder("new", "3"))

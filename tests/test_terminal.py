@@ -4,11 +4,14 @@ import io
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
+from forked import ForkServer, run_forked
 from mien import progress, terminal
 from mien.cli import main
 from mien.commands.stages.names import sequence_name
@@ -113,33 +116,39 @@ def test_closed_outputs_end_quietly(arguments: str, output: str, code: int, word
     assert done.stderr.count("\n") == (1 if words else 0)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["bench", "--help"], ["face-models"]])
-def test_a_reader_that_is_gone_ends_the_command_quietly(arguments: list[str]) -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    code = (
-        "import sys, mien.cli, mien.terminal\n"
-        "if 'face-models' in sys.argv: mien.cli._run = lambda *_: mien.terminal.show('[]')\n"
-        "sys.exit(mien.cli.main())"
-    )
-    done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=writing, stderr=subprocess.PIPE, check=False)
-    os.close(writing)
-    assert done.returncode == 141
-    assert done.stderr == b""
+@pytest.mark.parametrize("words", [["--help"], ["bench", "--help"], ["licenses"]])
+def test_a_reader_that_is_gone_ends_the_command_quietly(fork_server: ForkServer, words: list[str]) -> None:
+    done = fork_server.call("test_terminal:into_a_broken_pipe", words, 1, exits=True)
+    assert (done.wait(), done.stderr) == (141, "")
 
 
-def test_progress_that_nobody_reads_ends_the_command_quietly() -> None:
+def test_progress_that_nobody_reads_ends_the_command_quietly(fork_server: ForkServer, tmp_path: Path) -> None:
+    done = fork_server.call("test_terminal:into_a_broken_pipe", ["demo", "--out", str(tmp_path)], 2, exits=True)
+    assert (done.wait(), done.stdout) == (141, "")
+
+
+@dataclass(frozen=True)
+class Hello:
+    """A command that says something."""
+
+    out: Path
+
+    def check(self) -> None:
+        """Accept everything."""
+
+    def run(self) -> None:
+        """Say something."""
+        say("hello")
+
+
+def into_a_broken_pipe(words: list[str], number: int) -> int:
+    """Run a command in this process, which must be a fork, where nobody reads its output. `demo` only says hello."""
+    sys.modules["mien.commands.demo"] = SimpleNamespace(Command=Hello)  # type: ignore[assignment]
     reading, writing = os.pipe()
+    os.dup2(writing, number)
     os.close(reading)
-    code = (
-        "import sys, mien.cli\nfrom mien.progress import say\n"
-        "def run(name, rest): say('hello'); return 0\n"
-        "mien.cli._run = run\nsys.exit(mien.cli.main(['track', 'x']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], stderr=writing, stdout=subprocess.PIPE, check=False)
     os.close(writing)
-    assert done.returncode == 141
-    assert done.stdout == b""
+    return main(words)
 
 
 def test_a_closed_output_is_not_taken_by_the_next_file(tmp_path: Path) -> None:
@@ -196,11 +205,8 @@ def test_the_door_needs_no_library(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_instructions_that_the_machine_lacks_are_told(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mien.cli", "demo", "--out", str(tmp_path / "demo")]
-    ended = subprocess.run(
-        command, env={**os.environ, "MIEN_ISA": "mmx"}, capture_output=True, text=True, timeout=120, check=False
-    )
+def test_instructions_that_the_machine_lacks_are_told(fork_server: ForkServer, tmp_path: Path) -> None:
+    ended = run_forked(fork_server, "demo", "--out", tmp_path / "demo", env={"MIEN_ISA": "mmx"})
     assert ended.returncode == 2
     assert ended.stderr.startswith("mien: MIEN_ISA=mmx: this machine has ")
     assert len(ended.stderr.splitlines()) == 1
@@ -208,9 +214,5 @@ def test_instructions_that_the_machine_lacks_are_told(tmp_path: Path) -> None:
 
 
 def test_a_number_agrees_with_its_noun() -> None:
-    assert [counted(count, "frame") for count in (0, 1, 2, 12_000)] == [
-        "0 frames",
-        "1 frame",
-        "2 frames",
-        "12,000 frames",
-    ]
+    told = [counted(count, "frame") for count in (0, 1, 2, 12_000)]
+    assert told == ["0 frames", "1 frame", "2 frames", "12,000 frames"]

@@ -20,6 +20,8 @@ from two_commands import RANK, Studio, beside, toy_studio
 
 pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
 TWO_RUNS = ["--runs", "alone", "twin"]
+WHERE = ["within", "before"]
+"""Whether the first of two commands waits with the lock, or just before it takes it, until the second has ended."""
 
 
 @pytest.fixture(scope="module")
@@ -157,9 +159,6 @@ def test_the_command_after_a_kill_goes_on_at_once(
     assert_same_run(studio, "killed")
 
 
-# Two commands at once: the first waits beside a lock, or with it, until the second has ended.
-
-
 def assert_same_run(studio: Studio, name: str) -> None:
     """Check that the run has the bytes of the one that was trained alone."""
     alone, run = studio.root / "runs" / "alone", studio.root / "runs" / name
@@ -175,66 +174,42 @@ def assert_told(pid: int, name: str, told: CompletedProcess[str]) -> None:
     assert f"{name}: is being written by another command (process {pid} on " in told.stderr.splitlines()[-1]
 
 
-@pytest.fixture(params=["within", "before"])
-def where(request: pytest.FixtureRequest) -> str:
-    """Whether the first command waits with the lock, or just before it takes it."""
-    return request.param
-
-
-def test_two_trainings_of_one_run(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
-    """One of two trainings of a run works, and the run is that of a single training."""
-    train = ["train", str(studio.root), "--run", where, "--steps", "3", "--split", "tail", *RANK]
-    pid, first, second = beside(fork_server, tmp_path / "wait", (where, where), train, train)
-    assert first.returncode == 0, first.stderr
-    trained = ["training: 3/3" in each.stderr for each in (first, second)]
-    assert trained == ([True, False] if where == "within" else [False, True])
-    if where == "within":
-        assert_told(pid, where, second)
-    assert_same_run(studio, where)
-
-
-def test_two_captures_of_one_video(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
-    """One of two captures of a video works, and the result is that of a single one."""
-    root = tmp_path / "root"
-    capture = ["capture", str(studio.video), "--out", str(root), "--name", "clip", *studio.capture_options]
-    pid, first, second = beside(fork_server, tmp_path / "wait", (where, "clip"), capture, capture)
-    assert first.returncode == 0, first.stderr
-    captured = ["capture clip: 5/5" in each.stderr for each in (first, second)]
-    assert captured == ([True, False] if where == "within" else [False, True])
-    if where == "within":
-        assert_told(pid, "clip", second)
-    expected = tree_bytes(studio.root / "sequences" / "clip" / "capture")
-    assert tree_bytes(root / "sequences") == {f"clip/capture/{name}": data for name, data in expected.items()}
-
-
-def test_two_imports_of_one_run(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
-    """One of two imports of a run works. The other one names it, or says that the run is there."""
-    words = ["import", str(studio.avatar_folder), "--out", str(tmp_path / "out")]
-    stop = (where, "gaussian_avatars")
-    pid, first, second = beside(fork_server, tmp_path / "wait", stop, words, words)
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("kind", ["train", "capture", "import", "analyze"])
+def test_one_of_two_works_and_the_other_names_it_or_finds_all_done(
+    kind: str, where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path
+) -> None:
+    """What is left is that of a single command."""
+    root, out = str(studio.root), tmp_path / "out"
+    of_capture = ["--out", str(out), "--name", "clip", *studio.capture_options]
+    of_analysis = ["--run", "alone", "--parts", "growth", "--out", str(out)]
+    words, place, work = {
+        "train": (["train", root, "--run", where, "--steps", "3", "--split", "tail", *RANK], where, "training: 3/3"),
+        "capture": (["capture", str(studio.video), *of_capture], "clip", "capture clip: 5/5"),
+        "import": (["import", str(studio.avatar_folder), "--out", str(out)], "gaussian_avatars", "Gaussians on toy"),
+        "analyze": (["analyze", "gaussian-avatars", root, *of_analysis], "out", "Look at"),
+    }[kind]
+    pid, first, second = beside(fork_server, tmp_path / "wait", (where, place), words, words)
     if where == "within":
         assert first.returncode == 0, first.stderr
-        assert_told(pid, "gaussian_avatars", second)
+        assert_told(pid, place, second)
     else:
-        assert (first.returncode, second.returncode) == (2, 0), second.stderr
-        assert "is there already; give the imported run another name" in first.stderr
-    files = tree_bytes(tmp_path / "out" / "runs" / "gaussian_avatars")
-    assert {"avatar/avatar.safetensors", "config.json", "face_track.safetensors"} <= files.keys()
-
-
-def test_two_analyses_of_one_run(where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path) -> None:
-    """One of two analyses works at a time, and nothing is measured twice."""
-    out = tmp_path / "out"
-    words = ["analyze", "gaussian-avatars", str(studio.root), "--run", "alone", "--parts", "growth", "--out", str(out)]
-    pid, first, second = beside(fork_server, tmp_path / "wait", (where, "out"), words, words)
-    assert first.returncode == 0, first.stderr
-    if where == "within":
-        assert_told(pid, "out", second)
+        assert (first.returncode, second.returncode) == (2 if kind == "import" else 0, 0), first.stderr + second.stderr
+        late = {"import": "is there already; give the imported run another name", "analyze": "growth: measured before"}
+        assert late.get(kind, "") in first.stderr
+    worked = [work in each.stderr for each in (first, second)]
+    assert worked == [where == "within" or kind == "analyze", where == "before"]
+    if kind == "train":
+        assert_same_run(studio, where)
+    elif kind == "capture":
+        expected = tree_bytes(studio.root / "sequences" / "clip" / "capture")
+        assert tree_bytes(out / "sequences") == {f"clip/capture/{name}": data for name, data in expected.items()}
+    elif kind == "import":
+        files = tree_bytes(out / "runs" / "gaussian_avatars")
+        assert {"avatar/avatar.safetensors", "config.json", "face_track.safetensors"} <= files.keys()
     else:
-        assert second.returncode == 0, second.stderr
-    assert ("growth: measured before" in first.stderr) == (where == "before")
-    assert json.loads((out / "analysis.json").read_text())["parts"].keys() == {"growth"}
-    assert (out / "analysis.html").is_file()
+        assert json.loads((out / "analysis.json").read_text())["parts"].keys() == {"growth"}
+        assert (out / "analysis.html").is_file()
     assert not lock_file(out).exists()
 
 
@@ -252,6 +227,7 @@ def without_perceptual(content: Any) -> Any:
     return {key: without_perceptual(value) for key, value in content.items() if key != "perceptual"}
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize(
     ("first_is", "trained"),
     [("create", True), ("evaluate", True), ("create", False)],

@@ -8,12 +8,15 @@ import os
 
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
+import gc
 import json
 import resource
 import signal
 import sys
 from pathlib import Path
 from typing import Any
+
+from forked import end_after
 
 
 def apply_limits(request: dict[str, Any]) -> None:
@@ -84,7 +87,8 @@ def _import_everything() -> None:
 
 if __name__ == "__main__":
     _import_everything()
+    gc.freeze()
     if _serve():
         from mien.cli import main
 
-        sys.exit(main())
+        end_after(main)
