@@ -1,13 +1,21 @@
 """Make tiny captures and clips for the tests of mien.capture."""
 
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
 import numpy as np
+import pytest
 
 from mien.capture import Capture
+from mien.capture.tone import PQ, hlg_scene_light, pq_light
 from mien.capture.video import write_video
+
+BT2020, BT709 = (0.2627, 0.0593), (0.2126, 0.0722)
+"""Weights of red and blue in luma."""
 
 
 def random_capture(timesteps: int = 3, cameras: int = 2, height: int = 20, width: int = 31, seed: int = 0) -> Capture:
@@ -75,38 +83,80 @@ def write_face_clip(path: Path, test_data: Path, frames: int = 12, size: tuple[i
     return np.stack([lefts + 120, np.full(frames, 160)], axis=-1)
 
 
-def write_planes(
+Codes = tuple[int, int, int, int]
+"""Codes of matrix, primaries, transfer and range."""
+
+
+def encode(
     path: Path,
-    pictures: list[np.ndarray],
-    pixel_format: str,
-    colors: tuple[int, int, int, int] = (1, 1, 1, 1),
-    ticks: list[int] | None = None,
+    frames: Sequence[np.ndarray | list[np.ndarray] | av.VideoFrame],
+    codec: str = "libx264",
+    pixels: str = "yuv420p",
+    *,
+    rate: int = 25,
+    options: dict[str, str] | None = None,
+    colors: Codes | None = None,
+    tags: Codes | None = None,
+    ticks: Sequence[int] | None = None,
+    prepare: Callable[[Any], object] = lambda stream: None,
 ) -> None:
-    """Write a lossless clip (FFV1 in Matroska, 25 frames a second) of exactly these Y'CbCr planes [3, h, w], 4:4:4.
+    """Encode a video with FFmpeg.
 
     Args:
-        path: Path of the clip; it ends in .mkv.
-        pictures: Planes as uint8 or uint16, depending on the pixel format.
-        pixel_format: FFmpeg's name of the pixel format, such as yuv444p10le.
-        colors: Codes of matrix, primaries, transfer and range.
-        ticks: Times in milliseconds; by default the rate is even.
+        path: Path of the video; its ending tells the container.
+        frames: Frames as RGB pictures [h, w, 3], as lists of planes of the pixel format, or as PyAV has them.
+        codec: FFmpeg's name of the codec.
+        pixels: FFmpeg's name of the pixel format, such as yuv444p10le.
+        rate: Frames a second, or units of `ticks`.
+        options: Options of the codec; without any, libx264 keeps nearly every level.
+        colors: Colours that the codec's header and the frames state.
+        tags: Colours that the container states; those of the header without it.
+        ticks: Times of the frames; by default the rate is even.
+        prepare: Changes the stream before anything is encoded.
     """
-    _, height, width = pictures[0].shape
+    given = [_frame_of(frame, pixels) for frame in frames]
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=25 if ticks is None else 1000)
-        stream.width, stream.height, stream.pix_fmt = width, height, pixel_format
-        context = stream.codec_context
-        context.colorspace, context.color_primaries, context.color_trc, context.color_range = colors
-        for index, planes in enumerate(pictures):
-            frame = av.VideoFrame(width, height, pixel_format)
-            frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range = colors
-            frame.pts = index if ticks is None else ticks[index]
-            for plane, values in zip(frame.planes, planes, strict=True):
-                padded = np.zeros((height, plane.line_size // values.itemsize), values.dtype)
-                padded[:, :width] = values
-                plane.update(padded.tobytes())
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+        stream = container.add_stream(codec, rate=rate, options=options or ({"crf": "1"} if codec == "libx264" else {}))
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = given[0].width, given[0].height, pixels
+        prepare(stream)
+        packets = []
+        for target in (stream.codec_context, *given) if colors else ():
+            _state(target, colors)
+        for frame, tick in zip(given, ticks or range(len(given)), strict=True):
+            frame.pts = tick
+            packets += stream.encode(frame)
+        packets += stream.encode()
+        if tags:
+            # The muxer takes the tags of this moment, which the encoder no longer reads.
+            _state(stream.codec_context, tags)
+        container.mux(packets)
+
+
+def _state(target: Any, colors: Codes | None) -> None:
+    if colors:
+        target.colorspace, target.color_primaries, target.color_trc, target.color_range = colors
+
+
+def _frame_of(given: np.ndarray | list[np.ndarray] | av.VideoFrame, pixels: str) -> av.VideoFrame:
+    if isinstance(given, av.VideoFrame):
+        return given
+    if isinstance(given, np.ndarray):
+        return av.VideoFrame.from_ndarray(np.ascontiguousarray(given), format="rgb24")
+    frame = av.VideoFrame(given[0].shape[1], given[0].shape[0], pixels)
+    for plane, values in zip(frame.planes, given, strict=True):
+        padded = np.zeros((plane.height, plane.line_size // values.itemsize), values.dtype)
+        padded[:, : values.shape[1]] = values
+        plane.update(padded.tobytes())
+    return frame
+
+
+def write_planes(
+    path: Path, pictures: list[np.ndarray], pixels: str, colors: Codes = (1, 1, 1, 1), ticks: list[int] | None = None
+) -> None:
+    """Write a lossless .mkv (FFV1) of exactly these Y'CbCr planes [3, h, w], 4:4:4, at 25 frames a second or at ticks
+    of milliseconds."""
+    encode(path, list(map(list, pictures)), "ffv1", pixels, rate=1000 if ticks else 25, colors=colors, ticks=ticks)
 
 
 def to_planes(signal: np.ndarray, weights: tuple[float, float], bits: int) -> np.ndarray:
@@ -123,3 +173,45 @@ def face_picture(test_data: Path, side: int = 160, margin: int = 0) -> np.ndarra
     """Return the scan's texture with a plain margin around it."""
     face = cv2.resize(scan_texture(test_data), (side, side), interpolation=cv2.INTER_AREA)
     return np.pad(face, ((margin, margin), (margin, margin), (0, 0)), constant_values=190)
+
+
+def _inverse(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
+    signal = np.linspace(0, 1, 200001)
+    return np.interp(values, curve(signal), signal)
+
+
+def light_of(srgb: np.ndarray) -> np.ndarray:
+    """Return linear light, 0..1, of sRGB levels, 0..255."""
+    values = srgb / 255
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def hdr_signal(light: np.ndarray, transfer: int) -> np.ndarray:
+    """Return the BT.2020 signal of sRGB's display light, where 1 is 203 cd/m2."""
+    matrix = [[0.627404, 0.329283, 0.043313], [0.069097, 0.919540, 0.011362], [0.016391, 0.088013, 0.895595]]
+    display = 203 * light @ np.array(matrix).T  # BT.2087
+    if transfer == PQ:
+        return _inverse(pq_light, display)
+    luminance = display @ np.array([0.2627, 0.6780, 0.0593])
+    scene = display / 1000 * np.power(np.maximum(luminance / 1000, 1e-9), 1 / 1.2 - 1)[..., None]
+    return _inverse(hlg_scene_light, scene)
+
+
+def write_rig(path: Path, *cameras: dict[str, Any], **others: object) -> Path:
+    """Write a calibration of these cameras."""
+    path.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": cameras, **others}))
+    return path
+
+
+def interrupt_at(count: int, monkeypatch: pytest.MonkeyPatch, place: object, name: str) -> list[tuple[Any, ...]]:
+    """Let the call number `count` of a function end by Ctrl-C. Return a list that gets the arguments of each call."""
+    original, calls = getattr(place, name), []
+
+    def interrupted(*arguments: Any, **options: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) == count:
+            raise KeyboardInterrupt
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(place, name, interrupted)
+    return calls

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from capture_helpers import scan_texture, tree_bytes
+from capture_helpers import interrupt_at, scan_texture, tree_bytes, write_rig
 from mien.camera import Camera, look_at
-from mien.capture import CaptureSettings
+from mien.capture import Capture, CaptureSettings, from_cameras
 from mien.capture.calibration import read_calibration
 from mien.capture.from_cameras import capture_cameras
 from mien.capture.head_path import choose_crops, find_head_path
@@ -48,47 +48,37 @@ def corners_at(timestep: int) -> torch.Tensor:
     return square + torch.tensor([0.01 * timestep, 0.0, 0.0])
 
 
-def write_rig(folder: Path, texture: np.ndarray, frames: int = FRAMES) -> tuple[Path, Path]:
+def film_rig(folder: Path, texture: np.ndarray) -> tuple[Path, Path]:
     """Write the pictures of all cameras and their calibration; the back camera sees a plain board."""
-    entries = []
+    side, entries = texture.shape[0], []
+    source = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
     for camera_id, camera in CAMERAS.items():
         place = folder / "pictures" / camera_id
         place.mkdir(parents=True)
-        for timestep in range(frames):
+        board = np.full_like(texture, 90) if camera_id == "back" else texture
+        for timestep in range(FRAMES):
             picture = np.full((HEIGHT, WIDTH, 3), 170, np.uint8)
-            corners, side = camera.project(corners_at(timestep))[0].numpy(), texture.shape[0]
-            source = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
-            board = np.full_like(texture, 90) if camera_id == "back" else texture
-            warp = cv2.getPerspectiveTransform(source, corners.astype(np.float32) - 0.5)
-            cv2.warpPerspective(
-                board, warp, (WIDTH, HEIGHT), picture, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_TRANSPARENT
-            )
+            corners = camera.project(corners_at(timestep))[0].numpy().astype(np.float32) - 0.5
+            warp, how = cv2.getPerspectiveTransform(source, corners), {"borderMode": cv2.BORDER_TRANSPARENT}
+            cv2.warpPerspective(board, warp, (WIDTH, HEIGHT), picture, flags=cv2.INTER_AREA, **how)
             cv2.imwrite(str(place / f"{timestep}.png"), picture[..., ::-1])
-        entries.append(entry_of(camera_id, camera))
-    path = folder / "rig.json"
-    write_entries(path, entries)
-    return folder / "pictures", path
-
-
-def entry_of(camera_id: str, camera: Camera) -> dict:
-    return {
-        "id": camera_id,
-        "K": camera.K.tolist(),
-        "viewmat": camera.viewmat.tolist(),
-        "width": camera.width,
-        "height": camera.height,
-    }
-
-
-def write_entries(path: Path, entries: list[dict]) -> None:
-    path.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": entries}))
+        matrices = {"K": camera.K.tolist(), "viewmat": camera.viewmat.tolist()}
+        entries.append({"id": camera_id, **matrices, "width": WIDTH, "height": HEIGHT})
+    return folder / "pictures", write_rig(folder / "rig.json", *entries)
 
 
 @pytest.fixture(scope="module")
 def rig(test_data, tmp_path_factory):
     """Pictures and calibration of the rig."""
     texture = cv2.resize(scan_texture(test_data), (512, 512), interpolation=cv2.INTER_AREA)
-    return write_rig(tmp_path_factory.mktemp("rig"), texture)
+    return film_rig(tmp_path_factory.mktemp("rig"), texture)
+
+
+def capture_changed(rig, folder: Path, change: Callable[[list[dict]], list[dict]], **settings) -> Capture:
+    """Capture with a changed calibration."""
+    write_rig(folder / "rig.json", *change(json.loads(rig[1].read_text())["cameras"]))
+    out = folder / "out" / "capture"
+    return capture_cameras([rig[0]], folder / "rig.json", out, "s", replace(SMALL, **settings))
 
 
 @pytest.mark.unchecked
@@ -120,17 +110,7 @@ def test_cameras_become_one_capture_with_the_head_at_one_scale(rig, tmp_path):
 def test_same_command_reads_the_capture_back_and_an_interrupted_one_continues(rig, tmp_path, monkeypatch):
     settings = replace(SMALL, max_frames=2)
     capture_cameras([rig[0]], rig[1], tmp_path / "whole" / "capture", "s", settings)
-    import mien.capture.from_cameras as module
-
-    process, calls = module.process_part, []
-
-    def stop_at_third(*arguments, **options):
-        calls.append(arguments)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return process(*arguments, **options)
-
-    monkeypatch.setattr(module, "process_part", stop_at_third)
+    calls = interrupt_at(3, monkeypatch, from_cameras, "process_part")
     out = tmp_path / "stopped" / "capture"
     with pytest.raises(KeyboardInterrupt):
         capture_cameras([rig[0]], rig[1], out, "s", settings)
@@ -142,15 +122,12 @@ def test_same_command_reads_the_capture_back_and_an_interrupted_one_continues(ri
 
 
 def test_offsets_pair_frames(rig, tmp_path):
-    entries = json.loads(rig[1].read_text())["cameras"]
-    for entry in entries:
-        entry["offset"] = 1 if entry["id"] == "middle" else 0
-    write_entries(tmp_path / "rig.json", entries)
-    settings = replace(SMALL, max_frames=FRAMES - 1)
-    shifted = capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "a" / "capture", "s", settings)
+    def change(entries):
+        return [{**entry, "offset": int(entry["id"] == "middle")} for entry in entries]
+
+    shifted = capture_changed(rig, tmp_path, change, max_frames=FRAMES - 1)
     assert shifted.timesteps == FRAMES - 1
-    assert shifted.source["cameras"]["middle"]["first_frame"] == 1
-    assert shifted.source["cameras"]["left"]["first_frame"] == 0
+    assert [shifted.source["cameras"][name]["first_frame"] for name in ("left", "middle")] == [0, 1]
 
 
 @pytest.mark.parametrize("camera", ["middle", "top"])
@@ -164,7 +141,7 @@ def test_unequal_lengths_are_refused_before_faces_are_searched(rig, tmp_path, mo
         entries[1]["offset"] = 1
     else:
         (pictures / camera / f"{FRAMES - 1}.png").unlink()
-    write_entries(tmp_path / "rig.json", entries)
+    write_rig(tmp_path / "rig.json", *entries)
     with pytest.raises(
         UserError, match=f"camera {camera} has 2 frames, but camera left has 3; .* --capture.max-frames 2"
     ):
@@ -209,23 +186,16 @@ def first(**changes: object) -> Callable[[list[dict]], list[dict]]:
     ],
 )
 def test_calibration_that_does_not_fit_is_refused(rig, tmp_path, change, message):
-    entries = change(json.loads(rig[1].read_text())["cameras"])
-    write_entries(tmp_path / "rig.json", entries)
     with pytest.raises(UserError, match=message) as found:
-        capture_cameras(
-            [rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", replace(SMALL, max_frames=1)
-        )
+        capture_changed(rig, tmp_path, change, max_frames=1)
     assert "\n" not in str(found.value)
     assert not (tmp_path / "out").exists()
 
 
 def test_camera_that_disagrees_is_reported(rig, tmp_path, capsys):
-    entries = json.loads(rig[1].read_text())["cameras"]
-    wrong = np.array(entries[0]["viewmat"])
+    wrong = CAMERAS["left"].viewmat.clone()
     wrong[0, 3] += 0.4
-    entries[0]["viewmat"] = wrong.tolist()
-    write_entries(tmp_path / "rig.json", entries)
-    capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", replace(SMALL, max_frames=2))
+    capture_changed(rig, tmp_path, first(viewmat=wrong.tolist()), max_frames=2)
     assert "warning: camera left sees the face" in capsys.readouterr().err
 
 
@@ -288,12 +258,12 @@ def test_a_reading_is_found_in_the_pictures(rig, tmp_path):
     """Matrices from camera to world with OpenGL's axes, in the world of the left camera."""
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     world = np.linalg.inv(CAMERAS["left"].viewmat.numpy()) @ flip
-    entries = json.loads(rig[1].read_text())["cameras"]
-    for entry in entries:
-        entry["viewmat"] = np.linalg.inv(flip @ np.array(entry["viewmat"]) @ world).tolist()
-    write_entries(tmp_path / "rig.json", entries)
-    with pytest.raises(
-        UserError, match="no two cameras ever .*; the matrices go from camera to world with OpenGL's"
-    ) as e:
-        capture_cameras([rig[0]], tmp_path / "rig.json", tmp_path / "a" / "capture", "s", SMALL)
-    assert "cannot tell" not in str(e.value)
+
+    def change(entries):
+        inverse = [np.linalg.inv(flip @ np.array(entry["viewmat"]) @ world).tolist() for entry in entries]
+        return [{**entry, "viewmat": viewmat} for entry, viewmat in zip(entries, inverse, strict=True)]
+
+    message = "no two cameras ever .*; the matrices go from camera to world with OpenGL's"
+    with pytest.raises(UserError, match=message) as error:
+        capture_changed(rig, tmp_path, change)
+    assert "cannot tell" not in str(error.value)

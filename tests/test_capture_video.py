@@ -1,12 +1,18 @@
-"""Video files are read and written with their colours and times."""
+"""Video files are read and written with their colours and times: HDR, ten bits, pixel aspect, rotation, odd sizes."""
+
+from fractions import Fraction
 
 import av
 import numpy as np
 import pytest
 
-from capture_helpers import write_gradient_video
-from mien.capture.video import probe_video, read_video_frames, write_video
+from capture_helpers import BT2020, encode, hdr_signal, light_of, to_planes, write_gradient_video, write_planes
+from mien.capture.tone import HLG, PQ, roll_off
+from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
 from mien.errors import UserError
+
+COLORS = np.array([[200, 120, 100], [90, 60, 50], [40, 90, 60], [20, 30, 120], [128, 128, 128], [0, 0, 0]])
+"""Colours of sRGB below the knee, like those of faces."""
 
 
 def test_written_frames_are_read_back(tmp_path):
@@ -17,8 +23,9 @@ def test_written_frames_are_read_back(tmp_path):
     # Chroma has half the resolution, which costs a smooth picture about two levels on average.
     assert np.abs(np.stack(frames).astype(int) - pictures).mean() < 2
     info = probe_video(path)
-    assert info.frames == 5
+    assert info.frames == count_frames(path) == 5
     assert info.fps == pytest.approx(29.97, abs=1e-4)
+    assert {frame.shape for _, frame in read_video_frames(path, longest_side=32)} == {(24, 32, 3)}
 
 
 def test_colors_keep_their_level(tmp_path):
@@ -40,7 +47,7 @@ def test_equal_pictures_give_equal_files(tmp_path):
     disc = np.hypot(*np.mgrid[-1:1:80j, -1:1:80j]) < 0.7
     picture = np.where(disc[..., None], random.integers(80, 200, (80, 80, 3)), 255).astype(np.uint8)
     moved, path, files = np.roll(picture, 1, 1), tmp_path / "clip.mp4", set()
-    for _ in range(20):
+    for _ in range(8):
         litter = [random.random(size) for size in random.integers(1, 100_000, 50)]
         write_video(path, [picture, moved, moved, picture, picture, picture], 25)
         files.add(path.read_bytes())
@@ -71,39 +78,11 @@ def test_rotation_and_mirror_flags_are_applied(tmp_path, degrees, mirrored, turn
     picture = np.zeros((48, 64, 3), np.uint8)
     picture[:24, :20] = 255
     path = tmp_path / "turned.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25, options={"crf": "1"})
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        stream.set_display_rotation(degrees, mirrored)
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(stream.encode())
+    encode(path, [picture], prepare=lambda stream: stream.set_display_rotation(degrees, mirrored))
     _, frame = next(read_video_frames(path))
     expected = turn(picture)
     assert frame.shape == expected.shape
     assert np.abs(frame.astype(int) - expected).mean() < 4
-
-
-def test_shrinking_while_reading(tmp_path):
-    """Frames are shrunk while they are read."""
-    path = tmp_path / "clip.mp4"
-    write_gradient_video(path, width=128, height=96)
-    shapes = {frame.shape for _, frame in read_video_frames(path, longest_side=64)}
-    assert shapes == {(48, 64, 3)}
-
-
-def test_variable_frame_rate_keeps_its_times(tmp_path):
-    path = tmp_path / "variable.mp4"
-    ticks = [0, 40, 50, 130, 170]
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=1000, options={"crf": "20"})
-        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
-        for tick in ticks:
-            frame = av.VideoFrame.from_ndarray(np.full((32, 32, 3), tick, np.uint8), format="rgb24")
-            frame.pts = tick
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    times = [seconds for seconds, _ in read_video_frames(path)]
-    np.testing.assert_allclose(times, np.array(ticks) / 1000, atol=1e-6)
 
 
 def test_bad_videos_are_named(tmp_path):
@@ -144,3 +123,52 @@ def test_writing_nothing_or_nowhere_is_refused(tmp_path):
     blocked.touch()
     with pytest.raises(UserError, match="cannot be written"):
         write_video(blocked / "clip.mp4", [np.zeros((16, 16, 3), np.uint8)], 25)
+
+
+@pytest.mark.parametrize("transfer", [PQ, HLG])
+def test_hdr_comes_back_as_the_colors_it_was_made_of(tmp_path, transfer):
+    path = tmp_path / "hdr.mkv"
+    light = light_of(COLORS)
+    signal = np.repeat(np.repeat(hdr_signal(light, transfer)[None], 8, axis=0), 8, axis=1)
+    write_planes(path, [to_planes(signal, BT2020, 10)], "yuv444p10le", (9, 9, transfer, 1))
+    assert probe_video(path).hdr == {PQ: "PQ", HLG: "HLG"}[transfer]
+    _, picture = next(read_video_frames(path))
+    found = picture[4, 4::8].astype(int)
+    assert np.abs(found - COLORS).max() <= 3, found
+
+
+def test_hdr_highlights_are_pressed_together_without_a_step(tmp_path):
+    path = tmp_path / "bright.mkv"
+    levels = np.linspace(0, 1200 / 203, 200)
+    signal = hdr_signal(np.repeat(levels[:, None], 3, axis=1), PQ)
+    write_planes(path, [to_planes(np.repeat(signal[None], 4, axis=0), BT2020, 10)], "yuv444p10le", (9, 9, PQ, 1))
+    gray = next(read_video_frames(path))[1][1].astype(int)
+    assert np.ptp(gray, axis=1).max() <= 2  # grey stays grey
+    assert (np.diff(gray[:, 1]) >= 0).all()
+    assert 230 <= gray[np.searchsorted(levels, 1.0), 1] <= 245  # diffuse white
+    assert (gray[levels >= 1000 / 203, 1] == 255).all()
+    np.testing.assert_allclose(roll_off(np.array([0.75, 1000 / 203, 50.0])), [0.75, 1, 1])
+    slope = np.diff(roll_off(np.array([0.75, 0.7501])))
+    np.testing.assert_allclose(slope, 1e-4, rtol=1e-3)
+
+
+def test_ten_bits_are_rounded_exactly(tmp_path):
+    path = tmp_path / "ramp.mkv"
+    ramp = np.tile(np.arange(64, 941, dtype=np.uint16), (4, 1))
+    gray = np.full_like(ramp, 512)
+    write_planes(path, [np.stack([ramp, gray, gray])], "yuv444p10le")
+    _, picture = next(read_video_frames(path))
+    exact = (ramp[0].astype(float) - 64) * 255 / 876
+    assert np.abs(picture[0] - exact[:, None]).max() <= 0.51
+
+
+def test_pixels_become_square(tmp_path):
+    picture = np.full((48, 64, 3), 90, np.uint8)
+    picture[12:32, 20:40] = 235
+    for aspect, size in ((Fraction(2, 1), (48, 128)), (Fraction(3, 4), (64, 64))):
+        path = tmp_path / f"{aspect.numerator}.mp4"
+        encode(path, [picture], prepare=lambda stream, aspect=aspect: setattr(stream, "sample_aspect_ratio", aspect))
+        _, shown = next(read_video_frames(path))
+        assert shown.shape[:2] == size
+        bright = shown[..., 1] > 160
+        assert bright.any(axis=0).sum() / bright.any(axis=1).sum() == pytest.approx(float(aspect), rel=0.08)

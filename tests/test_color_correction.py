@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import color_charts
+from capture_helpers import write_rig
 from dataset_writers import FRONTAL, write_nersemble
 from mien.capture.calibration import read_calibration
 from mien.capture.color_correction import ColorCorrection
@@ -57,8 +58,7 @@ def test_black_white_and_greys_stay_without_a_correction() -> None:
 def test_pictures_and_plates_are_corrected_and_mattes_are_not(tmp_path: Path) -> None:
     matrix = color_charts.correction(5)
     entry = {**ENTRY, "color_correction": matrix.tolist()}
-    rig = tmp_path / "rig.json"
-    rig.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": [entry]}))
+    rig = write_rig(tmp_path / "rig.json", entry)
     (camera,) = read_calibration(rig)
     assert camera.colors is not None
     for name, seed in (("pictures/0.png", 1), ("plate.png", 2), ("mattes/0.png", 3)):
@@ -85,10 +85,7 @@ def test_pictures_and_plates_are_corrected_and_mattes_are_not(tmp_path: Path) ->
     ],
 )
 def test_other_matrices_are_refused(tmp_path: Path, given: object, told: str) -> None:
-    rig = tmp_path / "rig.json"
-    rig.write_text(
-        json.dumps({"format": "mien.cameras", "version": 1, "cameras": [{**ENTRY, "color_correction": given}]})
-    )
+    rig = write_rig(tmp_path / "rig.json", {**ENTRY, "color_correction": given})
     with pytest.raises(UserError, match=rf"camera 0 \(a\): color_correction.* {told}"):
         read_calibration(rig)
 

@@ -22,6 +22,7 @@ from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
 SECONDS = 6.0
+BLACK = np.zeros((32, 32, 3), np.uint8)
 MOUTH = [index for index, name in enumerate(ARKIT_NAMES) if name.startswith(("jaw", "mouth"))]
 
 
@@ -45,7 +46,7 @@ def tone(frequency: float, loudness: float = 0.5, rate: int = RATE) -> tuple[np.
     return (loudness * envelope * np.sin(2 * np.pi * frequency * seconds)).astype(np.float32), envelope
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
 def test_silence_keeps_the_mouth_shut(noise: float) -> None:
     samples = (noise * np.random.default_rng(0).standard_normal(round(SECONDS * RATE))).astype(np.float32)
     motion = motion_of_sound(samples)
@@ -56,8 +57,7 @@ def test_silence_keeps_the_mouth_shut(noise: float) -> None:
     assert 0.005 < np.abs(motion.head_rotation).max() < 0.1
 
 
-@pytest.mark.parametrize("loudness", [0.9, 0.05])
-@pytest.mark.parametrize("frequency", [150.0, 1200.0])
+@pytest.mark.parametrize(("frequency", "loudness"), [(150.0, 0.9), (1200.0, 0.05)])
 def test_the_jaw_follows_the_envelope(frequency: float, loudness: float) -> None:
     samples, envelope = tone(frequency, loudness)
     samples = samples + 1e-4 * np.random.default_rng(0).standard_normal(len(samples)).astype(np.float32)
@@ -69,6 +69,11 @@ def test_the_jaw_follows_the_envelope(frequency: float, loudness: float) -> None
     assert max(by_lag, key=lambda lag: by_lag[lag]) == 0, "there is no lag"
     assert jaw[:25].max() < 0.02, "it is silent before the tone"
     assert 0.4 < jaw.max() <= 0.6
+    # A pause in noise closes the mouth as well.
+    noisy = 0.3 / loudness * samples + 0.005 * np.random.default_rng(0).standard_normal(len(samples)).astype(np.float32)
+    jaw = column(motion_of_sound(noisy).coefficients, "jawOpen")
+    assert jaw[:25].max() < 0.05
+    assert jaw.max() > 0.4
 
 
 VOWELS = {"a": (750, 1200, 2600, 1.0, 0), "e": (290, 2300, 3000, 0.25, -5), "i": (420, 1950, 2600, 0.4, -4),
@@ -115,7 +120,7 @@ def synthesised(seed: int, syllables: int, even: bool = False) -> tuple[np.ndarr
     return sound.astype(np.float32), smooth(table[:, 3], 0.05), np.array(shut)
 
 
-@pytest.mark.parametrize(("seed", "even"), [(0, False), (1, False), (2, True), (3, True)])
+@pytest.mark.parametrize(("seed", "even"), [(0, False), (2, True)])
 def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(seed: int, even: bool) -> None:
     """Vowels that are equally loud are told by their formants."""
     sound, jaw, shut = synthesised(seed, 24, even)
@@ -130,14 +135,6 @@ def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(seed: int, eve
     for one in closures:
         inside[max(one.start - 1, 0) : one.stop + 1] = True
     assert press[~inside].mean() < 0.1 * press[inside].max(), "lips are not pressed in vowels"
-
-
-def test_pauses_in_noise_close_the_mouth() -> None:
-    samples, envelope = tone(300.0, 0.3)
-    noisy = samples + 0.005 * np.random.default_rng(0).standard_normal(len(samples)).astype(np.float32)
-    jaw = column(motion_of_sound(noisy).coefficients, "jawOpen")
-    assert jaw[:25].max() < 0.05
-    assert jaw.max() > 0.4
 
 
 def test_low_sounds_round_the_lips_and_high_ones_stretch_them() -> None:
@@ -167,28 +164,29 @@ def test_sound_is_read_from_several_kinds_of_files(tmp_path: Path) -> None:
     assert len(read) == pytest.approx(SECONDS * RATE, abs=50)
     reference, _ = tone(440.0)
     assert np.abs(read[: len(reference)] - reference[: len(read)]).max() < 0.02
-    write_video(tmp_path / "film.mp4", [np.zeros((32, 32, 3), np.uint8)] * 50, 25, sound=(stereo, 2.0))
+    write_video(tmp_path / "film.mp4", [BLACK] * 50, 25, sound=(stereo, 2.0))
     assert len(read_sound(tmp_path / "film.mp4")) == pytest.approx(2 * RATE, abs=RATE // 10)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("gone.wav", "no such file"),
-        ("empty.wav", "is empty"),
-        ("text.wav", "cannot be read as sound.*convert it to .wav"),
-        ("film.mp4", "has no sound; give a file with sound"),
-        ("header.wav", "no sound of it can be decoded"),
-        (".", "is not a file; give a sound file"),
-    ],
-)
-def test_files_without_sound_are_refused(name: str, message: str, tmp_path: Path) -> None:
+def test_files_without_sound_and_odd_rates_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.wav").touch()
     (tmp_path / "text.wav").write_text("la la la " * 100)
     write_wav(tmp_path / "header.wav", np.zeros(0))
-    write_video(tmp_path / "film.mp4", [np.zeros((32, 32, 3), np.uint8)] * 2, 25)
-    with pytest.raises(UserError, match=message):
-        read_speech(tmp_path / name)
+    write_video(tmp_path / "film.mp4", [BLACK] * 2, 25)
+    cases = {
+        "gone.wav": "no such file", "empty.wav": "is empty", "header.wav": "no sound of it can be decoded",
+        "text.wav": "cannot be read as sound.*convert it to .wav", "film.mp4": "has no sound; give a file with sound",
+        ".": "is not a file; give a sound file",
+    }  # fmt: skip
+    for rate in (0, 999, 2_000_000):
+        path = write_wav(tmp_path / f"{rate}.wav", np.zeros(100))
+        data = bytearray(path.read_bytes())
+        data[24:28] = rate.to_bytes(4, "little")
+        path.write_bytes(data)
+        cases[path.name] = r"\.wav: .*convert it to \.wav"
+    for name, message in cases.items():
+        with pytest.raises(UserError, match=message):
+            read_speech(tmp_path / name)
 
 
 @pytest.mark.parametrize("pictures", [30, 90])
@@ -196,7 +194,7 @@ def test_the_video_has_sound_of_its_own_length(tmp_path: Path, pictures: int) ->
     """Sound of two seconds is cut, or followed by silence."""
     given = write_wav(tmp_path / "a.wav", tone(440.0)[0][: 2 * RATE])
     out = tmp_path / "out.mp4"
-    write_video(out, [np.zeros((32, 32, 3), np.uint8)] * pictures, 30, sound=(given, pictures / 30))
+    write_video(out, [BLACK] * pictures, 30, sound=(given, pictures / 30))
     assert count_frames(out) == pictures
     with av.open(str(out)) as container:
         lengths = [float((stream.duration or 0) * (stream.time_base or 0)) for stream in container.streams]
@@ -204,6 +202,7 @@ def test_the_video_has_sound_of_its_own_length(tmp_path: Path, pictures: int) ->
     assert lengths == pytest.approx([pictures / 30] * 2, abs=0.05)
 
 
+@pytest.mark.unchecked
 def test_the_command_writes_a_talking_avatar(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -223,15 +222,16 @@ def test_the_command_writes_a_talking_avatar(
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(out), "--size", "32"]) == 0
     assert len(list(read_video_frames(out))) == 90
     assert len(read_sound(out)) == pytest.approx(3 * RATE, abs=RATE // 10)
-    silent = tmp_path / "talking.webm"
-    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(silent), "--size", "32"]) == 0
+    words = ["drive", str(tmp_path / "w"), "--by", str(voice), "--size", "32"]
+    assert main([*words, "--out", str(tmp_path / "talking.webm")]) == 0
     assert "has no sound; only an .mp4" in capsys.readouterr().err
-    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--sequence", "a", "--out", str(out)]) == 2
-    capsys.readouterr()
-    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--alone", "--size", "32"]) == 2
-    assert "--alone, the options of pictures: needs --out" in capsys.readouterr().err
-    assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--out", str(out), "--port", "80"]) == 2
-    assert "--port 80: is for the viewer" in capsys.readouterr().err
+    for options, said in (
+        (["--sequence", "a", "--out", str(out)], ""),
+        (["--alone"], "--alone, the options of pictures: needs --out"),
+        (["--out", str(out), "--port", "80"], "--port 80: is for the viewer"),
+    ):
+        assert main([*words, *options]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_without_an_output_the_viewer_plays_the_voice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -250,17 +250,6 @@ def test_without_an_output_the_viewer_plays_the_voice(tmp_path: Path, monkeypatc
     monkeypatch.setattr(viewing_motions, "open_driver", open_driver)
     assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--port", "8123"]) == 0
     assert shown == [("voice.wav", True, 90, 8123)]
-
-
-@pytest.mark.parametrize("rate", [0, 1, 3, 999, 2_000_000, 2**31 - 1])
-def test_odd_rates_are_refused(rate: int, tmp_path: Path) -> None:
-    path = write_wav(tmp_path / "a.wav", np.zeros(100))
-    data = bytearray(path.read_bytes())
-    data[24:28] = rate.to_bytes(4, "little")
-    path.write_bytes(data)
-    with pytest.raises(UserError, match=r"a\.wav: ") as error:
-        read_sound(path)
-    assert "convert it to .wav" in str(error.value)
 
 
 def write_mp3(path: Path, layout: str, seconds: float) -> bytes:
@@ -289,7 +278,7 @@ def test_sound_that_changes_its_channels_is_read_to_its_end(tmp_path: Path) -> N
 def test_a_damaged_mp3_is_read_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mp3"
     content, random = write_mp3(path, "stereo", 0.5), np.random.default_rng(0)
-    for _ in range(60):
+    for _ in range(20):
         data = bytearray(content)
         for place in random.integers(0, len(data), 20):
             data[place] = random.integers(0, 256)

@@ -1,6 +1,5 @@
 """Interlaced video: frames become progressive pictures of their first moment; what is progressive stays as it is."""
 
-import json
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,10 +9,9 @@ import numpy as np
 import pytest
 from av.filter import Graph
 
-from capture_helpers import face_picture
+from capture_helpers import encode
 from mien.capture.fields import FieldOrder, combs, deinterlace
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames
-from mien.cli import main
 
 HEIGHT, WIDTH, FRAMES = 96, 128, 6
 FIRST = {"tff": 0, "bff": 1}
@@ -73,16 +71,14 @@ CONTAINER_ORDERS = {"tff": 2, "bff": 3}
 
 def write(path: Path, kind: str, frames: list[av.VideoFrame], order: int = 0, rotation: int = 0) -> None:
     codec, pixels, options = CODECS[kind]
-    options = options if any(frame.interlaced_frame for frame in frames) else {}
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=25, options=options)
-        stream.width, stream.height, stream.pix_fmt = frames[0].width, frames[0].height, pixels
+
+    def prepare(stream: av.VideoStream) -> None:
         stream.codec_context.field_order = order
         if rotation:
             stream.set_display_rotation(rotation)
-        for frame in frames:
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+
+    is_interlaced = any(frame.interlaced_frame for frame in frames)
+    encode(path, frames, codec, pixels, options=options if is_interlaced else None, prepare=prepare)
 
 
 def write_woven(path: Path, kind: str, pattern: np.ndarray, order: str) -> None:
@@ -100,8 +96,9 @@ def green(frame: LazyFrame) -> np.ndarray:
     return frame.picture()[..., 1]
 
 
-@pytest.mark.parametrize("order", ["tff", "bff"])
-@pytest.mark.parametrize("kind", CODECS)
+@pytest.mark.parametrize(
+    ("kind", "order"), [*((kind, "tff") for kind in CODECS), *((kind, "bff") for kind in ("h264.mp4", "raw.mov"))]
+)
 def test_each_interlaced_frame_becomes_one_picture_of_its_first_moment(kind, order, pattern, tmp_path):
     path = tmp_path / kind
     write_woven(path, kind, pattern, order)
@@ -176,8 +173,13 @@ def test_a_turned_interlaced_clip_is_upright(pattern, tmp_path):
     assert np.abs(green(frames[2]).astype(int) - upright).mean() < 7
 
 
-@pytest.mark.parametrize("pixels", ["nv12", "rgb24", "gray", "gray16le", "yuvj420p", "yuv411p", "uyvy422", "p010le"])
-@pytest.mark.parametrize("size", [(3, 9), (64, 48)])
+@pytest.mark.parametrize(
+    ("pixels", "size"),
+    [
+        *((pixels, (3, 9)) for pixels in ("nv12", "rgb24", "gray", "gray16le", "yuvj420p", "yuv411p", "uyvy422")),
+        *((pixels, (64, 48)) for pixels in ("nv12", "p010le")),
+    ],
+)
 def test_any_format_and_size_passes(pixels, size):
     frames = flagged([np.full((size[1], size[0]), 180, np.uint8)] * 3, pixels, ["tff"] * 3)
     for count in (1, 2, 3):
@@ -205,69 +207,14 @@ def test_few_frames_are_held(pattern):
         assert len(read) <= index + 2
 
 
-# Through the command --------------------------------------------------------------------------------------------------
-
-
-def captured(path: Path, out: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[str, dict]:
-    """Return what `mien capture` says about fields, and its report."""
-    arguments = ["capture", str(path), "--out", str(out), "--capture.no-cuts", "--capture.crop", "none", *options]
-    assert main(arguments) == 0
-    report = json.loads((out / "sequences" / path.stem / "capture/report.json").read_text())
-    return " ".join(line for line in capsys.readouterr().err.splitlines() if "interlaced" in line), report
-
-
-@pytest.fixture(scope="module")
-def heads(test_data) -> list[np.ndarray]:
-    """A head that moves by five pixels a field, woven."""
-    face = face_picture(test_data, 200)
-    fields = []
-    for index in range(12):
-        picture = np.full((240, 320, 3), 190, np.uint8)
-        picture[20:220, 20 + 5 * index : 220 + 5 * index] = face
-        fields.append(picture)
-    frames = [picture.copy() for picture in fields[::2]]
-    for frame, second in zip(frames, fields[1::2], strict=True):
-        frame[1::2] = second[1::2]
-    return frames
-
-
-def test_the_capture_says_that_it_deinterlaced(heads, tmp_path, capsys):
-    path = tmp_path / "clip.mp4"
-    write(path, "h264.mp4", flagged(heads, "yuv420p", ["tff"] * 6))
-    said, report = captured(path, tmp_path / "out", capsys)
-    assert said.endswith("clip.mp4: interlaced; 6 of 6 frames are deinterlaced, each to one picture")
-    assert (report["frames"], report["frames_deinterlaced"], report["combs"]) == (6, 6, True)
-    said, report = captured(path, tmp_path / "never", capsys, "--capture.deinterlace", "never")
-    assert said == ""
-    assert (report["frames_deinterlaced"], report["combs"]) == (0, True)
-
-
-def test_a_wrong_mark_is_told_with_its_remedy(heads, tmp_path, capsys):
-    progressive = tmp_path / "psf.mp4"
-    write(progressive, "h264.mp4", flagged([heads[0][::2].repeat(2, axis=0)] * 4, "yuv420p", ["tff"] * 4))
-    said, report = captured(progressive, tmp_path / "psf", capsys)
-    assert "no combs: if filmed progressively, --capture.deinterlace never keeps more detail" in said
-    assert (report["frames_deinterlaced"], report["combs"]) == (4, False)
-    unmarked = tmp_path / "unmarked.mkv"
-    write(unmarked, "ffv1.mkv", flagged(heads, "yuv420p", ["prog"] * 6))
-    said, report = captured(unmarked, tmp_path / "unmarked", capsys)
-    assert said.startswith("warning:")
-    assert "not marked as interlaced; if moving edges look like combs, add --capture.deinterlace always" in said
-    said, report = captured(unmarked, tmp_path / "always", capsys, "--capture.deinterlace", "always")
-    assert said.endswith("6 of 6 frames are deinterlaced, each to one picture")
+def write_single_fields(path: Path, pictures: list[np.ndarray]) -> None:
+    """Write fields in HEVC, which stores each as a picture of its own, of half the height, which has no combs."""
+    encode(path, pictures, "libx265", rate=50, options={"x265-params": "log-level=none:interlace=tff"})
 
 
 def test_single_fields_of_hevc_are_told(pattern, tmp_path):
-    """HEVC stores each field as a picture of its own, of half the height, which has no combs."""
     path = tmp_path / "hevc.mp4"
-    with av.open(str(path), "w") as container:
-        options = {"x265-params": "log-level=none:interlace=tff"}
-        stream = container.add_stream("libx265", rate=50, options=options)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        for field in range(4):
-            gray = np.repeat(moment(pattern, field)[..., None], 3, axis=2)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(gray), format="rgb24")))
-        container.mux(stream.encode())
+    write_single_fields(path, [np.repeat(moment(pattern, field)[..., None], 3, axis=2) for field in range(4)])
     assert probe_video(path).has_field_pictures
     assert len(list(read_video_frames(path))) == count_frames(path) == 4
     assert not any(frame.is_deinterlaced for frame in read_lazily(path))

@@ -2,16 +2,15 @@
 
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
+from capture_helpers import encode, hdr_signal, light_of
 from mien.capture.camera_names import CameraName
 from mien.capture.colors import Colors
 from mien.capture.live_camera import LiveCamera
 from mien.capture.tone import HLG, PQ
 from mien.capture.video import probe_video, read_video_frames
-from test_capture_pictures import hdr_signal, light_of, to_bt2020
 
 COLOR = np.array([200, 120, 100])
 WEIGHTS = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
@@ -36,7 +35,7 @@ def numbers_of(colors: Colors, bits: int) -> list[int]:
     """Return Y', Cb and Cr of `COLOR` in these colours."""
     signal = COLOR / 255
     if colors.transfer in (PQ, HLG):
-        signal = hdr_signal(to_bt2020(light_of(COLOR[None])), colors.transfer)[0]
+        signal = hdr_signal(light_of(COLOR[None]), colors.transfer)[0]
     red, blue = WEIGHTS[colors.matrix]
     luma = float(signal @ [red, 1 - red - blue, blue])
     chroma = [(signal[2] - luma) / (2 - 2 * blue), (signal[0] - luma) / (2 - 2 * red)]
@@ -50,30 +49,15 @@ def numbers_of(colors: Colors, bits: int) -> list[int]:
 def write_color(path: Path, kind: str, true: Colors, header: Colors, container: Colors, height: int = 96) -> None:
     """Write three frames of `COLOR` in the colours `true`, whose header and container state something else."""
     codec, pixels, options = KINDS[kind]
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream(codec, rate=25, options=options)
-        stream.width, stream.height, stream.pix_fmt = 96, height, pixels
-        context = stream.codec_context
-
-        def state(target: av.VideoFrame | av.VideoCodecContext, colors: Colors) -> None:
-            target.color_trc, target.colorspace, target.color_range = colors
-            target.color_primaries = PRIMARIES[colors.matrix]
-
-        state(context, header)
-        wide = pixels.endswith("10le")
-        packets = []
-        for tick in range(3):
-            frame = av.VideoFrame(96, height, pixels)
-            state(frame, header)
-            frame.pts = tick
-            for plane, value in zip(frame.planes, numbers_of(true, 10 if wide else 8), strict=True):
-                values = np.full(plane.buffer_size // (2 if wide else 1), value, np.uint16 if wide else np.uint8)
-                plane.update(values.tobytes())
-            packets += stream.encode(frame)
-        packets += stream.encode()
-        # The muxer takes the tags of this moment, which the encoder no longer reads.
-        state(context, container)
-        file.mux(packets)
+    wide = pixels.endswith("10le")
+    numbers = numbers_of(true, 10 if wide else 8)
+    halves = (height // 2 if "420" in pixels else height, 48)
+    sizes = [(height, 96), halves, halves]
+    planes = [np.full(size, value, np.uint16 if wide else np.uint8) for size, value in zip(sizes, numbers, strict=True)]
+    stated = [
+        (colors.matrix, PRIMARIES[colors.matrix], colors.transfer, colors.range) for colors in (header, container)
+    ]
+    encode(path, [planes] * 3, codec, pixels, options=options, colors=stated[0], tags=stated[1])
 
 
 def error_of(path: Path) -> float:
@@ -82,11 +66,19 @@ def error_of(path: Path) -> float:
     return float(np.abs(picture.reshape(-1, 3).mean(axis=0) - COLOR).max())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+TAGS = {
+    "HLG": ((HLG, 9), 96), "PQ": ((PQ, 9), 96), "709 of 96 lines": ((1, 1), 96), "PAL of 720 lines": ((6, 5), 720),
+    "NTSC of 720 lines": ((6, 6), 720),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("tags", "height"),
-    [((HLG, 9), 96), ((PQ, 9), 96), ((1, 1), 96), ((6, 5), 720), ((6, 6), 720)],
-    ids=["HLG", "PQ", "709 of 96 lines", "601 (PAL) of 720 lines", "601 (NTSC) of 720 lines"],
+    ("kind", "tags", "height"),
+    [
+        (kind, *TAGS[name])
+        for kind in KINDS
+        for name in (TAGS if kind in ("prores.mov", "hevc.mp4", "vp9.webm") else ("HLG", "PAL of 720 lines"))
+    ],
 )
 def test_tags_of_the_container_count_where_the_header_is_silent(kind, tags, height, tmp_path):
     true = Colors(tags[0], tags[1], LIMITED)
@@ -116,8 +108,9 @@ def test_the_header_counts_before_the_container(kind, tmp_path):
         assert probe_video(tmp_path / kind).hdr == ""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("height", "matrix"), [(96, 6), (720, 1)])
+@pytest.mark.parametrize(
+    ("kind", "height", "matrix"), [*((kind, 96, 6) for kind in KINDS), ("prores.mov", 720, 1), ("vp9.webm", 720, 1)]
+)
 def test_without_any_tags_the_height_decides(kind, height, matrix, tmp_path):
     write_color(tmp_path / kind, kind, Colors(1, matrix, LIMITED), SILENT, SILENT, height)
     assert probe_video(tmp_path / kind).hdr == ""
@@ -149,6 +142,6 @@ def test_a_file_that_plays_as_a_camera_has_the_same_colors(tmp_path):
     write_color(path, "prores.mov", true, SILENT, true)
     with LiveCamera(CameraName(str(path), "v4l2"), again=False) as camera:
         camera.start()
-        frame = camera.newest(-1, 5.0)
+        frame = camera.newest(-1, 120.0)
     assert frame is not None
     assert np.abs(frame.picture.reshape(-1, 3).mean(axis=0) - COLOR).max() <= 4

@@ -1,0 +1,271 @@
+"""Odd videos by what `mien capture` says of them, what its report holds, and what is in the capture.
+
+A new kind of footage is a function that writes a small video, and a row of `ODD`. Videos that are refused are rows of
+`test_capture_from_video::test_nobody_there_is_said_and_why` and `test_bad_requests_are_refused` there.
+"""
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from capture_helpers import BT709, BT2020, encode, face_picture, hdr_signal, light_of, to_planes, write_planes
+from mien.capture import Capture, read_capture
+from mien.capture.tone import HLG, srgb_signal
+from mien.capture.video import write_video
+from mien.cli import main
+from test_capture_quality import streak
+from test_interlaced import flagged, write, write_single_fields
+
+pytestmark = pytest.mark.unchecked
+Face = Callable[..., np.ndarray]
+"""`face_picture` of the test data: takes a side and a margin in pixels."""
+
+
+@dataclass(frozen=True)
+class Odd:
+    """A video and what is right for it."""
+
+    write: Callable[[Path, Face], Path]
+    """Writes the video into a folder and returns its path."""
+    said: tuple[str, ...] = ()
+    """Patterns of all lines besides the usual ones, in order."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """Entries of report.json."""
+    options: tuple[str, ...] = ()
+    check: Callable[[Capture], object] = lambda capture: None
+    """Asserts what is in the capture."""
+
+
+# Light ----------------------------------------------------------------------------------------------------------------
+
+
+def wide(face: Face) -> np.ndarray:
+    return np.pad(face(160), ((20, 20), (40, 40), (0, 0)), mode="edge")
+
+
+def filmed(
+    folder: Path, face: Face, change: Callable[[np.ndarray], Sequence[np.ndarray]] = lambda picture: [picture] * 4
+) -> Path:
+    write_video(folder / "clip.mp4", iter(change(wide(face))), 25.0, crf=10)
+    return folder / "clip.mp4"
+
+
+def brighter(gain: float, picture: np.ndarray) -> list[np.ndarray]:
+    return [np.clip(picture.astype(np.float32) * gain, 0, 255).astype(np.uint8)] * 4
+
+
+def in_light(color: Sequence[float], picture: np.ndarray) -> list[np.ndarray]:
+    """Return pictures in light of this colour, linear."""
+    light = np.clip(light_of(picture.astype(np.float64)) * np.array(color), 0, 1)
+    return [np.rint(255 * srgb_signal(light)).astype(np.uint8)] * 4
+
+
+def shaken(picture: np.ndarray) -> list[np.ndarray]:
+    return [picture] * 6 + [streak(picture, 0.07 * 0.46 * 160, 0.0)] * 2 + [picture] * 4
+
+
+def expect_unusable(capture: Capture) -> None:
+    assert capture.valid.all()
+    assert np.flatnonzero(~capture.usable[:, 0]).tolist() == [6, 7]
+
+
+AGAIN = "warning: clip: the face is {}.*record the video again"
+CAST = "warning: clip: the skin is {0} \\(red .*white balance"
+PLAIN = {"dark": False, "overexposed": False, "color_cast": None, "frames_blurred": 0, "combs": False}
+
+# Fields ---------------------------------------------------------------------------------------------------------------
+
+
+def woven_heads(face: Face) -> list[np.ndarray]:
+    """Return frames of a head that moves by five pixels from field to field."""
+    fields = []
+    for index in range(12):
+        picture = np.full((240, 320, 3), 190, np.uint8)
+        picture[20:220, 20 + 5 * index : 220 + 5 * index] = face(200)
+        fields.append(picture)
+    frames = [picture.copy() for picture in fields[::2]]
+    for frame, second in zip(frames, fields[1::2], strict=True):
+        frame[1::2] = second[1::2]
+    return frames
+
+
+def interlaced(folder: Path, face: Face) -> Path:
+    write(folder / "clip.mp4", "h264.mp4", flagged(woven_heads(face), "yuv420p", ["tff"] * 6))
+    return folder / "clip.mp4"
+
+
+def unmarked(folder: Path, face: Face) -> Path:
+    write(folder / "clip.mkv", "ffv1.mkv", flagged(woven_heads(face), "yuv420p", ["prog"] * 6))
+    return folder / "clip.mkv"
+
+
+def segmented(folder: Path, face: Face) -> Path:
+    """Write a progressive video that is marked as interlaced (PsF)."""
+    frames = [woven_heads(face)[0][::2].repeat(2, axis=0)] * 4
+    write(folder / "clip.mp4", "h264.mp4", flagged(frames, "yuv420p", ["tff"] * 4))
+    return folder / "clip.mp4"
+
+
+def fields_of_hevc(folder: Path, face: Face) -> Path:
+    write_single_fields(folder / "clip.mp4", [wide(face)] * 4)
+    return folder / "clip.mp4"
+
+
+PROGRESSIVE = "no combs: if filmed progressively, --capture.deinterlace never keeps more detail"
+UNMARKED = "warning:.*not marked as interlaced; if moving edges look like combs, add --capture.deinterlace always"
+DEINTERLACED = "clip.m..: interlaced; 6 of 6 frames are deinterlaced, each to one picture$"
+WHOLE = ("--capture.crop", "none")
+NEVER, ALWAYS = ((*WHOLE, "--capture.deinterlace", mode) for mode in ("never", "always"))
+
+# Times, sizes and turns -----------------------------------------------------------------------------------------------
+
+TICKS = [0, 33, 66, 166, 200, 233]
+
+
+def variable(folder: Path, face: Face) -> Path:
+    planes = to_planes(face(160) / 255, BT709, 8)
+    write_planes(folder / "clip.mkv", [planes] * len(TICKS), "yuv444p", ticks=TICKS)
+    return folder / "clip.mkv"
+
+
+def expect_times(capture: Capture) -> None:
+    np.testing.assert_allclose(capture.timestamps, np.array(TICKS) / 1000, atol=1e-6)
+    assert capture.fps == pytest.approx(4 / 0.133), "the rate of the usual frames"
+
+
+def odd_size(folder: Path, face: Face) -> Path:
+    picture = np.full((121, 163, 3), 190, np.uint8)
+    picture[:, 21:142] = cv2.resize(face(160), (121, 121), interpolation=cv2.INTER_AREA)
+    write_planes(folder / "clip.mkv", [to_planes(picture / 255, BT709, 8)] * 3, "yuv444p")
+    return folder / "clip.mkv"
+
+
+def expect_size(height: int, width: int, capture: Capture) -> None:
+    assert capture.images.shape == (3, 1, height, width, 3)
+    assert capture.valid.all()
+
+
+def large(folder: Path, face: Face) -> Path:
+    """Write pictures of 4K with a head aside."""
+    picture = np.full((2160, 3840, 3), 190, np.uint8)
+    picture[500:1700, 1900:3100] = cv2.resize(face(400), (1200, 1200))
+    write_video(folder / "clip.mp4", [picture] * 2, 25.0, preset="ultrafast")
+    return folder / "clip.mp4"
+
+
+def expect_the_head(capture: Capture) -> None:
+    assert capture.valid.all()
+    assert capture.images.shape[2:4] == (256, 256)
+    crop = capture.source["crop"]
+    nose = capture.landmarks[0, 0, 1] * crop["width"] / 256 + [crop["left"], crop["top"]]
+    np.testing.assert_allclose(nose, [2500, 500 + 0.42 * 1200], atol=45)
+
+
+MOMENTS = [0, 20, 40, 50, 90, 110, 130, 150]
+
+
+def upright(face: Face) -> np.ndarray:
+    return np.pad(face(160), ((70, 90), (10, 10), (0, 0)), mode="edge")
+
+
+def of_a_telephone(folder: Path, face: Face) -> Path:
+    """Write HEVC with ten bits, HLG, a rotation flag and a variable rate, in a .mov."""
+    stored = np.ascontiguousarray(np.rot90(upright(face), 3))
+    luma, *chroma = to_planes(hdr_signal(light_of(stored), HLG), BT2020, 10)
+    small = [cv2.resize(plane, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for plane in chroma]
+
+    def prepare(stream: av.VideoStream) -> None:
+        stream.codec_tag = "hvc1"
+        stream.set_display_rotation(90)
+
+    options = {"x265-params": "log-level=none:crf=10"}
+    encode(
+        folder / "clip.mov", [[luma, *small]] * 8, "libx265", "yuv420p10le", rate=600, options=options,
+        colors=(9, 9, HLG, 1), ticks=MOMENTS, prepare=prepare,
+    )  # fmt: skip
+    return folder / "clip.mov"
+
+
+def expect_a_telephone(capture: Capture, face: Face) -> None:
+    picture = upright(face)
+    assert capture.images.shape == (8, 1, *picture.shape)
+    assert capture.valid.all()
+    np.testing.assert_allclose(capture.timestamps, np.array(MOMENTS) / 600, atol=1e-4)
+    # Highlights are compressed; darker colours are restored.
+    ordinary = picture.max(axis=-1) < 200
+    assert np.abs(capture.images[4, 0].astype(int) - picture)[ordinary].mean() < 3
+
+
+ODD = {
+    "plain": Odd(filmed, report=PLAIN),
+    "dark": Odd(partial(filmed, change=partial(brighter, 0.2)), (AGAIN.format("dark"),), {**PLAIN, "dark": True}),
+    "over-exposed": Odd(
+        partial(filmed, change=partial(brighter, 1.4)), (AGAIN.format("over-exposed"),), {**PLAIN, "overexposed": True}
+    ),
+    "green light": Odd(
+        partial(filmed, change=partial(in_light, (0.3, 1.0, 0.4))), (CAST.format("green"),), {"color_cast": "green"}
+    ),
+    "blue light": Odd(
+        partial(filmed, change=partial(in_light, (0.15, 0.4, 1.5))), (CAST.format("blue"),), {"color_cast": "blue"}
+    ),
+    "blurred": Odd(
+        partial(filmed, change=shaken), ("the face is blurred in 2 of 12 frames",), {"blurred_frames": [6, 7]},
+        check=expect_unusable,
+    ),
+    "interlaced": Odd(interlaced, (DEINTERLACED,), {"frames_deinterlaced": 6, "combs": True}, WHOLE),
+    "interlaced, kept": Odd(interlaced, (), {"frames_deinterlaced": 0, "combs": True}, NEVER),
+    "marked as interlaced": Odd(segmented, (PROGRESSIVE,), {"frames_deinterlaced": 4, "combs": False}, WHOLE),
+    "not marked as interlaced": Odd(unmarked, (UNMARKED,), {"frames_deinterlaced": 0}, WHOLE),
+    "not marked, but told": Odd(unmarked, (DEINTERLACED,), {"frames_deinterlaced": 6}, ALWAYS),
+    "fields of HEVC": Odd(fields_of_hevc, ("warning:.*each picture is a single field",), {}, WHOLE),
+    "variable rate": Odd(variable, (r"33 to 100 ms apart \(variable rate\)",), check=expect_times),
+    "odd size": Odd(odd_size, options=WHOLE, check=partial(expect_size, 121, 163)),
+    "odd size, smaller": Odd(odd_size, (), {}, (*WHOLE, "--capture.size", "77"), partial(expect_size, 57, 77)),
+    "4K": Odd(large, (), {}, ("--capture.size", "256"), expect_the_head),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_what_is_said_of_odd_footage(
+    kind: str, test_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd = ODD[kind]
+    capture, remarks, report = captured(odd.write(tmp_path, partial(face_picture, test_data)), capsys, odd.options)
+    assert len(remarks) == len(odd.said), remarks
+    for remark, pattern in zip(remarks, odd.said, strict=True):
+        assert re.search(pattern, remark), remark
+    assert {name: report[name] for name in odd.report} == odd.report
+    hints = [remark.removeprefix("warning: clip: ") for remark in remarks if remark.startswith("warning: clip: ")]
+    assert report["hints"] == hints
+    odd.check(capture)
+
+
+def test_a_clip_of_a_telephone_is_captured(test_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    face = partial(face_picture, test_data)
+    capture, remarks, report = captured(of_a_telephone(tmp_path, face), capsys, WHOLE)
+    assert report["hdr"] == "HLG"
+    assert "HDR video (HLG); its pictures are tone-mapped" in remarks[0]
+    assert "(variable rate); all are kept, each with its own time" in remarks[1]
+    assert not any(remark.startswith("warning:") for remark in remarks)
+    expect_a_telephone(capture, face)
+
+
+def captured(
+    path: Path, capsys: pytest.CaptureFixture[str], options: Sequence[str]
+) -> tuple[Capture, list[str], dict[str, Any]]:
+    """Return the capture of a video, what the command says besides its usual lines, and the report."""
+    out = path.parent / "out"
+    assert main(["capture", str(path), "--out", str(out), "--capture.no-cuts", *options]) == 0
+    usual = r"find the face in |capture clip: |clip: \d+ frames of .* (take about|a face in) "
+    remarks = [line for line in capsys.readouterr().err.splitlines() if line and not re.match(usual, line)]
+    folder = out / "sequences/clip/capture"
+    return read_capture(folder), remarks, json.loads((folder / "report.json").read_text())
