@@ -124,11 +124,12 @@ fuzz-native: setup
 	$(BIN)/ninja --quiet -C $(SANITIZED)
 	$(BIN)/python tests/fuzzing/native_calls.py $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
 
-# Mutated files of every format and odd command lines, for MINUTES, messages to a viewer, native calls; findings go to out/fuzz/findings.jsonl.
+# Faults in files of every format and odd command lines, for MINUTES, messages to a viewer, native calls; findings go to out/fuzz/findings.jsonl.
 MINUTES ?= 10
 fuzz: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
-	  --lines 300 --heavy 10 --viewer 200 --findings out/fuzz/findings.jsonl
+	  --findings out/fuzz/findings.jsonl
+	PYTHONPATH=tests $(BIN)/python -m fuzzing.viewer_messages --count 200 --seed $(SEED)
 	$(MAKE) fuzz-native
 
 # FAULTS faults in each layout that `mien import` reads, layouts side by side, without the tests' checks of types at run time, as
@@ -136,7 +137,7 @@ fuzz: setup
 FAULTS ?= 2000
 fuzz-datasets: setup
 	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_DATASET_FUZZ_COUNTS=$(abspath out/fuzz/datasets.jsonl) MIEN_THREADS=1 \
-	  $(BIN)/pytest -q -o addopts= -n auto --dist load --timeout 0 tests/test_datasets_fuzz.py
+	  $(BIN)/pytest -q -o addopts= -n auto --dist load --timeout 0 tests/test_datasets_fuzz.py -m 'not long'
 
 # Commands that are killed at random moments and run again, until there are KILLS kills; findings go to out/fuzz/kills.jsonl.
 KILLS ?= 200

@@ -1,7 +1,4 @@
-"""A stranger's workspace is refused if its files hold what cannot be.
-
-Every file here has the right checksum, or none, since whoever makes a file can make its checksum.
-"""
+"""A stranger's workspace is refused if its files do not fit together; single values are in `fuzzing.values`."""
 
 import json
 import shutil
@@ -10,31 +7,32 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from capture_helpers import write_gradient_video
-from damage import edit_json, nested
+from damage import edit_json
+from fuzzing.material import new_avatar
+from mien.avatar import METHODS, load_avatar, write_avatar
 from mien.capture import read_capture
 from mien.cli import main
 from mien.errors import UserError
-from mien.evaluation import EvaluationSettings, compare_runs, evaluate
-from mien.evaluation.load import load_experiments
-from mien.storage import file_digest, read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
+from mien.evaluation import EvaluationSettings, evaluate
+from mien.face.loading import read_landmarks
+from mien.storage import file_digest, read_arrays, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import TrackingSettings, pipeline, read_scoring, read_tracking, track_subject
-from mien.training import read_curves, read_run_config, read_sequence, read_training_summary, run_camera
+from mien.training import read_sequence
+from shared_things import MadeOnce, evaluated_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_evaluated_workspace
 
 NOT_ONE_LINE = "a\nb"
 HUGE = 10**400
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_evaluated_workspace(tmp_path_factory.mktemp("made") / "w")
+@pytest.fixture
+def made(made_once: MadeOnce) -> Path:
+    return evaluated_workspace(made_once)
 
 
 @pytest.fixture
@@ -46,7 +44,7 @@ def test_partial_figures_of_other_kinds_are_dropped(workspace: Path) -> None:
     """Partial figures with impossible content are dropped, although their first line is right."""
     run, clip = workspace / "runs/toy", workspace / "sequences/clip"
     settings = EvaluationSettings(perceptual=False, video_frames=0)
-    fingerprint = next(iter(read_json_content(run / "metrics.json")["fingerprints"].values()))
+    fingerprint = next(iter(json.loads((run / "metrics.json").read_text())["fingerprints"].values()))
     for line in (
         '{"frame": [0, 4, 0], "scores": {}, "seconds": 1}',
         '{"frame": [0, 4, 0], "scores": {"avatar": {"psnr": "high"}}, "seconds": 1}',
@@ -56,51 +54,6 @@ def test_partial_figures_of_other_kinds_are_dropped(workspace: Path) -> None:
     ):
         (run / ".self_reenactment_tail.partial").write_text(f'{{"scores_of": "{fingerprint}"}}\n{line}\n')
         assert evaluate(run, [clip], settings)["protocols"]["self_reenactment_tail"]["psnr"] > 0
-
-
-def read_json_content(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text())
-
-
-CAPTURES: dict[str, Callable[[dict[str, Any]], object]] = {
-    "timesteps": lambda c: c.update(timesteps=10**9),
-    "timesteps huge": lambda c: c.update(timesteps=HUGE),
-    "timesteps text": lambda c: c.update(timesteps="5"),
-    "width": lambda c: c.update(width=10**9),
-    "width huge": lambda c: c.update(width=HUGE),
-    "size": lambda c: c.update(width=30000, height=30000),
-    "fps": lambda c: c.update(fps=HUGE),
-    "fps small": lambda c: c.update(fps=1e-300),
-    "camera twice": lambda c: c.update(camera_ids=["front", "front"]),
-    "name": lambda c: c.update(name=NOT_ONE_LINE),
-    "source": lambda c: c.update(source=[]),
-    "deep": lambda c: c.update(source={"a": nested(900)}),
-}
-
-
-@pytest.mark.parametrize("name", CAPTURES)
-def test_captures_that_cannot_be(name: str, workspace: Path) -> None:
-    """Impossible captures are refused by their file."""
-    folder = workspace / "sequences/clip/capture"
-    edit_json(folder / "capture.json", CAPTURES[name])
-    with pytest.raises(UserError, match=r"capture\.json|timestamps is"):
-        read_capture(folder)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("landmarks", np.nan), ("landmarks", np.inf), ("landmarks", 3e38), ("timestamps", np.nan), ("timestamps", 1e300),
-     ("principal_point", np.inf)],
-)  # fmt: skip
-def test_capture_numbers_that_cannot_be(name: str, value: float, workspace: Path) -> None:
-    """Impossible numbers of a capture are refused by name."""
-    folder = workspace / "sequences/clip/capture"
-    arrays = read_arrays(folder / "landmarks.safetensors")
-    arrays[name] = np.array(arrays[name])
-    arrays[name].flat[-1] = value
-    write_arrays(folder / "landmarks.safetensors", arrays)
-    with pytest.raises(UserError, match=f"{name} holds impossible numbers"):
-        read_capture(folder)
 
 
 def test_a_picture_larger_than_it_should_be_is_not_decoded(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,54 +83,6 @@ def rewrite_tracking(folder: Path, change: Callable[[dict[str, Tensor]], object]
     edit_json(folder / "tracking.json", lambda content: content.update(tensors_sha256=digest))
 
 
-TRACKINGS: dict[str, Callable[[Path], object]] = {
-    "camera 3e38": lambda f: rewrite_tracking(f, lambda t: t["camera_K"].fill_(3e38)),
-    "viewmat": lambda f: rewrite_tracking(f, lambda t: t["camera_viewmats"].mul_(2)),
-    "focal": lambda f: rewrite_tracking(f, lambda t: t["camera_K"].neg_()),
-    "huge": lambda f: rewrite_tracking(f, lambda t: t["head_translation"].fill_(3e38)),
-    "dtype": lambda f: rewrite_tracking(f, lambda t: t.update(expression=t["expression"].half())),
-    "whole": lambda f: rewrite_tracking(f, lambda t: t.update(neck_lines=t["neck_lines"].long())),
-    "float8": lambda f: rewrite_tracking(f, lambda t: t.update(joints=t["joints"].to(torch.float8_e4m3fn))),
-    "width": lambda f: edit_json(f / "tracking.json", lambda c: c["cameras"][0].update(width=10**9)),
-    "width huge": lambda f: edit_json(f / "tracking.json", lambda c: c["cameras"][0].update(width=HUGE)),
-    "cameras": lambda f: edit_json(f / "tracking.json", lambda c: c.update(cameras={})),
-    "face model": lambda f: edit_json(f / "tracking.json", lambda c: c.update(face_model=["anny"])),
-    "settings": lambda f: edit_json(f / "tracking.json", lambda c: c.update(settings=[1])),
-    "together": lambda f: edit_json(f / "tracking.json", lambda c: c["settings"].update(tracked_together=3)),
-    "looks": lambda f: edit_json(f / "tracking.json", lambda c: c.update(looks=[])),
-}
-
-
-@pytest.mark.parametrize("name", TRACKINGS)
-def test_trackings_that_cannot_be(name: str, workspace: Path) -> None:
-    """Impossible trackings are refused in one line."""
-    TRACKINGS[name](workspace / "sequences/clip/tracking")
-    with pytest.raises(UserError, match="tracking") as error:
-        read_tracking(workspace / "sequences/clip/tracking")
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"timesteps": 10**9}, {"timesteps": HUGE}, {"cameras": "1"}, {"width": HUGE}, {"height": 10**6}, {"width": None}],
-)
-def test_scorings_that_cannot_be(change: dict[str, Any], workspace: Path) -> None:
-    """Impossible scorings are refused."""
-    folder = workspace / "sequences/clip/scoring"
-    edit_json(folder / "scoring.json", lambda content: content.update(change))
-    with pytest.raises(UserError, match="scoring"):
-        read_scoring(folder)
-
-
-@pytest.mark.parametrize("crop", [[-1, 0, 8, 8], [0, 0, 33, 8], [2**31 - 1, 0, 2**31 - 1, 1]])
-def test_crops_out_of_the_picture(crop: list[int], workspace: Path) -> None:
-    """Crops that reach out of the picture are refused."""
-    folder = workspace / "sequences/clip/scoring"
-    write_arrays(folder / "crops.safetensors", {"crops": np.tile(np.array(crop, np.int32), (5, 1, 1))})
-    with pytest.raises(UserError, match="extends beyond the picture"):
-        read_scoring(folder)
-
-
 def test_parts_of_a_sequence_have_to_be_of_the_same_pictures(workspace: Path) -> None:
     clip = workspace / "sequences/clip"
 
@@ -189,97 +94,6 @@ def test_parts_of_a_sequence_have_to_be_of_the_same_pictures(workspace: Path) ->
     read_tracking(clip / "tracking")
     with pytest.raises(UserError, match="other pictures than the capture"):
         read_sequence(clip)
-
-
-RUNS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
-    "camera": (lambda r: edit_config(r, lambda c: c["data"][0]["camera"].update(width=10**9)), run_camera),
-    "camera 3e38": (lambda r: edit_config(r, lambda c: c["data"][0]["camera"].update(K=[[3e38] * 3] * 3)), run_camera),
-    "no data": (lambda r: edit_config(r, lambda c: c.update(data=[])), read_run_config),
-    "settings": (lambda r: edit_config(r, lambda c: c.update(settings=[{"split": 1}])), read_run_config),
-    "method": (lambda r: edit_config(r, lambda c: c.update(method={"kind": 3})), read_run_config),
-    "command line": (lambda r: edit_config(r, lambda c: c.update(command_line=[1])), read_run_config),
-    "steps": (lambda r: edit_json(r / "training.json", lambda c: c.update(steps="many")), read_training_summary),
-    "seconds": (lambda r: edit_json(r / "training.json", lambda c: c.update(seconds=HUGE)), read_training_summary),
-    "curves": (lambda r: write_tensors(r / "curves.safetensors", {"loss": torch.zeros(2, 2)}), read_curves),
-    "no curves": (lambda r: write_tensors(r / "curves.safetensors", {}), read_curves),
-    "faces": (
-        lambda r: change_tensors(r / "face_track.safetensors", lambda t: t["expression"].fill_(torch.nan)),
-        lambda r: load_experiments(r, [r.parent.parent / "sequences/clip"]),
-    ),
-    "faces of another model": (
-        lambda r: change_tensors(r / "face_track.safetensors", lambda t: t.update(expression=torch.zeros(5, 9))),
-        lambda r: load_experiments(r, [r.parent.parent / "sequences/clip"]),
-    ),
-}
-
-
-def edit_config(run: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    edit_json(run / "config.json", change)
-
-
-def change_tensors(path: Path, change: Callable[[dict[str, Tensor]], object]) -> None:
-    tensors = read_tensors(path)
-    change(tensors)
-    write_tensors(path, tensors)
-
-
-@pytest.mark.parametrize("name", RUNS)
-def test_runs_that_cannot_be(name: str, workspace: Path) -> None:
-    """Impossible runs are refused in one line."""
-    change, read = RUNS[name]
-    change(workspace / "runs/toy")
-    with pytest.raises(UserError) as error:
-        read(workspace / "runs/toy")
-    assert "\n" not in str(error.value)
-
-
-def of_protocol(change: Callable[[dict[str, Any]], object]) -> Callable[[dict[str, Any]], object]:
-    return lambda content: change(content["protocols"]["self_reenactment_tail"])
-
-
-METRICS: dict[str, Callable[[dict[str, Any]], object]] = {
-    "protocols": lambda c: c.update(protocols=[]),
-    "a protocol": lambda c: c.update(protocols={"self_reenactment_tail": 3}),
-    "name": lambda c: c["protocols"].update({NOT_ONE_LINE: c["protocols"]["self_reenactment_tail"]}),
-    "other protocol": lambda c: c.update(protocols={"novel": c["protocols"]["self_reenactment_tail"]}),
-    "text": of_protocol(lambda e: e.update(psnr="high")),
-    "none": of_protocol(lambda e: e.update(psnr=None)),
-    "huge": of_protocol(lambda e: e.update(psnr=HUGE)),
-    "list": of_protocol(lambda e: e.update(ssim=[1])),
-    "head": of_protocol(lambda e: e.update(head=None)),
-    "no head": of_protocol(lambda e: e.pop("head")),
-    "eyes": of_protocol(lambda e: e.update(eyes={"psnr": "high"})),
-    "faces": of_protocol(lambda e: e.update(face_params="guessed")),
-    "frames": of_protocol(lambda e: e.update(frames="1")),
-    "split": of_protocol(lambda e: e.update(split={})),
-    "baselines": of_protocol(lambda e: e.update(baselines=[1])),
-    "a baseline": of_protocol(lambda e: e["baselines"].update(mesh={"psnr": 1.0})),
-    "another baseline": of_protocol(lambda e: e["baselines"].update(other=e["baselines"]["mesh"])),
-    "scored on": of_protocol(lambda e: e.update(scored_on=["clip"])),
-    "frames differ": of_protocol(lambda e: e["per_frame"].update(timestep=[])),
-    "per frame": of_protocol(lambda e: e.pop("per_frame")),
-    "a frame's figure": of_protocol(lambda e: e["per_frame"].update(head_psnr=["x"])),
-    "backbone": of_protocol(lambda e: e.update(perceptual_backbone=[1])),
-    "seconds": of_protocol(lambda e: e.update(seconds_per_frame=None)),
-    "training": lambda c: c.update(training={"gaussians": "many", "seconds": 1}),
-    "no training": lambda c: c.pop("training"),
-}
-
-
-@pytest.mark.parametrize("name", METRICS)
-def test_edited_metrics_are_told_in_a_comparison(
-    name: str, workspace: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    edit_json(workspace / "runs/toy/metrics.json", METRICS[name])
-    assert main(["evaluate", str(workspace), "--compare"]) == 2
-    told = capsys.readouterr().err.strip()
-    assert "metrics.json" in told
-    assert len([line for line in told.splitlines() if "metrics.json" in line]) == 1
-    assert "Traceback" not in told
-
-
-def test_metrics_as_they_were_written_are_compared(workspace: Path) -> None:
-    assert len(compare_runs({"toy": workspace / "runs/toy"}).tables) == 1
 
 
 @pytest.mark.parametrize(
@@ -349,12 +163,30 @@ def test_kept_pieces_of_a_tracking_that_are_of_no_use(
             raise KeyError("rows")
         return []
 
-    monkeypatch.setattr(pipeline, "_track_subject", fit)
+    monkeypatch.setattr(pipeline, "track_once", fit)
     capture = read_capture(workspace / "sequences" / "clip" / "capture")
     arguments: Any = ([capture], toy_face_model(), TrackingSettings(), keep, None)
     assert track_subject(*arguments) == []
     assert seen == [True, False]
     assert "starts again" in capsys.readouterr().err
-    monkeypatch.setattr(pipeline, "_track_subject", lambda *_: {}["a bug of ours"])
+    monkeypatch.setattr(pipeline, "track_once", lambda *_: {}["a bug of ours"])
     with pytest.raises(KeyError):
         track_subject(*arguments)
+
+
+@pytest.mark.parametrize("method", [name for name, one in METHODS.items() if hasattr(one.config, "points")])
+def test_what_counts_only_at_the_beginning_takes_no_memory(method: str, tmp_path: Path) -> None:
+    """Settings that only matter at the start take no memory. The avatar has the points of its tensors."""
+    write_avatar(tmp_path / "avatar", new_avatar(method))
+    expected = load_avatar(tmp_path)
+    edit_json(tmp_path / "avatar/avatar.json", lambda content: content["config"].update(points=1_000_000))
+    found = load_avatar(tmp_path)
+    assert found.config.points == 1_000_000  # pyright: ignore[reportAttributeAccessIssue]
+    posed = [avatar.pose(avatar.subject).gaussians.means for avatar in (found, expected)]
+    assert torch.equal(*posed)
+
+
+@pytest.mark.parametrize("name", ["../x", "/etc/x", "a\0b", ""])
+def test_landmarks_of_a_name_that_leads_elsewhere(name: str) -> None:
+    with pytest.raises(UserError, match="cannot be the name of a face model"):
+        read_landmarks(name, toy_face_model())

@@ -150,7 +150,7 @@ def test_a_strangers_lock_file_does_no_harm(kind: str, tmp_path: Path) -> None:
     ],
 )
 def test_what_a_holder_says_is_not_trusted(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locks, "_PATIENCE_SECONDS", 0.05)
+    monkeypatch.setattr(locks, "PATIENCE_SECONDS", 0.05)
     file = lock_file(tmp_path / "r")
     file.write_text(text, encoding="utf-8")
     with file.open() as handle:
@@ -171,7 +171,7 @@ def test_the_name_of_a_dead_process_is_not_told(
 
     A new holder that has not signed yet leaves the old name for a moment.
     """
-    monkeypatch.setattr(locks, "_PATIENCE_SECONDS", 0.05)
+    monkeypatch.setattr(locks, "PATIENCE_SECONDS", 0.05)
     with mortal.holding(tmp_path / "r"):
         mortal.kill()
     with lock_file(tmp_path / "r").open() as handle:
@@ -188,7 +188,7 @@ def test_a_file_system_without_locks_is_warned_of_once(
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", refused)
-    monkeypatch.setattr(locks, "_once", set())
+    monkeypatch.setattr(locks, "said_once", set())
     for _ in range(2):
         with hold(tmp_path / "r"):
             assert holder_of(tmp_path / "r") is None

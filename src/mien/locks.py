@@ -50,7 +50,7 @@ _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOS
 _REMOVED = frozenset({errno.ENOENT, errno.ESTALE})
 """Errors if the process that released the lock has removed the file and the folders that stayed empty (ESTALE: on
 another machine)."""
-_PATIENCE_SECONDS, _STEP_SECONDS = 0.5, 0.01
+PATIENCE_SECONDS, _STEP_SECONDS = 0.5, 0.01
 """Seconds to try again for a lock without a readable holder, and between two tries.
 
 The holder may be a reader that checks the lock for a
@@ -67,7 +67,7 @@ _MAX_SHOWN = {"host": 60, "since": 30, "command": 200}
 
 _ours: dict[tuple[int, int], int] = {}
 """Device and number of each lock file that is held -> the process that holds it. A child made by fork has a copy."""
-_once: set[str] = set()
+said_once: set[str] = set()
 """Messages that are shown only once per process."""
 
 
@@ -166,7 +166,7 @@ def _hold_one(place: Path, remedy: str) -> Iterator[None]:
 
 def _acquire(place: Path, file: Path, remedy: str) -> Callable[[], None]:
     """Lock the file, and return what removes and unlocks it. That does nothing if the file system has no locks."""
-    patience = time.monotonic() + _PATIENCE_SECONDS
+    patience = time.monotonic() + PATIENCE_SECONDS
     while True:
         try:
             return _lock(file)
@@ -257,7 +257,7 @@ def _holder(file: Path, *, ours: bool = True) -> str | None:
 
 
 def _wait_for_name(handle: int) -> str:
-    for _ in range(round(_PATIENCE_SECONDS / 2 / _STEP_SECONDS)):
+    for _ in range(round(PATIENCE_SECONDS / 2 / _STEP_SECONDS)):
         holder = read_holder(handle)
         if holder is not None:
             return holder
@@ -284,8 +284,8 @@ def _state(folder: Path) -> object:
 
 
 def _warn_of_no_locks(file: Path) -> None:
-    if "warned" not in _once:
-        _once.add("warned")
+    if "warned" not in said_once:
+        said_once.add("warned")
         say(f"warning: {file.parent}: its file system has no locks; run only one command at a time there")
 
 

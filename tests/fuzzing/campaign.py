@@ -1,54 +1,46 @@
-"""Run cases over all targets in several workers, and collect the findings by cause in a table."""
+"""Run cases over all targets in processes of their own, and collect the findings by cause in a table.
 
-import contextlib
+A process runs many cases in a row, until one ends it. A finding is then tried again alone.
+"""
+
+import faulthandler
 import json
 import os
 import select
+import signal
+import socket
 import sys
+import tempfile
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from fuzzing.judge import Result
-from fuzzing.material import make_material
-from fuzzing.run_lines import HEAVY, LIGHT, LINES, run_lines
-from fuzzing.self_check import failures
-from fuzzing.targets import TARGETS, present, spread
-from fuzzing.workers import run_cases
+import numpy as np
 
-VIEWER = "messages to a viewer"
-"""Name of the format of messages."""
+from fuzzing.edges import SCRIPT
+from fuzzing.faults import Place
+from fuzzing.judge import Bench, Result, limit_this_process, run_case, snapshot
+from fuzzing.targets import TARGETS, Target, present, spread
+from mien import terminal
+from mien.errors import UserError
 
-
-@dataclass(frozen=True)
-class Plan:
-    """Options of a campaign."""
-
-    seed: int
-    cases: int
-    only: list[str] | None = None
-    workers: int = 1
-    until: float | None = None
-    """Time of `time.monotonic` after which no further seed starts; None for one seed."""
-    lines: int = 0
-    """Number of command lines to run as well."""
-    heavy: int = 0
-    """Number of command lines that take long."""
-    viewer: int = 0
-    """Number of messages to a running viewer."""
-    self_check: bool = False
-    """Whether to check first that the fuzzers can fail."""
+BATCH = 150
+"""Number of cases in a row in one process."""
+_SPARE = 3.0
+"""Seconds that a process has to report by itself that a case took too long."""
+_GROWN = 400.0
+"""Megabytes of memory after which a process takes no further case."""
+OUTCOMES = ("refused", "accepted", "finding")
 
 
 @dataclass
 class Row:
-    """Figures of a format or a target."""
+    """Figures of a target."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
     megabytes: float = 0.0
@@ -56,157 +48,126 @@ class Row:
     seconds: float = 0.0
     """Longest time of a case, in seconds."""
 
-    def add(self, result: Result) -> None:
-        self.outcomes[result.outcome] += 1
-        if result.outcome != "finding":
-            self.seconds, self.megabytes = max(self.seconds, result.seconds), max(self.megabytes, result.megabytes)
-
     def cells(self, name: str) -> str:
         counts = (self.outcomes.total(), *(self.outcomes[one] for one in OUTCOMES))
         figures = (*(f"{count:,}" for count in counts), f"{self.megabytes:,.0f} MB", f"{self.seconds:.1f} s")
         return f"| {name} | {' | '.join(figures)} |"
 
 
-OUTCOMES = ("refused", "accepted", "stopped", "finding")
-
-
 @dataclass
 class Tally:
-    """Figures by format and by target, and findings by cause, of a campaign."""
+    """Figures by target, and findings by cause, of a campaign."""
 
-    formats: dict[str, Row] = field(default_factory=dict)
-    targets: dict[str, Row] = field(default_factory=dict)
-    whole: Row = field(default_factory=Row)
+    rows: dict[str, Row] = field(default_factory=dict)
     findings: dict[str, list[Result]] = field(default_factory=dict)
-    missed: list[str] = field(default_factory=list)
-    """Planted faults that the fuzzers did not find in the self-check."""
 
     def add(self, result: Result) -> None:
-        self.formats.setdefault(result.format, Row()).add(result)
-        self.targets.setdefault(result.case.rsplit(":", 2)[0], Row()).add(result)
-        self.whole.add(result)
+        for name in (result.case.rsplit(":", 2)[0], "all"):
+            row = self.rows.setdefault(name, Row())
+            row.outcomes[result.outcome] += 1
+            if result.outcome != "finding":
+                row.seconds, row.megabytes = max(row.seconds, result.seconds), max(row.megabytes, result.megabytes)
         if result.outcome == "finding":
             self.findings.setdefault(result.cause, []).append(result)
 
-    def table(self, by_target: bool = False) -> str:
-        """Return a table of the figures by format or by target, then the causes with a case of each."""
-        formats = [*dict.fromkeys(target.format for target in TARGETS.values()), LINES, VIEWER]
-        kind, order, found = ("target", [*TARGETS], self.targets) if by_target else ("format", formats, self.formats)
-        order += [name for name in found if name not in order]
-        heads = (kind, "cases", *OUTCOMES[:-1], "findings", "most memory", "longest")
-        rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-        rows += [found[name].cells(name) for name in order if name in found]
-        rows += [self.whole.cells("all"), "", f"{len(self.findings)} causes:"]
+    def table(self) -> str:
+        """Return a table of the figures by target, then the causes with a case of each."""
+        heads = ("target", "cases", *OUTCOMES[:-1], "findings", "most memory", "longest")
+        lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+        lines += [self.rows[name].cells(name) for name in (*TARGETS, "all") if name in self.rows]
+        lines += ["", f"{len(self.findings)} causes:"]
         for cause, results in sorted(self.findings.items(), key=lambda item: -len(item[1])):
-            rows.append(f"{len(results):6} x {cause}    --replay {results[0].case!r}")
-        return "\n".join(rows)
+            lines.append(f"{len(results):6} x {cause}    --replay {results[0].case!r}\n{results[0].message[:500]}")
+        return "\n".join(lines)
 
 
-def run(plan: Plan, folder: Path, findings: Path | None) -> Tally:
-    """Run a plan; everything is made below `folder`. Findings are written as json lines as they come."""
-    material = folder / "material"
-    make_material_aside(material)
+def run(
+    seed: int, cases: int, folder: Path, material: Path, only: list[str] | None = None, workers: int = 1,
+    until: float | None = None, log: Path | None = None,
+) -> Tally:  # fmt: skip
+    """Run cases over all targets, or over some, and further seeds until `until` (`time.monotonic`)."""
     tally, began = Tally(), time.monotonic()
-    with contextlib.ExitStack() as stack:
-        if plan.self_check:
-            tally.missed += _aside(lambda: list(failures(folder / "self", material)))
-        log = stack.enter_context(_made(findings).open("a")) if findings else None
-        for result in _all_results(plan, folder, material):
+    while True:
+        numbered = [case.format(seed=seed) for case in spread(cases, only or present(material))]
+        jobs = [(numbered[index::workers], folder / f"worker{index}") for index in range(workers)]
+        results = _side_by_side(jobs, material, until) if workers > 1 else run_cases(*jobs[0], material, until)
+        for result in results:
             tally.add(result)
-            count = tally.whole.outcomes.total()
             if result.outcome == "finding" and log is not None:
-                log.write(json.dumps(result.as_json()) + "\n")
-                log.flush()
-            if count % 500 == 0:
-                print(
-                    f"{count} cases in {time.monotonic() - began:.0f} s, {len(tally.findings)} causes",
-                    file=sys.stderr,
-                    flush=True,
-                )
-    print(f"{tally.whole.outcomes.total()} cases in {time.monotonic() - began:.0f} s", file=sys.stderr)
-    return tally
+                log.parent.mkdir(parents=True, exist_ok=True)
+                with log.open("a") as file:
+                    file.write(json.dumps(asdict(result)) + "\n")
+            if tally.rows["all"].outcomes.total() % 500 == 0:
+                seconds = time.monotonic() - began
+                print(f"{tally.rows['all'].outcomes.total()} cases in {seconds:.0f} s", file=sys.stderr, flush=True)
+        seed += 1
+        if until is None or time.monotonic() >= until:
+            return tally
 
 
-def _made(path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+def table_of(results: list[Result]) -> str:
+    """Return a table of results."""
+    tally = Tally()
+    for result in results:
+        tally.add(result)
+    return tally.table()
 
 
-def replay(case: str, folder: Path) -> Result:
-    """Run one case or command line again."""
-    make_material_aside(folder / "material")
-    if case.startswith((LIGHT, HEAVY)):
-        return next(run_lines([case], folder / "worker", folder / "material"))
-    return next(run_cases([case], folder / "worker", folder / "material"))
+@contextmanager
+def bench_in(folder: Path, material: Path, **limits: Any) -> Iterator[Bench]:
+    """Return a bench with a socket of its own."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(64)
+        yield Bench(folder, material, listener, **limits)
 
 
-Job = Callable[[], Iterator[Result]]
-"""Job that runs its cases in a process of its own."""
+def run_cases(
+    cases: list[str], folder: Path, material: Path, until: float | None = None, **limits: float
+) -> Iterator[Result]:
+    """Yield results in order. No case starts after `until` (`time.monotonic`); `limits` are those of `Bench`."""
+    with bench_in(folder, material, **limits) as bench:
+        waiting = list(cases)
+        while waiting and (until is None or time.monotonic() < until):
+            done = 0
+            for result in _batch(waiting[:BATCH], bench):
+                done += 1
+                if result.outcome == "finding":
+                    again = next(_batch([result.case], bench))
+                    result.confirmed = again.outcome == "finding"
+                    result.traceback = result.traceback or again.traceback
+                yield result
+            waiting = waiting[done:]
 
 
-def _all_results(plan: Plan, folder: Path, material: Path) -> Iterator[Result]:
-    """Yield the results of the command lines beside the cases of the first seed, then those of further seeds."""
-    lines = [
-        f"{name}:{plan.seed}:{n}" for name, count in ((LIGHT, plan.lines), (HEAVY, plan.heavy)) for n in range(count)
-    ]
-    jobs: list[Job] = [partial(run_lines, lines, folder / "lines", material)]
-    jobs += [partial(_viewer_results, plan.viewer, plan.seed)] if plan.viewer else []
-    seed, names = plan.seed, plan.only or present(material)
-    if left_out := sorted(TARGETS.keys() - set(names)) if plan.only is None else []:
-        print(f"left out, because node or usd-core is missing: {', '.join(left_out)}", file=sys.stderr)
-    while plan.cases or jobs:
-        cases = [f"{name}:{seed}:{number}" for name, number in spread(plan.cases, names)] if plan.cases else []
-        shares = [cases[index :: plan.workers] for index in range(plan.workers)]
-        jobs += [
-            partial(run_cases, share, folder / f"worker{index}", material, plan.until)
-            for index, share in enumerate(shares)
-        ]
-        yield from chain.from_iterable(job() for job in jobs) if plan.workers == 1 else _side_by_side(jobs)
-        jobs, seed = [], seed + 1
-        if plan.until is None or time.monotonic() >= plan.until:
-            return
-
-
-def _send_messages(count: int, seed: int) -> dict[str, Any]:
-    from fuzzing.viewer_messages import campaign  # it needs viser, which may be missing
-
-    return asdict(campaign(count, seed))
-
-
-def _viewer_results(count: int, seed: int) -> Iterator[Result]:
-    """Yield a result for each hostile message and request. The viewer is judged as a whole, after them."""
-    figures = _aside(partial(_send_messages, count, seed))
-    numbers = iter(range(10 * count + 100))
-    known = {"megabytes": figures["memory_mib"], "seconds": figures["end_seconds"]}
-    for outcome, amount in (("refused", figures["refused_requests"]), ("accepted", figures["messages"])):
-        for _ in range(amount):
-            yield Result(f"{VIEWER}:{seed}:{next(numbers)}", VIEWER, outcome=outcome, **known)
-    for message in figures["findings"]:
-        told = {"message": message[:2000], "cause": f"viewer: {message[:80]}"}
-        yield Result(f"{VIEWER}:{seed}:{next(numbers)}", VIEWER, outcome="finding", findings=["viewer"], **told)
-
-
-def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
-    """Yield the results of jobs, each in a process of its own, as they come."""
-    pipes, children = [], []
-    for job in jobs:
-        reading, writing = os.pipe()
-        children.append(os.fork())
-        if children[-1] == 0:
-            code = 1
-            try:
-                with os.fdopen(writing, "w") as out:
-                    for result in job():
-                        out.write(json.dumps(result.as_json()) + "\n")
-                        out.flush()
-                code = 0
-            except BaseException:
-                traceback.print_exc()
-            finally:
-                os._exit(code)
+def _forked(work: Callable[[Callable[[Result], None]], None]) -> tuple[int, int]:
+    """Start `work` in another process; return its number, and the end of a pipe from which its results come."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child:
         os.close(writing)
-        pipes.append(os.fdopen(reading))
-    waiting = list(pipes)
+        return child, reading
+    code = 1
+    try:
+        os.close(reading)
+        work(lambda result: None if os.write(writing, json.dumps(asdict(result)).encode() + b"\n") else None)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+def _side_by_side(jobs: list[tuple[list[str], Path]], material: Path, until: float | None) -> Iterator[Result]:
+    """Yield the results of jobs, each in a process of its own, as they come."""
+
+    def work(cases: list[str], folder: Path, tell: Callable[[Result], None]) -> None:
+        for result in run_cases(cases, folder, material, until):
+            tell(result)
+
+    started = [_forked(lambda tell, job=job: work(*job, tell)) for job in jobs]
+    waiting = [os.fdopen(reading) for _, reading in started]
     while waiting:
         for pipe in select.select(waiting, [], [])[0]:
             # A line arrives whole: it is shorter than a pipe's buffer, or its rest follows at once.
@@ -214,37 +175,117 @@ def _side_by_side(jobs: list[Job]) -> Iterator[Result]:
                 yield Result(**json.loads(line))
             else:
                 waiting.remove(pipe)
-                pipe.close()
-    if any(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children):
+    if any(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child, _ in started):
         raise RuntimeError("a worker of the fuzzer itself failed; what it said is above")
 
 
-def make_material_aside(material: Path) -> None:
-    """Write whole files of every kind, in another process."""
-    _aside(lambda: make_material(material))
+def _batch(cases: list[str], bench: Bench) -> Iterator[Result]:
+    """Yield the results of the first cases, at least of one."""
+    here = Path.cwd()
+    bench.prepare()
+    os.chdir(here)
+    before = snapshot(bench)
+
+    def work(tell: Callable[[Result], None]) -> None:
+        os.setpgid(0, 0)
+        bench.prepare()
+        limit_this_process()
+        told = os.open(bench.told, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+        for stream, target in ((0, os.open(os.devnull, os.O_RDONLY)), (1, told), (2, told)):
+            os.dup2(target, stream)
+        for case in cases:
+            os.ftruncate(told, 0)
+            os.lseek(told, 0, os.SEEK_SET)
+            faulthandler.dump_traceback_later(bench.patience(), file=sys.__stderr__ or sys.stderr)
+            result = run_case(case, bench)
+            faulthandler.cancel_dump_traceback_later()
+            tell(result)
+            if result.megabytes > _GROWN or result.findings:
+                break  # later cases must not suffer from it
+
+    child, reading = _forked(work)
+    pending, done, status = b"", 0, None
+    while done < len(cases):
+        ready, _, _ = select.select([reading], [], [], bench.patience() + _SPARE)
+        data = os.read(reading, 1 << 20) if ready else None
+        if data:
+            *lines, pending = (pending + data).split(b"\n")
+            done += len(lines)
+            yield from (Result(**json.loads(line)) for line in lines)
+            continue
+        # The case neither ended nor raised an error: its process ended or hangs.
+        if data is None:
+            os.killpg(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        if data is None or os.waitstatus_to_exitcode(status) != 0:
+            yield _ended(cases[done], bench, before, "hang" if data is None else "signal", status)
+        break
+    os.close(reading)
+    if status is None:
+        os.waitpid(child, 0)
 
 
-def _aside(work: Callable[[], Any]) -> Any:
-    """Run `work` in another process and return its result. This process starts no threads, so that it forks safely."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        code, errors, quiet = 1, os.dup(2), os.open(os.devnull, os.O_WRONLY)
-        os.close(reading)
-        try:
-            os.dup2(quiet, 1)
-            os.dup2(quiet, 2)
-            with os.fdopen(writing, "w") as out:
-                json.dump(work(), out)
-            code = 0
-        except BaseException:
-            os.dup2(errors, 2)
-            traceback.print_exc()
-        finally:
-            os._exit(code)
-    os.close(writing)
-    with os.fdopen(reading) as answer:
-        told = answer.read()
-    if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0:
-        raise RuntimeError("the fuzzer itself failed; what it said is above")
-    return json.loads(told)
+def _ended(case: str, bench: Bench, before: dict[str, Any], finding: str, status: int) -> Result:
+    """Return the result of a case that ended its process."""
+    told = bench.told.read_text(errors="replace")[-4000:] if bench.told.exists() else ""
+    lines = [line.strip() for line in told.splitlines() if line.strip()]
+    frames = [line.rpartition("/")[2] for line in lines if line.startswith('File "') and "/mien/" in line]
+    code = os.waitstatus_to_exitcode(status)
+    message = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    findings = [finding] + ["outside"] * (snapshot(bench) != before)
+    cause = f"{finding}: {message} at {(frames or [case])[0]}"
+    return Result(case, "", "finding", findings, message, cause, lines[:8])
+
+
+# Readers that are wrong in every way ----------------------------------------------------------------------------------
+
+
+def _raising(error: Exception) -> Callable[[Path, Path], Any]:
+    def read(root: Path, file: Path) -> Any:
+        raise error
+
+    return read
+
+
+def _complain_as_it_comes(root: Path, file: Path) -> None:
+    """Print a message without making control characters harmless. It runs in a child, so nobody else sees it."""
+    terminal.printable = str  # type: ignore[assignment]
+    raise UserError(f"{file}: two\nlines")
+
+
+def _call(root: Path, file: Path) -> None:
+    with socket.socket() as caller:
+        caller.connect(("127.0.0.1", int((root / "port").read_text())))
+
+
+WRONG: dict[str, Callable[[Path, Path], Any]] = {
+    "signal": lambda root, file: os.kill(os.getpid(), signal.SIGSEGV),
+    "hang": lambda root, file: time.sleep(60),
+    "memory": lambda root, file: np.ones(100 << 20, np.uint8).sum(),
+    "traceback": _raising(KeyError("x")),
+    "message": _complain_as_it_comes,
+    "nameless": _raising(UserError("a file: cannot be read")),
+    "outside": lambda root, file: (root.parent / "outside/victim").write_bytes(b"gone"),
+    "leftover": lambda root, file: tempfile.mkdtemp(),
+    "connection": _call,
+    "printed": lambda root, file: print("\x1b[2J", file=sys.stderr, flush=True),
+    "script": lambda root, file: (root / "report.html").write_text(f"<p>{SCRIPT}</p>"),
+}
+"""Faulty readers, by the finding that they must cause."""
+
+
+def missed(folder: Path, material: Path) -> list[str]:
+    """Return a line for every faulty reader that the judge would miss."""
+
+    def fault(place: Place, _: Any) -> str:
+        (place.root / "port").write_text(str(place.port))
+        return "none"
+
+    wrong = []
+    for expected, read in WRONG.items():
+        TARGETS["wrong"] = Target("wrong", "head.ply", read, fault=fault)
+        (result,) = run_cases(["wrong:0:0"], folder, material, seconds=1.5, memory=64 << 20)
+        if expected not in result.findings:
+            wrong.append(f"wrong by {expected}, but judged {result.outcome} {result.findings} {result.message}")
+    del TARGETS["wrong"]
+    return wrong

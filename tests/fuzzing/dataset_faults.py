@@ -4,14 +4,15 @@ import io
 import json
 import os
 import pickle
-import zipfile
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import numpy as np
+
+from fuzzing.formats import bomb_of, members_of, npy_of, zip_of
+from fuzzing.kinds import entries
 
 _BOMB = 320 << 20
 """Bytes that a bomb unpacks to. All of them are zeros."""
@@ -39,8 +40,7 @@ def faulty_dataset(root: Path, canary: Path, dice: Random, only: str | None = No
     """
     kinds = list(KINDS)
     dice.shuffle(kinds)
-    kinds = kinds if only is None else [only]
-    for kind in kinds:
+    for kind in kinds if only is None else [only]:
         told = _FAULTS[kind](root, canary, dice)
         if told is not None:
             return f"{kind}: {told}"
@@ -54,22 +54,19 @@ def _missing_camera(root: Path, canary: Path, dice: Random) -> str | None:
         return None
     content = json.loads(file.read_text())
     if isinstance(content.get("world_2_cam"), dict):
-        serial = dice.choice(sorted(content["world_2_cam"]))
+        told = dice.choice(sorted(content["world_2_cam"]))
         owners = [content[key] for key in ("world_2_cam", "intrinsics") if isinstance(content.get(key), dict)]
         for owner in owners if dice.random() < 0.5 else [dice.choice(owners)]:
-            owner.pop(serial, None)
-        told = serial
+            owner.pop(told, None)
     elif content.get("frames") and "camera_id" in content["frames"][0]:
         told = dice.choice(sorted({frame["camera_id"] for frame in content["frames"]}))
-        some = dice.random() < 0.5  # at one timestep only, or at all of them
         gone = [frame for frame in content["frames"] if frame["camera_id"] == told]
-        gone = [dice.choice(gone)] if some else gone
+        gone = [dice.choice(gone)] if dice.random() < 0.5 else gone  # at one timestep only, or at all of them
         content["frames"] = [frame for frame in content["frames"] if frame not in gone]
     else:
         owner = dice.choice([content, *content.get("frames", [])])
-        keys = [
-            key for key in owner if key in ("intrinsics", "world_mat", "transform_matrix", "fl_x", "fx", "cx", "cy")
-        ]
+        names = ("intrinsics", "world_mat", "transform_matrix", "fl_x", "fx", "cx", "cy")
+        keys = [key for key in owner if key in names]
         if not keys:
             return None
         told = dice.choice(keys)
@@ -88,7 +85,7 @@ def _other_lengths(root: Path, canary: Path, dice: Random) -> str | None:
         more = np.concatenate([value, np.take(value, [-1], axis)], axis)
         return np.take(value, range(value.shape[axis] - 1), axis) if dice.random() < 0.6 else more
 
-    return _in_values(root, dice, lambda value: _is_list(value) or (_is_array(value) and value.ndim > 0), changed)
+    return _in_values(root, dice, lambda one: one if isinstance(one, list) else _dimensions(one) > 0, changed)
 
 
 def _not_a_number(root: Path, canary: Path, dice: Random) -> str | None:
@@ -96,39 +93,35 @@ def _not_a_number(root: Path, canary: Path, dice: Random) -> str | None:
     odd = dice.choice([float("nan"), float("inf"), -float("inf"), 1e30, 1e9])
 
     def changed(value: Any) -> Any:
-        if isinstance(value, str):
-            return str(odd)
-        if not _is_array(value):
-            return odd
+        if not isinstance(value, np.ndarray):
+            return str(odd) if isinstance(value, str) else odd
         array = value.astype(np.float64)
         array.flat[dice.randrange(array.size)] = odd
         return array.astype(value.dtype if value.dtype.kind == "f" else np.float32)
 
-    return _in_values(root, dice, lambda value: _is_number(value) or (_is_array(value) and value.size > 0), changed)
+    return _in_values(root, dice, lambda one: _is_number(one) or (_dimensions(one) >= 0 and one.size), changed)
 
 
 def _hostile_pickle(root: Path, canary: Path, dice: Random) -> str | None:
     """Put a pickle that runs code where arrays are: in a checkpoint, or as an array of objects."""
-    file = _pick(root, dice, (*_ARCHIVES, ".npy"))
+    file, hostile = _pick(root, dice, (*_ARCHIVES, ".npy")), RunsCode(canary / "ran")
     if file is None:
         return None
-    hostile = RunsCode(canary / "ran")
     if file.suffix == ".frame":
         arrays = _read(file)
         arrays[dice.choice(sorted(arrays))] = dice.choice([hostile, {"exp": hostile}, [hostile]])
-        whole = dice.random() < 0.3
-        _write_frame(file, hostile if whole else arrays, dice.choice([0, 2, 4]))
+        _write_frame(file, hostile if dice.random() < 0.3 else arrays, dice.choice([0, 2, 4]))
         return f"{file.relative_to(root)}"
+    stored = io.BytesIO()
     objects = np.empty(2, object)
     objects[:] = hostile
-    stored = io.BytesIO()
     np.save(stored, objects, allow_pickle=True)
     if file.suffix == ".npy":
         file.write_bytes(dice.choice([stored.getvalue(), pickle.dumps(hostile)]))
         return f"{file.relative_to(root)}"
-    members = _members(file)
+    members = members_of(file.read_bytes())
     name = dice.choice(sorted(members))
-    _write_zip(file, {**members, name: stored.getvalue()})
+    file.write_bytes(zip_of({**members, name: stored.getvalue()}))
     return f"{name} of {file.relative_to(root)}"
 
 
@@ -137,8 +130,8 @@ def _bomb(root: Path, canary: Path, dice: Random) -> str | None:
     file = _pick(root, dice, _ARCHIVES)
     if file is None:
         return None
-    member = "archive/data.pkl" if file.suffix == ".frame" else dice.choice(sorted(_members(file)))
-    file.write_bytes(_zip_of_zeros(member))
+    member = "archive/data.pkl" if file.suffix == ".frame" else dice.choice(sorted(members_of(file.read_bytes())))
+    file.write_bytes(bomb_of(member, _BOMB))
     return f"{member} of {file.relative_to(root)}"
 
 
@@ -146,8 +139,7 @@ def _link(root: Path, canary: Path, dice: Random) -> str | None:
     """Put a link in the place of a file or of a folder: out of the dataset, to itself, or to nothing."""
     place = dice.choice(sorted(each for each in root.rglob("*") if not each.is_symlink()))
     aside = canary / f"moved{place.suffix}"
-    targets = [canary / "file", canary, aside, place, root / "nothing", Path("/"), Path("..")]
-    target = dice.choice(targets)
+    target = dice.choice([canary / "file", canary, aside, place, root / "nothing", Path("/"), Path("..")])
     if target == aside and not aside.exists():
         place.rename(aside)  # the link leads to what was there, and yet it leads out
     elif place.is_dir():
@@ -171,37 +163,29 @@ def _pick(root: Path, dice: Random, suffixes: tuple[str, ...]) -> Path | None:
     return dice.choice(files) if files else None
 
 
-def _in_values(root: Path, dice: Random, fits: Callable[[Any], bool], changed: Callable[[Any], Any]) -> str | None:
+def _in_values(root: Path, dice: Random, fits: Callable[[Any], Any], changed: Callable[[Any], Any]) -> str | None:
     """Change one value of a json file, an archive or a checkpoint."""
     file = _pick(root, dice, (".json", ".npy", ".csv", *_ARCHIVES))
     if file is None:
         return None
-    content = _read(file)
-    places = [place for place in _places({"": content}) if fits(place[0][place[1]])]
+    content = {"": _read(file)}
+    places = [(container, key) for container, key in entries(content) if fits(container[key])]
     if not places:
         return None
     container, key = dice.choice(places)
     container[key] = changed(container[key])
-    whole = container[key] if key == "" else content
+    whole = content[""]
     if file.suffix == ".json":
         file.write_text(json.dumps(whole))
     elif file.suffix == ".frame":
         _write_frame(file, whole, 2)
     elif file.suffix == ".npy":
-        np.save(file, whole)
+        file.write_bytes(npy_of(whole))
     elif file.suffix == ".csv":
         file.write_text("\n".join(",".join(row) for row in whole))
     else:
-        np.savez(file, **whole)
+        file.write_bytes(zip_of({f"{name}.npy": npy_of(array) for name, array in whole.items()}))
     return f"{key!r} of {file.relative_to(root)}"
-
-
-def _places(value: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield each container with a key of it, of all that is in a value."""
-    keys = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
-    for key in list(keys):
-        yield value, key
-        yield from _places(value[key])
 
 
 def _read(file: Path) -> Any:
@@ -209,48 +193,21 @@ def _read(file: Path) -> Any:
     if file.suffix == ".json":
         return json.loads(file.read_text())
     if file.suffix == ".frame":
-        return pickle.loads(_members(file)["archive/data.pkl"])
-    if file.suffix == ".npy":
-        return np.load(file)
+        return pickle.loads(members_of(file.read_bytes())["archive/data.pkl"])
     if file.suffix == ".csv":
         return [line.split(",") for line in file.read_text().splitlines()]
+    if file.suffix == ".npy":
+        return np.load(file)
     with np.load(file) as arrays:
         return dict(arrays)
 
 
-def _members(file: Path) -> dict[str, bytes]:
-    with zipfile.ZipFile(file) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
-def _write_zip(file: Path, members: dict[str, bytes]) -> None:
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, data in members.items():
-            archive.writestr(name, data)
-
-
 def _write_frame(file: Path, content: Any, protocol: int) -> None:
-    _write_zip(file, {"archive/data.pkl": pickle.dumps(content, protocol), "archive/version": b"3\n"})
+    file.write_bytes(zip_of({"archive/data.pkl": pickle.dumps(content, protocol), "archive/version": b"3\n"}))
 
 
-@cache
-def _zip_of_zeros(member: str) -> bytes:
-    data = io.BytesIO()
-    with (
-        zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-        archive.open(member, "w", force_zip64=True) as stream,
-    ):
-        for _ in range(_BOMB >> 20):
-            stream.write(bytes(1 << 20))
-    return data.getvalue()
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, list) and bool(value)
-
-
-def _is_array(value: Any) -> bool:
-    return isinstance(value, np.ndarray)
+def _dimensions(value: Any) -> int:
+    return value.ndim if isinstance(value, np.ndarray) else -1
 
 
 def _is_number(value: Any) -> bool:

@@ -24,6 +24,43 @@ TEXTS = (
     "C:\\x", "con", "-", "--help", "a:b", f"http://127.0.0.1:{PORT}/x", "%s%n", "{0}", SCRIPT, "größer", "\U0001f600",
     "é" * 200,
 )  # fmt: skip
+LITERALS = (
+    "NaN", "inf", "-inf", "1e400", "-1e999", "3e38", "9" * 400, "9" * 5000, "0x10", "01", "1.", ".5", "1e", "--1",
+    "1_0", "\u0663", "1,5", "1.2.3", "=1+1", "x" * 200_000, "99:59:59:59", "-1:0:0:0", "0:0:0:1e9",
+    "9" * 400 + ":0:0:0", "0:0:0:0." + "9" * 400, "24:00:00:00", "0:00:00;29", "\u0663:00:00:00", "5000:0:0:0",
+    ":::", "double", "uchar", "int",
+)  # fmt: skip
+"""Words of a text that is no json."""
+USD_LINES = tuple(line.replace("{name}", name) for name in ("other.usda", f"{CANARY}/x.usda") for line in (
+    "subLayers = [@{name}@]", "references = @{name}@", "payload = @{name}@", 'def "a" ( references = @{name}@ ) {}',
+    "asset file = @{name}@", "point3f[] positions.timeSamples = { 0: [(1, 2, 3)] }", "float[] opacities = [inf]",
+    "point3f[] positions.connect = </avatar.x>", 'variants = { string v = "x" }',
+    "matrix4d xformOp:transform = ((1,0,0,0),(0,1,0,0),(0,0,1,0),(0,0,0,nan))",
+))  # fmt: skip
+_TEBIBYTE = (1 << 40).to_bytes(8, "little")
+SMALL_PICKLES = {
+    "bytes of a tebibyte": b"\x80\x04\x8e" + _TEBIBYTE + b".",
+    "a bytearray of a tebibyte": b"\x80\x05\x96" + _TEBIBYTE + b".",
+    "a text of a tebibyte": b"\x80\x04\x8d" + _TEBIBYTE + b".",
+    "a frame of a tebibyte": b"\x80\x04\x95" + _TEBIBYTE + b"N.",
+    "a memo of two billion": b"]r\xff\xff\xff\x7f.",
+    "a memo of digits": b"]p" + b"9" * 4000 + b"\n.",
+    "a number of two gigabytes": b"\x8b\xff\xff\xff\x7f.",
+    "digits": b"I" + b"9" * 10_000 + b"\n.",
+    "a doubled tuple": b"}(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"u.",
+    "a doubled tuple for a key": b"}(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"N" + b"u.",
+    "a doubled set": b"\x8f(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"\x90.",
+    "thousands of dictionaries": b"}" * 20_000 + b".",
+    "names without end": b"ca\nb\n" * 20_000 + b".",
+    "nested lists": b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b".",
+    "a stack that is empty": b"0.",
+    "a mark that is missing": b"t.",
+    "marks": b"(" * 10**6 + b".",
+    "a persistent name": b"Pname\n.",
+    "an extension": b"\x82\x01.",
+    "a cycle": b"}(X\x01\x00\x00\x00fca\nb\n)\x81q\x01}X\x01\x00\x00\x00xh\x01sbu.",
+}
+"""Pickles that ask for much memory or time."""
 _DEPTHS = (2, 100, 500, 990, 1000, 5000, 100_000)
 
 
@@ -60,3 +97,25 @@ def packed_integer(dice: Random, size: int, order: str = "little") -> bytes:
 def put(data: bytes, at: int, field: bytes) -> bytes:
     """Return `data` with some bytes replaced."""
     return data[:at] + field + data[at + len(field) :]
+
+
+def playlists(name: str) -> dict[str, str]:
+    """Return lists that name another file for a player to open, by their endings."""
+    rtp = (
+        f"c=IN IP4 127.0.0.1\nt=0 0\na=control:http://127.0.0.1:{PORT}/\nm=video 9 RTP/AVP 96\na=rtpmap:96 H264/90000\n"
+    )
+    return {
+        ".m3u8": f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXT-X-MEDIA-SEQUENCE:0\n#EXTINF:9,\n{name}\n#EXT-X-ENDLIST\n",
+        ".ffconcat": f"ffconcat version 1.0\nfile '{name}'\n",
+        ".sdp": f"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\n{rtp}",
+        ".mpd": '<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static" '
+        'mediaPresentationDuration="PT9S"><Period><AdaptationSet mimeType="video/mp4"><Representation id="0" '
+        f'bandwidth="1" width="64" height="48"><BaseURL>{name}</BaseURL></Representation></AdaptationSet>'
+        "</Period></MPD>",
+        ".txt": f"file '{name}'\n",
+        ".xml": f'<?xml version="1.0"?><CompositionPlaylist><Id>{name}</Id></CompositionPlaylist>',
+        ".rtsp": f"rtsptext\nrtsp://127.0.0.1:{PORT}/x\n",
+        ".qtl": f'<?xml version="1.0"?><?quicktime type="application/x-quicktime-media-link"?><embed src="{name}"/>',
+        ".asx": f"<asx version='3.0'><entry><ref href='{name}'/></entry></asx>",
+        ".ass": "[Script Info]\nTitle: x\n",
+    }

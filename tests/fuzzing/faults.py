@@ -1,27 +1,35 @@
-"""Make faults by kind of file: each changes the copies of a case before they are read."""
+"""Put faults into a file, or something else into its place; formats have faults of their own (`formats.py`)."""
 
-import json
+import contextlib
 import os
+import shutil
+import socket
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
 from damage import flip_or_cut
-from fuzzing import place_faults
-from fuzzing.archive_faults import faulty_npz, faulty_pickle
-from fuzzing.box_faults import faulty_mp4, faulty_stream
-from fuzzing.edges import CANARY, PORT
-from fuzzing.export_faults import EXPORT_FAULTS
-from fuzzing.json_faults import faulty_json, faulty_text, written
-from fuzzing.picture_faults import faulty_picture
-from fuzzing.repairs import repair_around, repair_portable, repair_tensors, with_checksum
-from fuzzing.tensor_faults import faulty_tensors, split
-from fuzzing.text_faults import faulty_ply, faulty_table, playlist
+from fuzzing.edges import CANARY, DEEP, PORT, playlists
+from fuzzing.formats import FORMATS
+from fuzzing.kinds import faulty_bytes
+from fuzzing.repairs import repair_around
 
 DAMAGE = "damage"
 """Name of the faults that a checksum must notice."""
-_REPAIRED, _WITHOUT = 0.75, 0.9
-"""Shares of faulty json files with a corrected checksum, and with a corrected checksum or none."""
+
+
+SPARSE = 3 << 30
+"""Size in bytes of a file that takes no room on the disk."""
+NAMES = (
+    "take:1", "http:x", f"http:127.0.0.1:{PORT}", "file:x", "concat:a|b", "pipe:1", "data:,x", "-", "--help", "-i",
+    "a b", " ", "...", "%d", "%06d", "%s%n",
+    "a\nb", "a\x1b]0;own\x07\x1b[31m", "\x9b31m", "a\rb", "\x7f", "\u202eabc", "größer", "x" * 240, "con", "*", "?",
+    "[a]", "{a,b}", "~", "$HOME", "`id`",
+    "a'b", 'a"b', "\\", "@x", "#x", "<script>mien_fuzz(1)</script>".replace("/", "∕"), "\udcff", "\u2028", "é",
+    ".hidden", "capture.json",
+)  # fmt: skip
+"""Names of files without their ending. None has a slash."""
 
 
 @dataclass
@@ -36,9 +44,11 @@ class Place:
     port: int
     """Port of this machine to which nothing may connect."""
 
-    def filled(self, data: bytes) -> bytes:
-        """Return the bytes with the placeholders of folder and port replaced."""
-        return data.replace(CANARY.encode(), os.fsencode(self.canary)).replace(PORT.encode(), str(self.port).encode())
+    def write(self, data: bytes) -> None:
+        """Write the file with the placeholders of folder and port replaced, and correct what is said around it."""
+        data = data.replace(CANARY.encode(), os.fsencode(self.canary)).replace(PORT.encode(), str(self.port).encode())
+        self.file.write_bytes(data)
+        repair_around(self.file)
 
 
 def faulty_file(place: Place, dice: Random) -> str:
@@ -47,49 +57,22 @@ def faulty_file(place: Place, dice: Random) -> str:
     if chance < 0.12:
         place.file.write_bytes(flip_or_cut(place.file.read_bytes(), dice))
         return DAMAGE
-    if chance < 0.22:
-        return faulty_place(place, dice)
-    return faulty_format(place, dice)
-
-
-def faulty_content(place: Place, dice: Random) -> str:
-    """Damage a file, or make a fault of its format, for readers that get the bytes and not the place."""
-    if dice.random() < 0.15:
-        place.file.write_bytes(flip_or_cut(place.file.read_bytes(), dice))
-        return DAMAGE
-    return faulty_inside(place, dice) if place.file.suffix == ".mien" else faulty_format(place, dice)
+    return faulty_place(place, dice) if chance < 0.22 else faulty_format(place, dice)
 
 
 def faulty_without_damage(place: Place, dice: Random) -> str:
-    """Make a fault as `faulty_file` does, but no unrepaired damage, for files that may also be read from elsewhere."""
-    return faulty_place(place, dice) if dice.random() < 0.5 else faulty_format(place, dice)
+    """Make a fault, but no unrepaired damage, for files that may also be read from elsewhere."""
+    return faulty_place(place, dice) if dice.random() < 0.3 else faulty_format(place, dice)
 
 
 def faulty_place(place: Place, dice: Random) -> str:
     """Put something else where the file is."""
-    return "place: " + place_faults.faulty_place(place.file, place.canary, dice)
+    return "place: " + put_something_else(place.file, place.canary, dice)
 
 
 def any_fault(place: Place, dice: Random) -> str:
     """Make any fault."""
     return faulty_place(place, dice) if place.file.is_dir() or dice.random() < 0.4 else faulty_format(place, dice)
-
-
-def faulty_format(place: Place, dice: Random) -> str:
-    """Make a fault of the file's own format."""
-    if place.file.suffix == ".partial":
-        return faulty_lines(place, dice)
-    data, suffix = place.file.read_bytes(), place.file.suffix
-    if suffix == ".json":
-        kind, data = _faulty_json_file(data, dice)
-    elif suffix == ".safetensors":
-        kind, data = faulty_tensors(data, dice)
-        data = repair_tensors(data)
-    else:
-        kind, data = _BY_ENDING.get(suffix, faulty_stream)(data, dice)
-    place.file.write_bytes(place.filled(data))
-    repair_around(place.file)
-    return kind
 
 
 def faulty_new_name(place: Place, dice: Random) -> str:
@@ -100,85 +83,150 @@ def faulty_new_name(place: Place, dice: Random) -> str:
     return kind
 
 
-def faulty_portable(place: Place, dice: Random) -> str:
-    """Damage a .mien file, put something else in its place, or make a fault in it."""
-    return faulty_file(place, dice) if dice.random() < 0.25 else faulty_inside(place, dice)
-
-
-def faulty_inside(place: Place, dice: Random) -> str:
-    """Make a fault in a .mien file: in its arrays, in its content, or in the entry around the content."""
-    data = place.file.read_bytes()
-    if dice.random() < 0.5:
-        kind, data = faulty_tensors(data, dice)
-        data = repair_portable(data)
-    else:
-        content = json.loads(split(data)[0]["__metadata__"]["mien"])["content"]
-        kind, content = faulty_json(content, dice)
-        kind, data = f"content {kind}", repair_portable(data, content)
-    place.file.write_bytes(place.filled(data))
-    return kind
-
-
-def _faulty_json_file(data: bytes, dice: Random) -> tuple[str, bytes]:
-    if dice.random() < 0.12:
-        kind, data = faulty_text(data, dice)
-        return f"text {kind}", data
-    content = json.loads(data)
-    if not isinstance(content, dict):
-        kind, content = faulty_json(content, dice)
-        return kind, written(content, dice)
-    checksum = content.pop("checksum", None)
-    frame = (
-        {name: content.pop(name) for name in ("format", "version") if name in content} if dice.random() < 0.8 else {}
-    )
-    kind, content = faulty_json(content, dice)
-    if isinstance(content, dict):
-        content = {**frame, **content}
-        chance = dice.random()
-        if checksum is not None and chance < _REPAIRED:
-            content = with_checksum(content)
-        elif checksum is not None and chance > _WITHOUT:
-            content["checksum"] = checksum
-    return kind, written(content, dice)
-
-
-def faulty_lines(place: Place, dice: Random) -> str:
-    """Make a fault in one of the json lines of a file, or in its place."""
-    if dice.random() < 0.2:
-        return faulty_place(place, dice)
-    lines = place.file.read_bytes().splitlines()
-    index = dice.randrange(len(lines)) if dice.random() < 0.2 else len(lines) - 1
-    if dice.random() < 0.8:
-        kind, content = faulty_json(json.loads(lines[index]), dice)
-        lines[index] = written(content, dice).replace(b"\n", b" ")
-    else:
-        kind, lines[index] = faulty_text(lines[index], dice)
-    if dice.random() < 0.2:
-        lines += [lines[index]] * dice.choice((1, 1000))
-    place.file.write_bytes(place.filled(b"\n".join(lines) + dice.choice((b"\n", b"\n", b""))))
-    return kind
+def rename(place: Place, dice: Random) -> str:
+    """Give the file an odd name."""
+    name = dice.choice(NAMES).replace(PORT, str(place.port)) + place.file.suffix
+    place.file = place.file.rename(place.file.with_name(name))
+    return ascii(place.file.stem)[:30]
 
 
 def write_playlist(place: Place, dice: Random) -> str:
     """Write a list of other files under a video's name."""
-    kind, ending, data = playlist("clip.mp4", dice)
     clip = place.canary / "clip.mp4"
     if not clip.exists():
         clip.write_bytes(place.file.read_bytes())
-    place.file = place.file.with_name(f"list{ending}")
-    place.file.write_bytes(place.filled(data))
+    names = ("clip.mp4", f"{CANARY}/clip.mp4", f"file:{CANARY}/clip.mp4", f"http://127.0.0.1:{PORT}/x.mp4",
+             f"tcp://127.0.0.1:{PORT}", "concat:clip.mp4|clip.mp4")  # fmt: skip
+    ending, text = dice.choice(list(playlists(dice.choice(names)).items()))
+    place.file = place.file.with_name(f"list{dice.choice((ending, '.mp4', '.mov', '.avi', '.png'))}")
+    place.write(text.encode())
+    return ending
+
+
+def faulty_format(place: Place, dice: Random) -> str:
+    """Make a fault of the file's own format."""
+    kind, data = FORMATS.get(place.file.suffix, faulty_bytes)(place.file.read_bytes(), dice)
+    place.write(data)
     return kind
 
 
-def rename(place: Place, dice: Random) -> str:
-    """Give the file an odd name."""
-    place.file = place_faults.rename_oddly(place.file, dice, place.port)
-    return ascii(place.file.stem)[:30]
+def put_something_else(path: Path, canary: Path, dice: Random, kind: str = "") -> str:
+    """Put something else where a file or folder is, and return the kind of fault."""
+    kind = kind or dice.choice(_KINDS)
+    beside = [other for other in path.parent.iterdir() if other != path and other.is_dir() == path.is_dir()]
+    copy = shutil.copytree if path.is_dir() else shutil.copy
+    if kind == "twice":
+        second = path.with_name(path.name.replace("0", "1", 1) if "0" in path.name else f"{path.name}2")
+        if not second.exists():
+            copy(path, second)
+    elif kind == "swapped" and beside:
+        other, aside = dice.choice(beside), path.with_name(".aside")
+        path.rename(aside)
+        other.rename(path)
+        aside.rename(other)
+    elif kind == "copied" and beside:
+        _remove(path)
+        copy(dice.choice(beside), path)
+    elif kind == "moved out":  # the original is outside now, with a link to it, and nothing may be changed there
+        outside = canary / f"moved{path.suffix}"
+        _remove(outside)
+        path.rename(outside)
+        path.symlink_to(outside)
+    else:
+        was_folder = path.is_dir()
+        _remove(path)
+        PLACES.get(kind, lambda *_: None)(path, canary, was_folder)
+    return kind
 
 
-_BY_ENDING = {
-    ".png": faulty_picture, ".jpg": faulty_picture, ".webp": faulty_picture, ".tif": faulty_picture,
-    ".bmp": faulty_picture,
-    ".mp4": faulty_mp4, ".mov": faulty_mp4, ".csv": faulty_table, ".ply": faulty_ply, ".npz": faulty_npz,
-    ".pkl": faulty_pickle, **EXPORT_FAULTS, ".m4a": faulty_mp4,
-}  # fmt: skip
+def outside_of(canary: Path) -> None:
+    """Fill the folder that links lead to and that nothing may be written into."""
+    (canary / "folder").mkdir(parents=True)
+    names = ("victim.json", "victim.safetensors", "victim.png", "victim.u8", "victim")
+    for name in (*names, "folder/victim.txt", "folder/000000.png"):
+        (canary / name).write_bytes(b"precious " * 20)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _socket(path: Path, canary: Path, was_folder: bool) -> None:
+    # The path of a socket may have only a hundred characters, so it is made from within its folder.
+    with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as made:
+        made.bind(path.name[:90])
+
+
+def _sparse(path: Path, canary: Path, was_folder: bool) -> None:
+    with path.open("wb") as file:
+        file.truncate(SPARSE)
+
+
+def _victim(path: Path, canary: Path, was_folder: bool = False) -> Path:
+    alike = canary / f"victim{path.suffix}"
+    return canary / "folder" if was_folder else alike if alike.exists() else canary / "victim"
+
+
+PLACES: dict[str, Callable[[Path, Path, bool], object]] = {
+    "missing": lambda path, canary, was_folder: None,
+    "empty": lambda path, canary, was_folder: path.mkdir() if was_folder else path.write_bytes(b""),
+    "folder": lambda path, canary, was_folder: path.write_bytes(b"text") if was_folder else path.mkdir(),
+    "full folder": lambda path, canary, was_folder: (path / "a" / "b").mkdir(parents=True),
+    "pipe": lambda path, canary, was_folder: os.mkfifo(path),
+    "socket": _socket,
+    "link outside": lambda path, canary, was_folder: path.symlink_to(_victim(path, canary, was_folder)),
+    "link upwards": lambda path, canary, was_folder: path.symlink_to(
+        os.path.relpath(_victim(path, canary), path.parent)
+    ),
+    "link beyond": lambda path, canary, was_folder: path.symlink_to(canary / f"new{path.suffix}"),
+    "link to itself": lambda path, canary, was_folder: path.symlink_to(path.name),
+    "endless": lambda path, canary, was_folder: path.symlink_to("/dev/zero"),
+    "null": lambda path, canary, was_folder: path.symlink_to("/dev/null"),
+    "sparse": _sparse,
+    "text": lambda path, canary, was_folder: path.write_text(f"{{}} {DEEP}"),
+}
+"""What may lie in the place of a file or folder."""
+
+
+def _changed(change: Callable[[bytes], bytes]) -> Callable[[Place], str]:
+    def fault(place: Place) -> str:
+        place.file.write_bytes(change(place.file.read_bytes()))
+        return DAMAGE
+
+    return fault
+
+
+def _placed(kind: str) -> Callable[[Place], str]:
+    return lambda place: put_something_else(place.file, place.canary, Random(0), kind)
+
+
+def _with_a_bit(data: bytes) -> bytes:
+    middle = len(data) // 3
+    return data[:middle] + bytes([data[middle] ^ 4]) + data[middle + 1 :]
+
+
+FIXED: dict[str, Callable[[Place], str]] = {
+    **{
+        kind: _placed(kind)
+        for kind in ("missing", "empty", "folder", "pipe", "link outside", "link beyond", "endless", "sparse", "text")
+    },
+    "cut": _changed(lambda data: data[: len(data) // 2]),
+    "a bit": _changed(_with_a_bit),
+    "the first byte": _changed(lambda data: bytes([data[0] ^ 1]) + data[1:]),
+    "zeros": _changed(lambda data: bytes(len(data))),
+}
+"""Damage that every reader gets."""
+_KINDS = (
+    *PLACES,
+    "link outside",
+    "link outside",
+    "link beyond",
+    "moved out",
+    "moved out",
+    "swapped",
+    "copied",
+    "twice",
+)

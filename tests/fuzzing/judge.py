@@ -1,4 +1,4 @@
-"""Run one case from its fault to its verdict, in a fresh process or after other cases."""
+"""Run one case from its fault to its verdict: a line of complaint that names the file, or content that can be used."""
 
 import contextlib
 import hashlib
@@ -13,19 +13,20 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from random import Random
 from typing import Any
 
-from fuzzing.content import content_of
+from fuzzing import uses
 from fuzzing.edges import SCRIPT
-from fuzzing.faults import DAMAGE, Place
+from fuzzing.faults import DAMAGE, FIXED, Place, outside_of
 from fuzzing.material import copy_of
-from fuzzing.place_faults import outside_of
 from fuzzing.targets import TARGETS, Target
-from mien import cli
+from fuzzing.uses import content_of
+from fuzzing.values import SANE, VALUES, concrete, edit
 from mien.errors import UserError
+from mien.terminal import tell
 
 SECONDS = 20.0
 """Longest time that a case may take, in seconds."""
@@ -33,20 +34,22 @@ MEMORY = 2 << 30
 """Most bytes that a case may hold."""
 LIMIT = 5 << 30
 """Bytes beyond which the system refuses. It is more than `MEMORY`, so that cases that would take them are seen."""
-LARGEST_FILE = 4 << 30
+_LARGEST_FILE = 4 << 30
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e]")
-_INNER = ("site-packages", "fuzzing/", "lib/python")
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Folders in which a worker runs its cases."""
+    """Folders in which cases run."""
 
     folder: Path
     material: Path
-    port: int
+    listener: socket.socket
+    """Socket to which nothing may connect."""
     seconds: float = SECONDS
     memory: int = MEMORY
+    expected: dict[str, Any] = field(default_factory=dict)
+    """Content of undamaged files, by target and file."""
 
     @property
     def root(self) -> Path:
@@ -85,7 +88,6 @@ class Result:
 
     case: str
     """Name of the case: TARGET:SEED:NUMBER."""
-    format: str
     kind: str = ""
     """Kind of the fault."""
     outcome: str = ""
@@ -101,40 +103,59 @@ class Result:
     confirmed: bool | None = None
     """Whether the finding was repeated in a process of its own."""
 
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def limit_this_process() -> None:
     """Set the limits that hold for all cases of a process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + LIMIT, size + LIMIT))
 
 
-def run_case(case: str, bench: Bench, listener: socket.socket, expected: Callable[[Target, Path], Any]) -> Result:
+def run_case(case: str, bench: Bench) -> Result:
     """Make a fault, read the file, use the result, and judge."""
     name, seed, number = case.rsplit(":", 2)
     target, dice = TARGETS[name], Random(case)
-    result = Result(case, target.format)
+    os.chdir(bench.folder / "here")
     shutil.rmtree(bench.root, ignore_errors=True)
-    copy_of(bench.material, target.parts, bench.root)
-    files = sorted(path for path in bench.root.glob(target.files) if not path.is_dir() or target.format == "workspace")
-    place = Place(bench.root, files[int(number) % len(files)], bench.canary, bench.port)
+    copy_of(bench.material, target.needs, bench.root)
+    files = sorted(path for path in bench.root.glob(target.files) if not path.is_dir() or "**" in target.files)
+    place = Place(bench.root, files[int(number) % len(files)], bench.canary, bench.listener.getsockname()[1])
+    if seed.isdigit():
+        return judge(target, Result(case), bench, place, lambda: target.fault(place, dice), dice)
+    if seed in FIXED:
+        return judge(target, Result(case), bench, place, lambda: FIXED[seed](place), dice)
+    row, _, index = seed.partition("/")
+    rows = [SANE[name]] if row == "sane" else concrete(VALUES[name][int(row)], place.file)
+    where, value = rows[int(index or 0)]
+    data = edit(place.file, where, value)
+    if data is None:
+        return Result(case, outcome="no such place")
+    place.write(data)
+    if row == "sane":
+        evaluated = target.use in (uses.use_run, uses.use_evaluation)
+        target = replace(target, use=uses.use_evaluation if evaluated else uses.nothing)
+    result = judge(target, Result(case), bench, place, lambda: f"{where} = {value!r}"[:200], dice)
+    if result.outcome == ("refused" if row == "sane" else "accepted"):
+        result.findings, result.cause = [result.outcome], f"{name}: {result.kind} is {result.outcome}"
+        result.outcome = "finding"
+    return result
+
+
+def judge(target: Target, result: Result, bench: Bench, place: Place, fault: Callable[[], str], dice: Random) -> Result:
+    """Make the fault, read the file, use the result, and complete the verdict."""
     whole = place.file
-    result.kind = target.fault(place, dice)
-    before, memory = snapshot(bench), _forget_peak()
-    began = time.monotonic()
+    result.kind = fault()
+    before, memory, began = snapshot(bench), _forget_peak(), time.monotonic()
     try:
         found = target.read(bench.root, place.file)
         if result.kind == DAMAGE and target.exact:
-            assert content_of(found) == expected(target, whole), "read something else than what was written"
+            assert content_of(found) == _expected(target, whole, bench), "read something else than what was written"
         target.use(bench.root, found, dice)
         result.outcome = "accepted"
     except UserError as error:
         result.outcome, result.message = "refused", str(error)
-        result.findings += _faults_of_message(str(error), str(bench.root) if target.named else "")
+        result.findings += faults_of_message(str(error), str(bench.root) if target.named else "")
         if result.findings:
             _add_traceback(result, error)
     except BaseException as error:
@@ -142,78 +163,74 @@ def run_case(case: str, bench: Bench, listener: socket.socket, expected: Callabl
         result.message = " ".join(f"{type(error).__name__}: {error}".split())[:2000]
         _add_traceback(result, error)
     result.seconds = round(time.monotonic() - began, 3)
-    result.megabytes = round((_peak() - memory) / 2**20, 1)
-    judge_traces(result, bench, before, listener)
+    result.megabytes = round((_status("VmHWM") - memory) / 2**20, 1)
+    _judge_traces(result, bench, before)
     if result.findings:
         result.outcome = "finding"
-        result.cause = result.cause or f"{'+'.join(result.findings)} in {name}, {result.kind}"
+        result.cause = result.cause or f"{'+'.join(result.findings)} in {target.name}, {result.kind}"
     return result
 
 
-def snapshot(bench: Bench, home: bool = True) -> dict[str, Any]:
-    """Return the state of everything outside of the copies, with or without the home folder."""
+def _expected(target: Target, file: Path, bench: Bench) -> Any:
+    """Return the content of an undamaged file, which is read once per process."""
+    key = f"{target.name} {file}"
+    if key not in bench.expected:
+        root = bench.folder / "whole"
+        shutil.rmtree(root, ignore_errors=True)
+        copy_of(bench.material, target.needs, root)
+        bench.expected[key] = content_of(target.read(root, root / file.relative_to(bench.root)))
+    return bench.expected[key]
+
+
+def snapshot(bench: Bench) -> dict[str, Any]:
+    """Return the state of everything outside of the copies."""
     found: dict[str, Any] = {}
-    for folder in (bench.canary, bench.folder / "here", *([bench.folder / "home"] if home else [])):
+    for folder in (bench.canary, bench.folder / "here", bench.folder / "home"):
         for path in sorted([folder, *folder.rglob("*")]):
-            status = path.lstat()
-            whole = path.is_file() and not path.is_symlink()
-            digest = (
-                hashlib.sha256(path.read_bytes()).hexdigest() if whole and status.st_size < LARGEST_FILE / 64 else None
-            )
-            found[str(path.relative_to(bench.folder))] = (
-                status.st_mode,
-                digest,
-                None if path.is_dir() else status.st_mtime_ns,
-            )
+            status, whole = path.lstat(), path.is_file() and not path.is_symlink()
+            small = whole and status.st_size < _LARGEST_FILE / 64
+            digest = hashlib.sha256(path.read_bytes()).hexdigest() if small else None
+            changed = None if path.is_dir() else status.st_mtime_ns
+            found[str(path.relative_to(bench.folder))] = status.st_mode, digest, changed
     return found
 
 
-def judge_traces(
-    result: Result,
-    bench: Bench,
-    before: dict[str, Any],
-    listener: socket.socket,
-    home: bool = True,
-    slow: bool = True,
-) -> None:
+def _judge_traces(result: Result, bench: Bench, before: dict[str, Any]) -> None:
     """Add findings if the case left files, wrote outside, opened a connection or printed control characters."""
-    if (after := snapshot(bench, home)) != before:
+    if (after := snapshot(bench)) != before:
         changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
         result.findings.append("outside")
         result.traceback.append(f"changed: {changed}")
-        result.cause = result.cause or f"outside: {result.case.split(':')[0]}, {result.kind}"
-    if slow and result.seconds > bench.patience():
+    if result.seconds > bench.patience():
         result.findings.append("hang")
     if result.megabytes > bench.memory / 2**20:
         result.findings.append("memory")
-    if select.select([listener], [], [], 0)[0]:
-        listener.accept()[0].close()
+    if select.select([bench.listener], [], [], 0)[0]:
+        bench.listener.accept()[0].close()
         result.findings.append("connection")
-    leftovers = sorted(
-        path.name for path in (bench.folder / "tmp").iterdir() if not path.name.startswith("mien-crash-")
-    )
-    if leftovers and result.outcome != "finding":
-        result.findings.append("leftover")
-        result.traceback.append(f"left in the folder for temporary files: {leftovers}")
+    temporary = bench.folder / "tmp"
+    if left := sorted(path.name for path in temporary.iterdir() if not path.name.startswith("mien-crash-")):
+        if not result.findings:
+            result.findings.append("leftover")
+            result.traceback.append(f"left in the folder for temporary files: {left}")
+        shutil.rmtree(temporary)
+        temporary.mkdir()
     told = bench.told.read_text(errors="surrogateescape") if bench.told.exists() else ""
     if _CONTROL.search(told.replace("\r", "")):
         result.findings.append("printed")
         result.traceback.append(f"printed: {ascii(told[-300:])}")
     for report in bench.root.rglob("*.html"):
         with contextlib.suppress(OSError):
-            if not report.is_file() or report.is_symlink() or report.stat().st_size > LARGEST_FILE / 64:
-                continue  # a fault may have made it longer than memory
-            if SCRIPT in report.read_text(errors="replace"):
-                result.findings.append("script")
-    if leftovers:
-        shutil.rmtree(bench.folder / "tmp")
-        (bench.folder / "tmp").mkdir()
+            # A fault may have made it longer than memory.
+            if report.is_file() and not report.is_symlink() and report.stat().st_size < _LARGEST_FILE / 64:
+                result.findings += ["script"] * (SCRIPT in report.read_text(errors="replace"))
 
 
-def _faults_of_message(message: str, root: str) -> list[str]:
+def faults_of_message(message: str, root: str) -> list[str]:
+    """Return what is wrong with a complaint, as it reaches the terminal: several lines, no name, too long."""
     printed = io.StringIO()
     with contextlib.redirect_stderr(printed):
-        cli._complain(message)  # what reaches the terminal counts, where names are made harmless
+        tell(f"mien: {message}")
     line = printed.getvalue().removesuffix("\n")
     lines = "message" if "\n" in line or _CONTROL.search(line) else ""
     nameless = "nameless" if root not in message else ""
@@ -224,16 +241,14 @@ def _add_traceback(result: Result, error: BaseException) -> None:
     frames = traceback.extract_tb(error.__traceback__)
     result.traceback = [
         f"{Path(frame.filename).name}:{frame.lineno} {frame.name}: {(frame.line or '').strip()[:120]}"
-        for frame in frames
-    ][-6:]
-    ours = [frame for frame in frames if "/mien/" in frame.filename]
-    last = ours[-1] if ours else frames[-1]
-    result.cause = f"{'+'.join(result.findings)}: {type(error).__name__} in {Path(last.filename).name}:{last.name}"
+        for frame in frames[-6:]
+    ]
+    last = [frame for frame in frames if "/mien/" in frame.filename][-1:] or frames[-1:]
+    where = f"{Path(last[0].filename).name}:{last[0].name}"
     if type(error).__name__ == "CommandError":
         logged = re.findall(r'File "[^"]*/mien/([^"]+)", line \d+, in (\w+)', str(error))
-        kind = re.findall(r"^(\w[\w.]*):? ?", str(error).strip().rpartition("\n")[2])
         where = f"{Path(logged[-1][0]).name}:{logged[-1][1]}" if logged else result.message[:60]
-        result.cause = f"traceback: {kind[0] if kind else ''} in {where}"
+    result.cause = f"{'+'.join(result.findings)}: {type(error).__name__} in {where}"
 
 
 def _forget_peak() -> int:
@@ -241,10 +256,6 @@ def _forget_peak() -> int:
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return _status("VmRSS")
-
-
-def _peak() -> int:
-    return _status("VmHWM")
 
 
 def _status(name: str) -> int:

@@ -2,76 +2,111 @@
 
 import contextlib
 import json
+import pickle
 import shutil
+import subprocess
+import wave
+from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+import av
 import cv2
 import numpy as np
 import torch
 
 import train_toy
-from fuzzing.archive_faults import npy_of, npz_of
-from mien.avatar import METHODS, load_avatar
-from mien.avatar.baking import make_portable
+from flame_like import write_pickle
+from fuzzing.formats import npy_of, zip_of
+from mien.avatar import METHODS, Avatar, as_array, bake_rig, load_avatar, make_portable, write_avatar
+from mien.capture.sound import RATE
 from mien.capture.video import write_video
+from mien.config import encode
 from mien.evaluation import EvaluationSettings, evaluate
 from mien.evaluation.partial import PartialScores
-from mien.export import in_world, write_gaussian_avatars_folder, write_ply
+from mien.export import (
+    MeshModel,
+    in_world,
+    pack,
+    write_gaussian_avatars_folder,
+    write_glb,
+    write_ply,
+    write_sog,
+    write_spz,
+    write_usd,
+)
 from mien.face import Landmarks
 from mien.face.cache import cache_folder
 from mien.face.flame import flame_face_model, read_flame
 from mien.face.listing import ADDED_RECIPE
 from mien.face.loading import load_face_model, write_face_model, write_landmarks
 from mien.lab.analysis import ANALYSES, AnalysisOptions, chosen_parts, run_analysis
+from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, write_key
+from mien.lab.analysis.study.shuffling import shuffled
 from mien.runtime import write_portable
 from mien.storage import write_json
+from mien.tracking import TrackingSettings, track_subject
+from mien.tracking.fitting import StageCache
+from mien.tracking.settings import PhotometricSettings
 from mien.training import read_face_track
+from photometric_case import make_photometric_case, make_textured_model
 from plain_settings import plain_config
-from toy_scene import toy_camera, toy_face_model
+from recordings import LAYOUTS
+from toy_scene import toy_camera, toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 from what_users_give import write_what_users_give
 
-RUN, SEQUENCE, ANALYSIS = "W/runs/toy", "W/sequences/clip", "W/analysis/toy"
+RUN, SEQUENCE, ANALYSIS, PIECES = "W/runs/toy", "W/sequences/clip", "W/analysis/toy", "pieces"
 GROWTH = replace(
-    ANALYSES["gaussian-avatars"],
-    parts=tuple(chosen_parts(ANALYSES["gaussian-avatars"], ("growth",), train=False)),
+    ANALYSES["gaussian-avatars"], parts=tuple(chosen_parts(ANALYSES["gaussian-avatars"], ("growth",), train=False))
 )
 """The part of an analysis that takes no time. The others draw large pictures or train."""
 QUICK = EvaluationSettings(perceptual=False, video_frames=0)
+CONFIG, SETTINGS = train_toy.CONFIG, train_toy.SETTINGS
+_TRACKING = TrackingSettings(photometric=PhotometricSettings(texture_size=128, keyframes=2, shared_steps=1))
+_WEB = Path(__file__).parents[2] / "web"
 
 
-def make_material(root: Path) -> None:
-    """Write everything below `root`, with the same bytes every time on one machine."""
+def make_material(root: Path, whole: bool = True) -> None:
+    """Write everything below `root`, with the same bytes every time on one machine.
+
+    Args:
+        root: The folder.
+        whole: Whether to write what takes seconds as well: the pieces of a tracking, and the runtime of pages.
+    """
+    torch.set_num_threads(1)
     root.mkdir(parents=True, exist_ok=True)
     write_toy_workspace(root / "W")
     _evaluate_and_keep_the_partial_file(root)
     avatar = load_avatar(root / RUN)
     write_portable(root / "head.mien", make_portable(avatar, toy_camera(32), "toy"))
-    with torch.no_grad():
-        write_ply(root / "head.ply", in_world(avatar.pose(avatar.subject).gaussians.timestep(0)))
     track = read_face_track(root / RUN, avatar.face_model)
     write_gaussian_avatars_folder(root / "gaussian_avatars", avatar, track)
     run_analysis(GROWTH, GROWTH.parts, root / RUN, [root / SEQUENCE], root / ANALYSIS, AnalysisOptions())
     _write_pictures(root / "pictures")
     write_what_users_give(root / "given", cv2.imread(str(root / "pictures/a.png")))  # type: ignore[arg-type]
     _write_face_models(root / "cache" / "face_models" / "added")
-    load_face_model("anny")  # baked here once, since a command that bakes looks like one that hangs
-    for file in (cache_folder() / "face_models").glob("*.*"):
-        shutil.copy(file, root / "cache" / "face_models")
-    (root / "flame").mkdir()
-    (root / "flame/tiny.npz").write_bytes(npz_of({name: npy_of(array) for name, array in tiny_flame().items()}))
-    from flame_like import write_pickle
-
-    write_pickle(root / "flame/tiny.pkl", tiny_flame())
-    _write_avatar_on_flame(root)
+    _write_flame(root)
     _write_videos(root / "videos")
-    from fuzzing.pieces import write_pieces
+    _write_avatars(root)
+    _write_exports(root, avatar)
+    _write_sounds(root / "sounds")
+    _write_study(root / "study")
+    _write_configs(root / "configs", root / RUN)
+    _write_rig(root / "rig")
+    (root / "takes").mkdir()
+    for write in (write for writers in LAYOUTS.values() for write in writers):
+        write(root / "takes", [{"jawOpen": index / 8, "eyeBlinkLeft": 0.5} for index in range(4)])
+    if whole:
+        _write_pieces(root / PIECES)
+        _write_packed(root)
 
-    write_pieces(root / "pieces")
-    from fuzzing.exchange_material import write_exchanged
 
-    write_exchanged(root, avatar, root / RUN)
+def quick_material(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """Return a folder with what is made quickly, which is for reading. `made_once` is the fixture of that name."""
+    return made_once("material", lambda folder: make_material(folder, whole=False))
 
 
 def _evaluate_and_keep_the_partial_file(root: Path) -> None:
@@ -84,27 +119,23 @@ def _evaluate_and_keep_the_partial_file(root: Path) -> None:
 
 def _write_pictures(folder: Path) -> None:
     folder.mkdir()
-    across = np.linspace(0, 255, 32).astype(np.uint8)
-    picture = np.stack(
-        [np.tile(across, (32, 1)), np.tile(across[:, None], (1, 32)), np.full((32, 32), 90, np.uint8)], axis=-1
-    )
+    across = np.tile(np.linspace(0, 255, 32).astype(np.uint8), (32, 1))
     for suffix in ("png", "jpg", "webp", "tif", "bmp"):
-        assert cv2.imwrite(str(folder / f"a.{suffix}"), picture)
+        assert cv2.imwrite(str(folder / f"a.{suffix}"), np.stack([across, across.T, np.full_like(across, 90)], -1))
 
 
 def _write_face_models(folder: Path) -> None:
-    """Write a face model as `mien face-models --add` leaves it."""
+    """Write a face model as `mien face-models --add` leaves it, and anny as it is baked."""
     bare = toy_face_model()
     marks = Landmarks(torch.arange(478) % len(bare.faces), torch.full((478, 3), 1 / 3))
     model = replace(bare, name="mine", landmarks={"mediapipe": marks})
     write_face_model(folder / "mine", model)
     write_landmarks(folder / "mine.landmarks.json", model, "test")
-    write_json(
-        folder / "mine.source.json",
-        "mien.face_model_source",
-        1,
-        {"path": "/x.npz", "sha256": "0", "recipe": ADDED_RECIPE},
-    )
+    source = {"path": "/x.npz", "sha256": "0", "recipe": ADDED_RECIPE}
+    write_json(folder / "mine.source.json", "mien.face_model_source", 1, source)
+    load_face_model("anny")  # baked here once, since a command that bakes looks like one that hangs
+    for file in (cache_folder() / "face_models").glob("*.*"):
+        shutil.copy(file, folder.parent)
 
 
 def tiny_flame() -> dict[str, np.ndarray]:
@@ -147,14 +178,15 @@ def _ball(around: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _write_avatar_on_flame(root: Path) -> None:
-    """Write GaussianAvatars' folder of an avatar on a model in FLAME's schema, whose licence forbids copies."""
+def _write_flame(root: Path) -> None:
+    """Write a model in FLAME's schema, whose licence forbids copies, and GaussianAvatars' folder of an avatar on it."""
+    (root / "flame").mkdir()
+    (root / "flame/tiny.npz").write_bytes(zip_of({f"{name}.npy": npy_of(one) for name, one in tiny_flame().items()}))
+    write_pickle(root / "flame/tiny.pkl", tiny_flame())
     model = flame_face_model(read_flame(root / "flame/tiny.npz"), "tiny")
     face = replace(model.neutral(3), head_translation=torch.tensor([0.0, 0.0, -0.6]).repeat(3, 1))
-    method = METHODS["gaussian_avatars"]
-    write_gaussian_avatars_folder(
-        root / "flame_avatars", method.avatar(plain_config("gaussian_avatars"), model, face), face
-    )
+    avatar = METHODS["gaussian_avatars"].avatar(plain_config("gaussian_avatars"), model, face)
+    write_gaussian_avatars_folder(root / "flame_avatars", avatar, face)
 
 
 def _write_videos(folder: Path) -> None:
@@ -167,22 +199,123 @@ def _write_videos(folder: Path) -> None:
     assert (folder / "clip.mp4").is_file()
 
 
+def new_avatar(method: str) -> Avatar:
+    """Return an untrained avatar of a method on the toy head."""
+    face_model, sequence = toy_sequence(5, 32)
+    torch.manual_seed(0)
+    return METHODS[method].avatar(plain_config(method), face_model, sequence.tracking.face)
+
+
+def _write_avatars(root: Path) -> None:
+    """Write an untrained avatar of each method, as a folder and as a .mien file."""
+    (root / "miens").mkdir()
+    for name in METHODS:
+        avatar = new_avatar(name)
+        write_avatar(root / "avatars" / name, avatar)
+        write_portable(root / f"miens/{name}.mien", make_portable(avatar, toy_camera(32), "toy"))
+
+
+def _write_exports(root: Path, avatar: Avatar) -> None:
+    folder = root / "exports"
+    folder.mkdir()
+    with torch.no_grad():
+        posed = in_world(avatar.pose(avatar.subject).gaussians.timestep(0))
+    write_ply(root / "head.ply", posed)
+    higher = 0.1 * torch.randn(len(posed), 3, 3, generator=torch.Generator().manual_seed(0))
+    rich = replace(posed, sh=torch.cat([posed.sh[:, :1], higher], dim=1))  # which .sog shares in a palette
+    write_spz(folder / "head.spz", rich, version=3)  # the faults lie behind gzip
+    write_sog(folder / "head.sog", rich)
+    if find_spec("pxr") is not None:
+        for ending in ("usda", "usdc", "usdz"):
+            write_usd(folder / f"head.{ending}", [posed, posed][: 1 + (ending == "usda")], None)
+        shutil.copy(folder / "head.usdc", folder / "head.usd")
+    model = avatar.face_model
+    mesh = MeshModel(bake_rig(model, avatar.subject), *map(as_array, (model.faces, model.uv, model.uv_faces)))
+    write_glb(folder / "head.glb", make_portable(avatar, toy_camera(32), "toy"), mesh, 16)
+
+
+def _write_packed(root: Path) -> None:
+    """Write the runtime of pages and an avatar of each method as pages have it, if node is here."""
+    if shutil.which("node") and (_WEB / "node_modules" / "esbuild").is_dir():
+        subprocess.run(["node", str(_WEB / "build.mjs"), str(root / "web")], check=True, capture_output=True)
+        (root / "packed").mkdir()
+        for name in METHODS:
+            portable = make_portable(new_avatar(name), toy_camera(32), "toy")
+            (root / "packed" / f"{name}.packed").write_bytes(pack(portable))
+
+
+def _write_sounds(folder: Path) -> None:
+    folder.mkdir()
+    samples = (0.3 * np.sin(np.arange(RATE // 2) * 0.1)).astype(np.float32)
+    with wave.open(str(folder / "voice.wav"), "wb") as file:
+        file.setparams((2, 2, RATE, 0, "NONE", ""))
+        file.writeframes(np.repeat(samples * 32767, 2).astype("<i2").tobytes())
+    for ending, codec, sample in (("mp3", "libmp3lame", "fltp"), ("flac", "flac", "s16"), ("ogg", "libopus", "flt"),
+                                  ("m4a", "aac", "fltp")):  # fmt: skip
+        with av.open(str(folder / f"voice.{ending}"), "w") as container:
+            stream = container.add_stream(codec, rate=48_000, layout="mono")
+            assert isinstance(stream, av.AudioStream)
+            rows: Any = np.repeat(samples, 3)[None]
+            rows = (rows * 32767).astype(np.int16) if sample == "s16" else rows
+            frame = av.AudioFrame.from_ndarray(np.ascontiguousarray(rows), format=sample, layout="mono")
+            frame.sample_rate = 48_000
+            container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+
+
+def _write_rig(folder: Path) -> None:
+    folder.mkdir()
+    K = [[40.0, 0.0, 16.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]
+    one = {"K": K, "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
+    cameras = [{"id": "00", **one}, {"id": "08", **one, "offset": 2, "distortion": [0.1, -0.05, 0.001, 0.0, 0.0]}]
+    (folder / "rig.json").write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": cameras}))
+
+
+def _write_study(folder: Path) -> None:
+    """Write the key of a study of two runs and two clips, and the answers of one participant."""
+    folder.mkdir()
+    study, participant, runs = "0123456789ab", "00000001", ("one", "two")
+    tiles = {f"{index:012x}": run for index, run in enumerate(runs)}
+    clips = tuple(KeyClip(f"c{index:07x}", "W", "clip", "front", 4 * index, 4, tiles) for index in range(2))
+    write_key(folder / "study.key.json", StudyKey(study, 0, runs, clips))
+    answers = [
+        {"clip": clip.name, "shown": shuffled(list(tiles), study, participant, clip.name), "seconds": 1.5,
+         **dict.fromkeys(("quality", "expression"), next(iter(tiles)))}
+        for clip in clips
+    ]  # fmt: skip
+    content = {"format": ANSWERS, "version": VERSION, "study": study, "participant": participant, "answers": answers}
+    (folder / "answers.json").write_text(json.dumps(content))
+
+
+def _write_configs(folder: Path, run: Path) -> None:
+    """Write a run's own config.json, and one by hand for each method."""
+    folder.mkdir()
+    shutil.copy(run / "config.json", folder / "run.json")
+    for name in METHODS:
+        settings = {"steps": 10, "seed": 1, "background": "random"}
+        (folder / f"{name}.json").write_text(json.dumps({"method": encode(plain_config(name)), "settings": settings}))
+
+
+def _write_pieces(folder: Path) -> None:
+    """Write every piece of a tracking that was stopped, none of them dropped, and its capture."""
+    capture = make_photometric_case(4).capture
+    drop, forget = StageCache.drop, StageCache.forget
+    StageCache.drop = StageCache.forget = lambda *_: None  # type: ignore[method-assign, assignment]
+    try:
+        track_subject([capture], make_textured_model(), _TRACKING, folder)
+    finally:
+        StageCache.drop, StageCache.forget = drop, forget  # type: ignore[method-assign]
+    (folder / "capture.pickle").write_bytes(pickle.dumps(capture))
+
+
+def go_on(folder: Path) -> None:
+    """Continue a tracking from the pieces in a folder."""
+    capture = pickle.loads((folder / "capture.pickle").read_bytes())
+    track_subject([capture], make_textured_model(), _TRACKING, folder)
+
+
 def copy_of(material: Path, parts: tuple[str, ...], root: Path) -> None:
     """Make fresh copies of some parts of the material."""
     root.mkdir(parents=True)
     for part in parts:
-        source, target = material / part, root / part
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if source.is_dir():
-            shutil.copytree(source, target)
-        else:
-            shutil.copy2(source, target)
-
-
-def summary(material: Path) -> str:
-    """Count the files of each ending."""
-    endings = [path.suffix or path.name for path in material.rglob("*") if path.is_file()]
-    return json.dumps({ending: endings.count(ending) for ending in sorted(set(endings))})
-
-
-CONFIG, SETTINGS = train_toy.CONFIG, train_toy.SETTINGS
+        (shutil.copytree if (material / part).is_dir() else shutil.copy2)(material / part, root / part)

@@ -15,8 +15,6 @@ import cv2
 import numpy as np
 import safetensors.numpy
 
-from fuzzing.tensor_faults import joined, split
-
 _UNSOUND = (Exception,)
 """Errors of files that are too faulty to be repaired. Such files stay as they are."""
 _GEOMETRY = (
@@ -24,6 +22,19 @@ _GEOMETRY = (
     "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis",
 )  # fmt: skip
 _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
+
+
+def split(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return header and body of a whole safetensors file."""
+    size = int.from_bytes(data[:8], "little")
+    return json.loads(data[8 : 8 + size]), data[8 + size :]
+
+
+def joined(header: Any, body: bytes) -> bytes:
+    """Return a safetensors file with this header, as a value or as text."""
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + body
 
 
 def json_checksum(content: dict[str, Any]) -> str:

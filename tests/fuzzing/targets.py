@@ -1,4 +1,4 @@
-"""List the targets of the fuzzer: the file that is made faulty, its reader, and the use of what was read."""
+"""The readers of mien: the file that is made faulty, how it is read, and the use of what was read."""
 
 import math
 from collections.abc import Callable
@@ -7,9 +7,26 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from fuzzing import exchange, faults, reads, uses
+from fuzzing import faults, lines, uses
 from fuzzing.faults import Place
-from fuzzing.material import ANALYSIS, RUN, SEQUENCE
+from fuzzing.material import ANALYSIS, PIECES, RUN, SEQUENCE
+from mien.avatar import load_avatar
+from mien.capture import read_capture
+from mien.capture.calibration import read_calibration
+from mien.capture.given import read_landmarks
+from mien.commands.config_file import read_config_file
+from mien.driving.speech import read_speech
+from mien.evaluation import read_metrics
+from mien.evaluation.image_folders import read_crops
+from mien.evaluation.load import load_experiments
+from mien.evaluation.partial import PartialScores
+from mien.export import read_gaussian_avatars_folder, read_glb_avatar, read_ply, read_sog, read_spz, read_usd
+from mien.face.flame import flame_face_model, read_flame
+from mien.render.camera_paths import read_cameras
+from mien.runtime import read_portable
+from mien.tracking import read_scoring, read_tracking
+from mien.training import read_curves, read_run_config, read_training_summary
+from mien.training.run import run_camera
 
 Read = Callable[[Path, Path], Any]
 """Reader that takes the folder with the copies and the faulty file."""
@@ -22,139 +39,130 @@ class Target:
     """A kind of file."""
 
     name: str
-    format: str
-    """Name of the format in the table of results."""
     files: str
-    """Pattern of the files below the material."""
-    parts: tuple[str, ...]
-    """Parts of the material that the reader needs."""
+    """Pattern of the files below the material. Its first part is what the reader needs, besides `parts`."""
     read: Read
     use: Use = uses.nothing
+    weight: float = 1.0
+    """Relative frequency among the targets."""
     exact: bool = False
     """Whether files with unrepaired damage must be refused or give exactly the same content."""
     fault: Callable[[Place, Random], str] = faults.faulty_file
-    weight: float = 1.0
-    """Relative frequency among the targets."""
+    parts: tuple[str, ...] = ()
+    """Further parts of the material that the reader needs."""
     named: bool = True
     """Whether the message must name a file of the folder."""
 
-
-def _in_workspaces() -> tuple[Target, ...]:
-    run, clip, whole = RUN, SEQUENCE, ("W",)
-    return (
-        Target("capture.json", "capture", f"{clip}/capture/capture.json", whole, reads.read_capture,
-               uses.use_capture, True, weight=2),
-        Target("landmarks.safetensors", "capture", f"{clip}/capture/landmarks.safetensors", whole,
-               reads.read_capture, uses.use_capture, True, weight=2),
-        Target("frames", "capture", f"{clip}/capture/*/*/*.png", whole, reads.read_capture, uses.use_capture, True),
-        Target("cache", "capture", f"{clip}/capture/cache/*", whole, reads.read_capture, uses.use_capture,
-               fault=faults.faulty_without_damage),
-        Target("tracking.json", "tracking", f"{clip}/tracking/tracking.json", whole, reads.read_tracking,
-               uses.use_run, True, weight=2),
-        Target("tracking.safetensors", "tracking", f"{clip}/tracking/tracking.safetensors", whole,
-               reads.read_tracking, uses.use_run, True, weight=3),
-        Target("scoring.json", "scoring", f"{clip}/scoring/scoring.json", whole, reads.read_scoring, uses.use_run,
-               True, weight=1.5),
-        Target("crops.safetensors", "scoring", f"{clip}/scoring/crops.safetensors", whole, reads.read_scoring,
-               uses.use_run, True, weight=1.5),
-        Target("masks", "scoring", f"{clip}/scoring/masks/*/*.png", whole, reads.read_scoring, uses.use_run, True),
-        Target("config.json", "run", f"{run}/config.json", whole, reads.read_config, uses.use_run, True, weight=2),
-        Target("training.json", "run", f"{run}/training.json", whole, reads.read_summary, uses.use_evaluation, True),
-        Target("curves.safetensors", "run", f"{run}/curves.safetensors", whole, reads.read_curves,
-               uses.use_evaluation, True),
-        Target("face_track.safetensors", "run", f"{run}/face_track.safetensors", whole, reads.read_face_track,
-               uses.use_evaluation, True),
-        Target("checkpoints", "run", f"{run}/checkpoints/*.safetensors", whole, reads.resume_run, uses.use_training,
-               weight=2),
-        Target("metrics.json", "metrics", f"{run}/metrics.json", whole, reads.read_metrics, uses.use_comparison,
-               True, weight=2),
-        Target("analysis.json", "analysis", f"{ANALYSIS}/analysis.json", whole, reads.read_analysis,
-               exact=True, weight=2),
-        Target("charts of an analysis", "analysis", f"{ANALYSIS}/*.png", whole, reads.read_analysis, weight=0.3),
-        Target("partial scores", "partial files", f"{run}/.*.partial", whole, reads.read_partial, uses.use_partial,
-               fault=faults.faulty_lines),
-        Target("tracking pieces", "partial files", "pieces/*.safetensors", ("pieces",), reads.go_on_tracking,
-               weight=0.3, named=False),
-    )  # fmt: skip
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The parts of the material that are copied for a case."""
+        return tuple(
+            dict.fromkeys((*self.parts, *([] if "*" in self.files.split("/")[0] else self.files.split("/")[:1])))
+        )
 
 
-def _avatars_and_given_files() -> tuple[Target, ...]:
-    run, whole, folder = RUN, ("W",), "GaussianAvatars' folder"
-    return (
-        Target("avatar.json", "avatar", f"{run}/avatar/avatar.json", whole, reads.read_avatar, uses.use_avatar,
-               True, weight=2),
-        Target("avatar.safetensors", "avatar", f"{run}/avatar/avatar.safetensors", whole, reads.read_avatar,
-               uses.use_avatar, True, weight=2),
-        Target("avatar's face_model.json", "avatar", f"{run}/avatar/face_model.json", whole, reads.read_avatar,
-               uses.use_avatar, True, weight=1.5),
-        Target("avatar's face_model.safetensors", "avatar", f"{run}/avatar/face_model.safetensors", whole,
-               reads.read_avatar, uses.use_avatar, True, weight=2),
-        Target("added face models", "face model", "cache/face_models/added/*", ("cache",), reads.read_added,
-               uses.use_face_model, weight=2, named=False),
-        Target("head.mien", ".mien", "head.mien", ("head.mien",), reads.read_portable, uses.use_portable, True,
-               faults.faulty_portable, 4),
-        Target("head.ply", ".ply", "head.ply", ("head.ply",), reads.read_ply, uses.use_gaussians, weight=2),
-        Target("pictures", "pictures", "pictures/*", ("pictures",), reads.read_pictures, weight=5),
-        Target("mattes", "pictures", "given/mattes/*", ("given",), reads.read_mattes, uses.expect_finite),
-        Target("points", "landmarks", "given/points.*", ("given",), reads.read_points, uses.expect_rows, weight=2),
-        Target("crops.json", "crops, cameras", "given/crops.json", ("given",), reads.read_crops, uses.expect_finite),
-        Target("cameras.json", "crops, cameras", "given/cameras.json", ("given", "head.ply"), reads.read_cameras,
-               uses.use_cameras, weight=1.5),
-        Target("take.csv", "motion", "given/take.csv", ("given",), reads.read_motion, uses.expect_motion, weight=2),
-        Target("take.json", "motion", "given/*take.json", ("given",), reads.read_motion, uses.expect_motion, weight=2),
-        Target("tiny.npz", "FLAME's schema", "flame/tiny.npz", ("flame",), reads.read_flame, uses.use_flame, weight=2),
-        Target("tiny.pkl", "FLAME's schema", "flame/tiny.pkl", ("flame",), reads.read_flame, uses.use_flame, weight=2),
-        Target("point_cloud.ply", folder, "gaussian_avatars/point_cloud.ply", ("gaussian_avatars",),
-               reads.read_dataset, uses.use_gaussian_avatars, weight=2),
-        Target("flame_param.npz", folder, "gaussian_avatars/flame_param.npz", ("gaussian_avatars",),
-               reads.read_dataset, uses.use_gaussian_avatars, weight=2),
-        Target("folder's face model", folder, "gaussian_avatars/face_model.*", ("gaussian_avatars",),
-               reads.read_dataset, uses.use_gaussian_avatars, True),
-        Target("folder on FLAME", folder, "flame_avatars/*", ("flame_avatars", "flame"),
-               reads.read_avatar_on_flame, uses.use_gaussian_avatars),
-        Target("imports", folder, "gaussian_avatars/*", ("gaussian_avatars", "cache"), reads.nothing_read,
-               uses.run_an_import, fault=faults.any_fault, weight=0.5, named=False),
-        Target("videos", "videos", "videos/*", ("videos",), reads.read_video, weight=3),
-        Target("playlists", "videos", "videos/clip.mp4", ("videos",), reads.read_no_playlist,
-               fault=faults.write_playlist, weight=1),
-        Target("names", "names", "[gpv]*/*.*", ("given", "pictures", "videos"), reads.read_by_ending,
-               fault=faults.rename, named=False),
-        Target("places", "workspace", "W/**/*", ("W",), reads.read_workspace, uses.use_run,
-               fault=faults.faulty_place, weight=4),
-        Target("commands", "workspace", "W/**/*", ("W", "cache"), reads.nothing_read, uses.run_a_line,
-               fault=faults.any_fault, weight=1, named=False),
-    )  # fmt: skip
+def _of(read: Callable[[Path], Any], place: str = "") -> Read:
+    """Return a reader of the file itself, or of a folder of the material."""
+    return lambda root, file: read(root / place if place else file)
 
 
-def _exchanged_files() -> tuple[Target, ...]:
-    exports, study, usd = ("exports",), ("study",), "USD"
-    stages = (
-        Target(f"head.{ending}", usd, f"exports/head.{ending}", exports, exchange.read_splats, uses.use_gaussians,
-               fault=faults.faulty_new_name)
-        for ending in ("usd", "usda", "usdc", "usdz")
-    )  # fmt: skip
-    return (
-        Target("scene of a .glb", ".glb", "exports/head.glb", exports, exchange.read_scene, weight=2),
-        Target("avatar of a .glb", ".glb", "exports/head.glb", exports, exchange.read_avatar_of_glb,
-               uses.use_portable, weight=2),
-        Target("head.spz", ".spz", "exports/head.spz", exports, exchange.read_splats, uses.use_gaussians, weight=3),
-        Target("head.sog", ".sog", "exports/head.sog", exports, exchange.read_splats, uses.use_gaussians, weight=3),
-        *stages,
-        Target("head.packed", ".packed, in node", "packed/*.packed", ("packed", "web"), exchange.read_in_node,
-               fault=faults.faulty_content, weight=3),
-        Target("head.mien in node", ".packed, in node", "head.mien", ("head.mien", "web"), exchange.read_in_node,
-               fault=faults.faulty_content),
-        Target("sounds", "sounds", "sounds/*", ("sounds",), exchange.read_sound, uses.expect_motion, weight=4),
-        Target("rig.json", "calibrations", "rig/rig.json", ("rig",), exchange.read_rig, exchange.use_rig, weight=2),
-        Target("takes", "motion", "takes/*", ("takes",), reads.read_motion, uses.expect_motion, weight=4),
-        Target("study.key.json", "study", "study/study.key.json", study, exchange.tally, exact=True),
-        Target("answers.json", "study", "study/answers.json", study, exchange.tally),
-        Target("config files", "--config", "configs/*.json", ("configs",), exchange.read_config, exchange.use_config,
-               weight=2),
-    )  # fmt: skip
+_CAPTURE, _TRACKING, _SCORING = f"{SEQUENCE}/capture", f"{SEQUENCE}/tracking", f"{SEQUENCE}/scoring"
+_READ_CAPTURE, _READ_TRACKING = _of(read_capture, _CAPTURE), _of(read_tracking, _TRACKING)
+_READ_SCORING, _READ_AVATAR = _of(read_scoring, _SCORING), _of(load_avatar, RUN)
+_FOLDER = {"read": uses.read_dataset, "use": uses.use_gaussian_avatars}
 
 
-TARGETS = {target.name: target for target in (*_in_workspaces(), *_avatars_and_given_files(), *_exchanged_files())}
+def _config(root: Path, file: Path) -> Any:
+    return uses.known(read_run_config(root / RUN)), run_camera(root / RUN)
+
+
+def _on_flame(root: Path, file: Path) -> Any:
+    model = flame_face_model(read_flame(root / "flame/tiny.npz"), "tiny")
+    return read_gaussian_avatars_folder(root / "flame_avatars", model)
+
+
+def _read_splats(root: Path, file: Path) -> Any:
+    return {".spz": read_spz, ".sog": read_sog}.get(file.suffix, read_usd)(file)
+
+
+_TARGETS = (
+    Target("capture.json", f"{_CAPTURE}/capture.json", _READ_CAPTURE, uses.use_capture, 2, True),
+    Target("landmarks.safetensors", f"{_CAPTURE}/landmarks.safetensors", _READ_CAPTURE, uses.use_capture, 2, True),
+    Target("frames", f"{_CAPTURE}/*/*/*.png", _READ_CAPTURE, uses.use_capture, 1, True),
+    Target("cache", f"{_CAPTURE}/cache/*", _READ_CAPTURE, uses.use_capture, fault=faults.faulty_without_damage),
+    Target("tracking.json", f"{_TRACKING}/tracking.json", _READ_TRACKING, uses.use_run, 2, True),
+    Target("tracking.safetensors", f"{_TRACKING}/tracking.safetensors", _READ_TRACKING, uses.use_run, 3, True),
+    Target("scoring.json", f"{_SCORING}/scoring.json", _READ_SCORING, uses.use_run, 1.5, True),
+    Target("crops.safetensors", f"{_SCORING}/crops.safetensors", _READ_SCORING, uses.use_run, 1.5, True),
+    Target("masks", f"{_SCORING}/masks/*/*.png", _READ_SCORING, uses.use_run, 1, True),
+    Target("config.json", f"{RUN}/config.json", _config, uses.use_run, 2, True),
+    Target("training.json", f"{RUN}/training.json", lambda root, file: uses.known(read_training_summary(root / RUN)),
+           uses.use_evaluation, 1, True),
+    Target("curves.safetensors", f"{RUN}/curves.safetensors", _of(read_curves, RUN), uses.use_evaluation, 1, True),
+    Target("face_track.safetensors", f"{RUN}/face_track.safetensors", uses.read_track, uses.use_evaluation, 1, True),
+    Target("checkpoints", f"{RUN}/checkpoints/*.safetensors", uses.resume_run, uses.use_training, 2),
+    Target("faces of a run", f"{RUN}/face_track.safetensors",
+           lambda root, file: load_experiments(root / RUN, [root / SEQUENCE]), weight=0.3),
+    Target("metrics.json", f"{RUN}/metrics.json", lambda root, file: uses.known(read_metrics(root / RUN)),
+           uses.use_comparison, 2, True),
+    Target("analysis.json", f"{ANALYSIS}/analysis.json", uses.read_analysis, weight=2, exact=True),
+    Target("charts", f"{ANALYSIS}/*.png", uses.read_analysis, weight=0.3),
+    Target("partial scores", f"{RUN}/.*.partial", lambda root, file: PartialScores(file, "0").read(), uses.use_partial,
+           fault=faults.faulty_without_damage),
+    Target("pieces", f"{PIECES}/*.safetensors", uses.go_on_tracking, weight=0.3, named=False),
+    Target("avatar.json", f"{RUN}/avatar/avatar.json", _READ_AVATAR, uses.use_avatar, 2, True),
+    Target("avatar.safetensors", f"{RUN}/avatar/avatar.safetensors", _READ_AVATAR, uses.use_avatar, 2, True),
+    Target("face_model.json", f"{RUN}/avatar/face_model.json", _READ_AVATAR, uses.use_avatar, 1.5, True),
+    Target("face_model.safetensors", f"{RUN}/avatar/face_model.safetensors", _READ_AVATAR, uses.use_avatar, 2, True),
+    Target("avatars", "avatars/*/avatar.*", lambda root, file: load_avatar(file.parent), uses.use_avatar, 3),
+    Target("names in avatars", "avatars/*/avatar.json", lambda root, file: load_avatar(file.parent), weight=0.2,
+           named=False),
+    Target("added face models", "cache/face_models/added/*", uses.read_added, uses.use_face_model, 2, named=False),
+    Target("head.mien", "head.mien", _of(read_portable), uses.use_portable, 2, True),
+    Target("miens", "miens/*", _of(read_portable), uses.use_portable, 3),
+    Target("head.ply", "head.ply", _of(read_ply), uses.use_gaussians, 2),
+    Target("pictures", "pictures/*", uses.read_pictures, weight=5),
+    Target("mattes", "given/mattes/*", uses.read_mattes, uses.expect_finite),
+    Target("points", "given/points.*", lambda root, file: read_landmarks(file, 3), uses.expect_rows, 2),
+    Target("crops.json", "given/crops.json", _of(read_crops), uses.expect_finite),
+    Target("cameras.json", "given/cameras.json", _of(read_cameras), uses.use_cameras, 1.5, parts=("head.ply",)),
+    Target("rig.json", "rig/rig.json", _of(read_calibration), uses.use_rig, 2),
+    Target("take.csv", "given/take.csv", uses.read_motion, uses.expect_motion, 2),
+    Target("take.json", "given/*take.json", uses.read_motion, uses.expect_motion, 2),
+    Target("takes", "takes/*", uses.read_motion, uses.expect_motion, 4),
+    Target("sounds", "sounds/*", _of(read_speech), uses.expect_motion, 3),
+    Target("tiny.npz", "flame/tiny.npz", _of(read_flame), uses.use_flame, 2),
+    Target("tiny.pkl", "flame/tiny.pkl", _of(read_flame), uses.use_flame, 2),
+    Target("point_cloud.ply", "gaussian_avatars/point_cloud.ply", **_FOLDER, weight=2),
+    Target("flame_param.npz", "gaussian_avatars/flame_param.npz", **_FOLDER, weight=2),
+    Target("folder's face model", "gaussian_avatars/face_model.*", **_FOLDER, exact=True),
+    Target("folder on FLAME", "flame_avatars/*", _on_flame, uses.use_gaussian_avatars, parts=("flame",)),
+    Target("imports", "gaussian_avatars/*", lambda root, file: None, lines.run_an_import, 0.5, fault=faults.any_fault,
+           parts=("cache",), named=False),
+    Target("videos", "videos/*", uses.read_video, weight=3),
+    Target("playlists", "videos/clip.mp4", uses.read_no_playlist, fault=faults.write_playlist),
+    Target("names", "[gpv]*/*.*", uses.read_by_ending, fault=faults.rename, parts=("given", "pictures", "videos"),
+           named=False),
+    Target("places", "W/**/*", uses.read_workspace, uses.use_run, 4, fault=faults.faulty_place),
+    Target("commands", "W/**/*", lambda root, file: None, lines.run_a_line, 1, fault=faults.any_fault, named=False,
+           parts=("cache",)),
+    Target("lines", "W/**/*", lambda root, file: None, lines.run_an_odd_line, 2, fault=lines.faulty_or_not, named=False,
+           parts=lines.PARTS),
+    Target("scene of a .glb", "exports/head.glb", uses.read_scene, weight=2),
+    Target("avatar of a .glb", "exports/head.glb", _of(read_glb_avatar), uses.use_portable, 2),
+    Target("head.spz", "exports/head.spz", _read_splats, uses.use_gaussians, 3),
+    Target("head.sog", "exports/head.sog", _read_splats, uses.use_gaussians, 3),
+    *(Target(f"head.{ending}", f"exports/head.{ending}", _read_splats, uses.use_gaussians, fault=faults.faulty_new_name)
+      for ending in ("usd", "usda", "usdc", "usdz")),
+    Target("head.packed", "packed/*.packed", uses.read_in_node, weight=3, parts=("web",)),
+    Target("head.mien in node", "head.mien", uses.read_in_node, parts=("web",)),
+    Target("study.key.json", "study/study.key.json", uses.tally, exact=True),
+    Target("answers.json", "study/answers.json", uses.tally),
+    Target("config files", "configs/*.json", _of(read_config_file), uses.use_config, 2),
+)  # fmt: skip
+TARGETS = {target.name: target for target in _TARGETS}
+"""The table of readers. That of damage has several parts: `formats.FORMATS` has random faults by the format of a file,
+`faults.PLACES` what may lie in the place of a file, and `values.VALUES` single values that a reader must refuse."""
 
 
 def present(material: Path) -> list[str]:
@@ -162,11 +170,11 @@ def present(material: Path) -> list[str]:
     return [
         target.name
         for target in TARGETS.values()
-        if all((material / part).exists() for part in target.parts) and any(material.glob(target.files))
+        if all((material / part).exists() for part in target.needs) and any(material.glob(target.files))
     ]
 
 
-def spread(total: int, names: list[str]) -> list[tuple[str, int]]:
+def spread(total: int, names: list[str]) -> list[str]:
     """Divide cases among the targets by their weights. They are mixed, so that any part of them holds all targets."""
     chosen = [TARGETS[name] for name in names]
     share = total / sum(target.weight for target in chosen)
@@ -174,4 +182,4 @@ def spread(total: int, names: list[str]) -> list[tuple[str, int]]:
     for target in chosen:
         amount = max(1, math.ceil(share * target.weight))
         places += [((number + 0.5) / amount, target.name, number) for number in range(amount)]
-    return [(name, number) for _, name, number in sorted(places)]
+    return [f"{name}:{{seed}}:{number}" for _, name, number in sorted(places)]

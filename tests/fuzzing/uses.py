@@ -1,55 +1,240 @@
-"""Use what was read as people do, to check that accepted files do no harm later."""
+"""Readers that take some lines, and uses of what was read, to see that accepted files do no harm later."""
 
 import contextlib
 import io
+import itertools
+import json
 import os
+import subprocess
 import tempfile
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
-from fuzzing import content
-from fuzzing.material import CONFIG, QUICK, RUN, SEQUENCE, SETTINGS
+from fuzzing.material import ANALYSIS, CONFIG, GROWTH, PIECES, QUICK, RUN, SEQUENCE, SETTINGS, go_on
 from mien import cli
-from mien.avatar import load_avatar
+from mien.avatar import METHODS, load_avatar
 from mien.avatar.baking import make_portable
+from mien.capture.calibration import CalibratedCamera
+from mien.capture.crop import whole_picture
+from mien.capture.given import GivenMattes
+from mien.capture.readings import readings_of
+from mien.capture.source import FrameSelection, open_source, read_image
+from mien.capture.video import count_frames, probe_video, read_video_frames
+from mien.commands.config_file import ConfigFile
+from mien.commands.options import TrainOptions, with_settings
 from mien.commands.stages.importing import front_camera
-from mien.datasets import datasets, write_sequence
-from mien.driving import Motion, drive
+from mien.datasets import TrainedAvatar, datasets, recognised, write_sequence
+from mien.driving import Motion, drive, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
-from mien.evaluation import evaluate
-from mien.evaluation import read_metrics as read_figures
+from mien.evaluation import evaluate, read_metrics
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.compare_report import comparison_html
+from mien.evaluation.image_source import open_pictures, read_picture
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.text import comparison_text
-from mien.export import in_world, write_gaussian_avatars_folder, write_ply
-from mien.export import read_ply as read_gaussians
-from mien.face import FaceModel
+from mien.export import in_world, read_glb, read_ply, write_gaussian_avatars_folder, write_ply
+from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
 from mien.face.flame import flame_face_model
+from mien.lab.analysis import AnalysisOptions, run_analysis
+from mien.lab.analysis.study.files import read_all_answers, read_key
+from mien.lab.analysis.study.tally import tally_content, tally_text
 from mien.render import rasterize
 from mien.runtime import Avatar, write_portable
+from mien.storage import read_tensors
 from mien.training import read_face_track, read_sequence, train, write_imported_run
+from mien.training.checkpoint import resume
 from mien.training.run import run_camera
-from mien.workspace import Workspace
-from toy_scene import toy_camera, toy_face_model
+from mien.training.trainer import start
+from mien.workspace import Workspace, open_workspace
+from toy_scene import toy_camera, toy_face_model, toy_sequence
+
+SEEN = 3
+"""Number of pictures of a video that are read."""
+_READER = Path(__file__).parents[2] / "web" / "tests" / "read.mjs"
+_WHITE = torch.ones(3)
 
 
 class CommandError(Exception):
     """A command ended in a way that commands must not end."""
 
 
+def content_of(value: Any) -> Any:
+    """Return a value in a form that can be compared."""
+    if isinstance(value, nn.Module):
+        return content_of(dict(value.state_dict()))
+    if isinstance(value, Tensor):
+        return content_of(value.detach().numpy())
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if is_dataclass(value):
+        return {field.name: content_of(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {name: content_of(item) for name, item in value.items()}
+    return [content_of(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+_MAY_BE_NAN = frozenset({"landmarks", "residuals", "pixel_residuals", "sharpness", "brightness", "clipped", "quality",
+                         "timestamps", "source", "settings"})  # fmt: skip
+"""Names of values that may be NaN, because a face was not found or the value is only shown."""
+
+
+def expect_finite(root: Path, found: Any, dice: Random, name: str = "") -> None:
+    """Check that all numbers in a value are finite, except for those where NaN means that something is unknown."""
+    if isinstance(found, nn.Module):
+        found = dict(found.state_dict())
+    if isinstance(found, Tensor):
+        found = found.detach().numpy()
+    if is_dataclass(found) and not isinstance(found, type):
+        found = {field.name: getattr(found, field.name) for field in fields(found)}
+    if name in _MAY_BE_NAN:
+        return
+    if isinstance(found, (float, np.ndarray)):
+        assert not isinstance(found, np.ndarray) or found.dtype.kind in "fiub", found.dtype
+        assert np.isfinite(found).all(), f"{name} holds numbers that are not finite"
+    for key, item in found.items() if isinstance(found, dict) else ():
+        expect_finite(root, item, dice, str(key))
+    for item in found if isinstance(found, (tuple, list)) else ():
+        expect_finite(root, item, dice, name)
+
+
+# Readers --------------------------------------------------------------------------------------------------------------
+
+
+def known(found: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries except for the one that results from damage to the name `checksum`."""
+    names = ("method", "settings", "data", "mien", "command_line", "protocols", "training", "fingerprints", "steps",
+             "seconds")  # fmt: skip
+    return {name: value for name, value in found.items() if name in names}
+
+
+def read_track(root: Path, file: Path) -> FaceParams:
+    try:
+        return FaceParams(**read_tensors(file))
+    except TypeError as error:  # as `mien.evaluation.load` does
+        raise UserError(f"{file}: {error}") from None
+
+
+def resume_run(root: Path, file: Path) -> Any:
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    state = start([sequence], face_model, CONFIG, replace(SETTINGS, split="tail"))
+    resume(root / RUN / "checkpoints", state, SETTINGS.record_every)
+    return state.avatar
+
+
+def go_on_tracking(root: Path, file: Path) -> None:
+    go_on(root / PIECES)
+
+
+def read_added(root: Path, file: Path) -> FaceModel:
+    os.environ["MIEN_CACHE"] = str(root / "cache")
+    available_face_models()
+    return load_face_model("mine")
+
+
+def read_pictures(root: Path, file: Path) -> None:
+    for each in (read_image(file), read_picture(file)):
+        assert (each.dtype, each.ndim, each.size > 0) == (np.uint8, 3, True), (each.dtype, each.shape)
+    source = open_source(file.parent, FrameSelection(), 25.0)
+    assert source.expected_frames == len(list(source.frames(64)))
+    open_pictures(file.parent)
+
+
+def read_mattes(root: Path, file: Path) -> list[np.ndarray]:
+    mattes = GivenMattes(root / "given/mattes", (32, 32))
+    return [mattes.matte(number, whole_picture(32, 32, 32)) for number in range(3)]
+
+
+def read_motion(root: Path, file: Path) -> Motion:
+    return read_live_link_face(file) if file.suffix == ".csv" else read_blendshape_json(file)
+
+
+def read_video(root: Path, file: Path) -> None:
+    probe_video(file)
+    count_frames(file)
+    for seconds, frame in itertools.islice(read_video_frames(file, 512), SEEN):
+        assert np.isfinite(seconds), seconds
+        assert (frame.dtype, frame.ndim) == (np.uint8, 3), (frame.dtype, frame.shape)
+
+
+def read_no_playlist(root: Path, file: Path) -> None:
+    assert not list(itertools.islice(read_video_frames(file, 512), SEEN)), "a list made mien read other files"
+
+
+def read_by_ending(root: Path, file: Path) -> None:
+    """Read a file by its ending from its own folder, as people do."""
+    with contextlib.chdir(file.parent):
+        name = Path(file.name)
+        if name.suffix in (".csv", ".json"):
+            read_motion(root, name)
+        elif name.suffix in (".png", ".jpg", ".webp", ".tif", ".bmp"):
+            read_pictures(root, name)
+        elif name.suffix != ".safetensors":
+            read_video(root, name)
+            open_source(name, FrameSelection(), 25.0)
+
+
+def read_workspace(root: Path, file: Path) -> Any:
+    workspace = open_workspace(root / "W")
+    read_sequence(workspace.sequence_dir(workspace.pick_sequence(None)))
+    return load_avatar(workspace.run_dir(workspace.pick_run(None)))
+
+
+def read_analysis(root: Path, file: Path) -> Any:
+    """Return what an analysis keeps: the parts, without what depends on the command."""
+    options = AnalysisOptions()
+    return run_analysis(GROWTH, GROWTH.parts, root / RUN, [root / SEQUENCE], root / ANALYSIS, options)["parts"]
+
+
+def read_dataset(root: Path, file: Path) -> Any:
+    """Return what the dataset holds that a file belongs to: an avatar, or a list of sequences."""
+    places = [path for path in (file, *file.parents) if root in path.parents]
+    path = [path for path in places if any(each.recognises(path) is not None for each in datasets())] or places[-1:]
+    found = recognised(path[0])[0].read(path[0], None)
+    return found if isinstance(found, TrainedAvatar) else list(found)
+
+
+def read_scene(root: Path, file: Path) -> None:
+    """Read all arrays of a .glb scene, as programs do that show it."""
+    glb = read_glb(file)
+    accessors = glb.content.get("accessors")
+    for index in range(min(len(accessors), 50) if isinstance(accessors, list) else 0):
+        try:
+            glb.array(index).sum()
+        except ValueError as error:
+            raise UserError(f"{file}: {error}") from None
+
+
+def read_in_node(root: Path, file: Path) -> None:
+    """Read an avatar with the web runtime, as pages do, and pose it."""
+    command = ["node", str(_READER), str(root / "web/mien.js"), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, f"node ended with {done.returncode}: {done.stderr[-300:]}"
+    found = json.loads(done.stdout)
+    assert not found["message"].startswith("not told"), found["message"]
+    if found["memory"] > 1 << 30:
+        raise MemoryError(f"node took {found['memory'] >> 20} MiB")
+    if found["message"]:
+        raise UserError(f"{file}: {found['message']}")
+
+
+def tally(root: Path, file: Path) -> str:
+    """Count the answers of a study."""
+    key = read_key(root / "study/study.key.json")
+    return tally_text(tally_content(key, read_all_answers([root / "study/answers.json"], key)))
+
+
+# Uses -----------------------------------------------------------------------------------------------------------------
+
+
 def nothing(root: Path, found: Any, dice: Random) -> None:
     """Do nothing else."""
-
-
-def expect_finite(root: Path, found: Any, dice: Random) -> None:
-    content.expect_finite(found)
 
 
 def expect_rows(root: Path, found: np.ndarray, dice: Random) -> None:
@@ -58,14 +243,13 @@ def expect_rows(root: Path, found: np.ndarray, dice: Random) -> None:
 
 
 def expect_motion(root: Path, found: Motion, dice: Random) -> None:
-    numbers = [getattr(found, field.name) for field in fields(found) if field.name != "notes"]
-    assert all(np.isfinite(number).all() for number in numbers)
+    assert all(np.isfinite(getattr(found, field.name)).all() for field in fields(found) if field.name != "notes")
     assert all("\n" not in note for note in found.notes)
     assert 0 < found.fps <= 1e6, found.fps
 
 
 def use_capture(root: Path, found: Any, dice: Random) -> None:
-    content.expect_finite(found.calibration)
+    expect_finite(root, found.calibration, dice)
     assert found.images[0, 0].shape == (found.height, found.width, 3)
     np.asarray(found.mattes[-1, -1]).sum()
     found.usable  # noqa: B018
@@ -79,7 +263,7 @@ def use_run(root: Path, found: Any, dice: Random) -> None:
 
 def use_evaluation(root: Path, found: Any, dice: Random) -> None:
     evaluate(root / RUN, [root / SEQUENCE], QUICK)
-    read_figures(root / RUN)
+    read_metrics(root / RUN)
 
 
 def use_training(root: Path, found: Any, dice: Random) -> None:
@@ -94,24 +278,27 @@ def use_training(root: Path, found: Any, dice: Random) -> None:
 
 def use_rendering(root: Path, found: Any, dice: Random) -> None:
     avatar, sequence = load_avatar(root / RUN), read_sequence(root / SEQUENCE)
-    camera = run_camera(root / RUN).fitted(32, 32)
     face = sequence.tracking.face
     driven = drive(face, face[0], avatar.subject, avatar.face_model.expression_bounds, who=str(root / SEQUENCE))
-    with torch.no_grad():
-        for each in (camera, sequence.tracking.cameras[0].fitted(32, 32)):
-            image = rasterize(avatar.pose(driven[0]).gaussians.timestep(0), each, torch.ones(3)).image
-            assert image.isfinite().all(), "a picture that is not finite"
+    for each in (run_camera(root / RUN), sequence.tracking.cameras[0]):
+        _draw(avatar.pose(driven[0]).gaussians.timestep(0), each.fitted(32, 32))
+
+
+@torch.no_grad()
+def _draw(gaussians: Any, camera: Any = None) -> None:
+    image = rasterize(gaussians, toy_camera(32) if camera is None else camera, _WHITE).image
+    assert image.isfinite().all(), "a picture that is not finite"
 
 
 def use_partial(root: Path, found: Any, dice: Random) -> None:
-    """Add and forget scores, and evaluate with the faulty lines after the correct first one."""
+    """Evaluate with the faulty lines after the correct first one."""
     for file in (root / RUN).glob(".*.partial"):
-        kept = PartialScores(file, "0")
-        kept.read()
+        PartialScores(file, "0").read()
     use_evaluation(root, found, dice)
 
 
 def use_comparison(root: Path, found: Any, dice: Random) -> None:
+    run_line("evaluate {W} --compare", root)
     comparison = compare_runs({"a": root / RUN})
     comparison_text(comparison, bold=False)
     comparison.content()
@@ -119,67 +306,55 @@ def use_comparison(root: Path, found: Any, dice: Random) -> None:
 
 
 def use_avatar(root: Path, found: Any, dice: Random) -> None:
-    content.expect_finite(found)
+    expect_finite(root, found, dice)
     with torch.no_grad():
         gaussians = found.pose(found.subject).gaussians.timestep(0)
-        rasterize(gaussians, toy_camera(32), torch.ones(3))
+        _draw(gaussians)
         if dice.random() < 0.3:
             write_ply(root / "out.ply", in_world(gaussians))
             write_portable(root / "out.mien", make_portable(found, toy_camera(32), str(root)))
 
 
 def use_face_model(root: Path, found: FaceModel, dice: Random) -> None:
-    content.expect_finite(found)
-    found(found.neutral(2))
+    expect_finite(root, found, dice)
     vertices = found.vertices_reference(found.neutral(1))
-    for name in found.landmarks:
-        assert found.landmark_positions(vertices, name).isfinite().all()
+    assert all(found.landmark_positions(vertices, name).isfinite().all() for name in found.landmarks)
 
 
 def use_portable(root: Path, found: Any, dice: Random) -> None:
-    content.expect_finite(found)
+    expect_finite(root, found, dice)
     avatar = Avatar(found)
     assert max(found.camera.width, found.camera.height) <= 1 << 15, "a camera of this size was let in"
-    posed = avatar.pose()
     avatar.pose(dict.fromkeys(avatar.expression_names, 0.5))
-    image, _ = avatar.render(posed, found.camera.resized(32, 32))
+    image, _ = avatar.render(avatar.pose(), found.camera.resized(32, 32))
     assert np.isfinite(image).all(), "a picture that is not finite"
 
 
 def use_gaussians(root: Path, found: Any, dice: Random) -> None:
-    content.expect_finite(found)
+    expect_finite(root, found, dice)
     if len(found) < 100_000:
-        image = rasterize(found, toy_camera(32), torch.ones(3)).image
-        assert image.isfinite().all(), "a picture that is not finite"
+        _draw(found)
 
 
 def use_cameras(root: Path, found: Any, dice: Random) -> None:
-    content.expect_finite(found)
-    gaussians = read_gaussians(root / "head.ply")
+    expect_finite(root, found, dice)
+    gaussians = read_ply(root / "head.ply")
     for camera in found[:2]:
-        for each in (
-            camera.fitted(32, 32),
-            replace(camera, width=min(camera.width, 64), height=min(camera.height, 64)),
-        ):
-            assert rasterize(gaussians, each, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"
+        _draw(gaussians, camera.fitted(32, 32))
+        _draw(gaussians, replace(camera, width=min(camera.width, 64), height=min(camera.height, 64)))
 
 
 def use_flame(root: Path, found: Any, dice: Random) -> None:
-    content.expect_finite(found)
-    model = flame_face_model(found, "tiny")
-    content.expect_finite(model)
-    model(model.neutral(1))
+    expect_finite(root, found, dice)
+    use_face_model(root, flame_face_model(found, "tiny"), dice)
 
 
 def use_gaussian_avatars(root: Path, found: Any, dice: Random) -> None:
     """Pose and draw what a folder holds, and write it as the run and the folder that a user would make of it."""
-    content.expect_finite(found.avatar)
-    content.expect_finite(found.face)
-    timestep = dice.randrange(len(found.face))
-    camera = front_camera(found.avatar).fitted(32, 32)
-    with torch.no_grad():
-        gaussians = found.avatar.pose(found.face[timestep]).gaussians.timestep(0)
-        assert rasterize(gaussians, camera, torch.ones(3)).image.isfinite().all(), "a picture that is not finite"
+    expect_finite(root, found.avatar, dice)
+    expect_finite(root, found.face, dice)
+    camera, timestep = front_camera(found.avatar).fitted(32, 32), dice.randrange(len(found.face))
+    _draw(found.avatar.pose(found.face[timestep]).gaussians.timestep(0), camera)
     if found.avatar.face_model.shareable and dice.random() < 0.3:  # the others need the user's own copy of the model
         write_imported_run(root / "I/runs/a", found.avatar, found.face, camera, root / "gaussian_avatars")
         again = load_avatar(root / "I/runs/a")
@@ -188,46 +363,47 @@ def use_gaussian_avatars(root: Path, found: Any, dice: Random) -> None:
 
 def use_sequences(root: Path, found: Any, dice: Random) -> None:
     """Write the sequences of a dataset as an import does, and read them as training does."""
-    workspace = Workspace(root / "I")
     for sequence in found:
-        content.expect_finite(sequence.tracking)
-        folder = workspace.sequence_dir(sequence.capture.name)
+        expect_finite(root, sequence.tracking, dice)
+        folder = Workspace(root / "I").sequence_dir(sequence.capture.name)
         write_sequence(folder, sequence, datasets()[0], root)
         read_sequence(folder)
 
 
-LINES = (
-    "render {W} --out {root}/o.png --width 16 --height 16", "render {W} --out {root}/o.png --size 16 --path captured",
-    "render {W} --out {root}/o.png --size 16 --sequence clip",
-    "render {W} --out {root}/o_%03d.png --size 16 --frames 2", "drive {W} --by {W} --out {root}/o.mp4 --size 16",
-    "export {W} --out {root}/o.ply",
-    "export {W} --out {root}/o.mien", "export {W} --out {root}/o.ply --series clip", "evaluate {W} --no-perceptual",
-    "evaluate {W} --compare", "evaluate {W} --compare --json",
-    "train {W} --steps 1 --run other", "train {W} --steps 1 --run toy", "track {W} --again", "track {W}",
-    "face-models", "face-models --json", "analyze gaussian-avatars {W} --parts growth",
-    "analyze gaussian-avatars {W} --parts growth --json", "export {W} --out {root}/o --format gaussian-avatars",
-    "track {W} --hold-out clip",
-)  # fmt: skip
-IMPORTS = (
-    "import {root}/gaussian_avatars --out {root}/new", "import {root}/gaussian_avatars --out {root}/new --run other",
-)  # fmt: skip
+def use_rig(root: Path, found: list[CalibratedCamera], dice: Random) -> None:
+    """Straighten a picture of every camera, and read the calibration in the other usual ways."""
+    for one in found[:3]:
+        expect_finite(root, one.camera, dice)
+        if one.lens is not None:
+            assert one.lens.straighten(np.zeros((32, 32, 3), np.uint8)).shape == (32, 32, 3)
+            assert np.isfinite(one.lens.straighten_points(np.full((4, 2), 7.0), 32, 32)).all()
+    for reading in readings_of([one.camera for one in found[:3]]):
+        expect_finite(root, reading.cameras, dice)
 
 
-def run_a_line(root: Path, found: Any, dice: Random) -> None:
-    """Run one command on the faulty workspace, in this process."""
-    run_line(dice.choice(LINES), root)
+def use_config(root: Path, found: ConfigFile, dice: Random) -> None:
+    """Make the options of `mien train` of the file, as its command line does, and check them."""
+    from mien.commands.train import Command
 
-
-def run_an_import(root: Path, found: Any, dice: Random) -> None:
-    """Import the faulty folder, in this process, and draw what was made of it."""
-    run_line(dice.choice(IMPORTS), root)
-    run_line("render {root}/new --out {root}/o.png --size 16 --timestep 1", root)
+    arguments = ["--config", str(found.path)]
+    arguments += ["--method", dice.choice(list(METHODS))] if found.method is None else []
+    command = with_settings(Command, arguments)
+    options = next(field for field in fields(command) if field.name == "options").default_factory()  # type: ignore[misc]
+    assert isinstance(options, TrainOptions)
+    options.check()
+    if dice.random() < 0.3:
+        with contextlib.suppress(UserError):  # there is no such workspace
+            run_line(f"train {{root}}/none --config {found.path}", root)
 
 
 def run_line(line: str, root: Path) -> None:
-    """Run a command in this process. A refusal is raised as a `UserError`."""
+    """Run a command in this process, with W, root in place of {W}, {root}. A refusal is raised as a `UserError`."""
+    run_words([word.format(W=root / "W", root=root) for word in line.split()], root)
+
+
+def run_words(words: list[str], root: Path) -> None:
+    """Run a command in this process. A refusal is raised as a `UserError`, another end as a `CommandError`."""
     os.environ["MIEN_CACHE"] = str(root / "cache")
-    words = [word.format(W=root / "W", root=root) for word in line.split()]
     told = io.StringIO()
     with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
         try:
@@ -237,13 +413,9 @@ def run_line(line: str, root: Path) -> None:
     lines = [line for line in told.getvalue().splitlines() if line.startswith("mien: ")]
     if code == cli.EXIT_USER_ERROR and len(lines) == 1:
         raise UserError(lines[0])
+    if code == cli.EXIT_INTERRUPTED:
+        raise UserError("stopped")
     if code != 0:
-        raise CommandError(f"{words[0]}: exit code {code}, {len(lines)} lines; {_crash()}")
-
-
-def _crash() -> str:
-    logs = sorted(Path(tempfile.gettempdir()).glob("mien-crash-*.log"))
-    text = logs[-1].read_text() if logs else ""
-    for log in logs:
-        log.unlink()
-    return text[-1500:]
+        logs = sorted(Path(tempfile.gettempdir()).glob("mien-crash-*.log"))
+        text = logs[-1].read_text() if logs else told.getvalue()
+        raise CommandError(f"{words[:1]}: exit code {code}, {len(lines)} lines; {text[-1500:]}")

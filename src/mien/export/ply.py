@@ -21,7 +21,7 @@ _MAX_HEADER_BYTES = 65536
 _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
 """Number of SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
 _MAX_COUNT_DIGITS = 12
-_MAX_GAUSSIANS = 2_000_000
+MAX_GAUSSIANS = 2_000_000
 """Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
 _MAX_BYTES = 1 << 29
 """Most bytes of vertices that are read: that number of Gaussians, with spherical harmonics of degree 3."""
@@ -126,8 +126,8 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
                 raise UserError(
                     f"{path}: is truncated: it has {left} of {expected} bytes of vertices; copy or export it again"
                 )
-            if count > _MAX_GAUSSIANS:
-                raise UserError(f"{path}: has {count:,} Gaussians, more than {_MAX_GAUSSIANS:,}; remove some of them")
+            if count > MAX_GAUSSIANS:
+                raise UserError(f"{path}: has {count:,} Gaussians, more than {MAX_GAUSSIANS:,}; remove some of them")
             if expected > _MAX_BYTES:
                 raise UserError(
                     f"{path}: has {expected:,} bytes of vertices, more than {_MAX_BYTES:,}; leave columns out"

@@ -92,16 +92,16 @@ def track_subject(
     settings.check()
     begun = keep is not None and keep.is_dir()
     try:
-        return _track_subject(captures, face_model, settings, keep, preview, held_out)
+        return track_once(captures, face_model, settings, keep, preview, held_out)
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
         if keep is None or not begun:
             raise
     say("The stored pieces of an interrupted tracking cannot be used, so tracking starts again")
     remove_tree(keep)
-    return _track_subject(captures, face_model, settings, keep, preview, held_out)
+    return track_once(captures, face_model, settings, keep, preview, held_out)
 
 
-def _track_subject(
+def track_once(
     captures: Sequence[Capture],
     face_model: FaceModel,
     settings: TrackingSettings,
@@ -109,6 +109,7 @@ def _track_subject(
     preview: Path | None,
     held_out: Sequence[Capture],
 ) -> list[Tracking]:
+    """Track as `track_subject` does, but without a second try if stored pieces cannot be used."""
     if "mediapipe" not in face_model.landmarks:
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; place them on it first")
     shots, cache = [shot_of(capture, settings) for capture in captures], StageCache(keep)

@@ -1,0 +1,311 @@
+"""Make faults by the format of a file, also behind its checksums and its compression."""
+
+import gzip
+import io
+import json
+import pickletools
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+
+from damage import flip_or_cut
+from fuzzing.edges import INTEGERS, SMALL_PICKLES, USD_LINES, edge_number, packed_integer, put
+from fuzzing.kinds import (
+    edge_for,
+    entries,
+    faulty_array,
+    faulty_bytes,
+    faulty_json,
+    faulty_lines,
+    faulty_list,
+    faulty_text,
+    faulty_value,
+    written,
+)
+from fuzzing.repairs import joined, repair_glb, repair_portable, repair_tensors, split
+
+Fault = Callable[[bytes, Random], tuple[str, bytes]]
+
+
+def faulty_tensors(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make one fault in a safetensors file. Checksums are not repaired here."""
+    kind = dice.choice((*("array",) * 9, "list", "name", *("header",) * 4, "length"))
+    header, body = split(data)
+    kept = {"__metadata__": header["__metadata__"]} if "__metadata__" in header else {}
+    if kind in ("array", "list", "name"):
+        arrays = dict(sorted(safetensors.numpy.load(data).items()))  # in a fixed order
+        name = dice.choice(list(arrays))
+        if kind == "array":
+            told, arrays[name] = faulty_array(arrays[name], dice)
+            kind = f"array {told}"
+        elif kind == "list":
+            values = faulty_list(list(arrays.values()), dice)
+            arrays = dict(zip(arrays, values, strict=False))
+        else:
+            arrays[dice.choice((name + "s", "", "x" * 10_000, "a\x1b[31m", "__metadata", *arrays))] = arrays.pop(name)
+        header, body = split(safetensors.numpy.save(arrays))
+        return kind, joined({**kept, **header}, body)
+    if kind == "header":
+        told, header = faulty_value(header, dice)
+        return f"header {told}", joined(written(header, dice), body)
+    length = dice.choice((*INTEGERS[:20], len(data), len(data) - 8, len(data) - 7)) % 2**64
+    return kind, length.to_bytes(8, "little") + data[8:]
+
+
+def faulty_portable(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in a .mien file: in its arrays, or in its content."""
+    if dice.random() < 0.5:
+        kind, data = faulty_tensors(data, dice)
+        return kind, repair_portable(data)
+    kind, content = faulty_value(json.loads(split(data)[0]["__metadata__"]["mien"])["content"], dice)
+    return f"content {kind}", repair_portable(data, content)
+
+
+def faulty_npy(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in a .npy file: in its array, or in its header."""
+    if dice.random() < 0.6:
+        kind, array = faulty_array(np.load(io.BytesIO(data)), dice)
+        return kind, npy_of(array)
+    size = int.from_bytes(data[8:10], "little")
+    odd = ("", "{", "__import__('os')", "(" * 5000, "{'descr': 1}", "1" * 5000)
+    kinds = ("|O", "<f8", ">f4", "<U1000", "<c16", "[('a', '<f4')]", "<M8[s]", "x")
+    shapes = (*((one,) for one in INTEGERS[:23]), (), (-1,), (1.5,), "x", (1,) * 40, (5_000_000_000, 3))
+    made = f"{{'descr': {dice.choice(kinds)!r}, 'fortran_order': False, 'shape': {dice.choice(shapes)!r}, }}"
+    _, text = dice.choice(
+        (("", dice.choice(odd).encode()), ("", made.encode()), faulty_text(data[10 : 10 + size], dice))
+    )
+    text = text[:65_000]
+    return "header", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text + b"\n" + data[10 + size :]
+
+
+def npy_of(array: np.ndarray) -> bytes:
+    """Return a .npy file."""
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
+
+
+def zeros(amount: int) -> bytes:
+    """Return a raw deflate stream of this many zeros, a thousandth as long and quickly made."""
+    pack = zlib.compressobj(9, zlib.DEFLATED, -15)
+    return (pack.compress(bytes(1 << 20)) + pack.flush(zlib.Z_FULL_FLUSH)) * (amount >> 20) + b"\x03\x00"
+
+
+def members_of(data: bytes) -> dict[str, bytes]:
+    """Return the members of a zip archive by name."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
+def zip_of(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    """Return a zip archive with these members, with the same bytes every time."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name), content, method)
+    return out.getvalue()
+
+
+def bomb_of(name: str, amount: int, head: bytes = b"") -> bytes:
+    """Return a small zip archive whose only member unpacks to many zeros after `head`."""
+    packed = zlib.compressobj(1, zlib.DEFLATED, -15)
+    body = packed.compress(head) + packed.flush(zlib.Z_FULL_FLUSH) + zeros(amount)
+    sizes = struct.pack("<HHHIII", 8, 0, 33, 0, len(body), min(amount + len(head), 2**32 - 1))
+    whole = zip_of({name: b""})
+    directory, end = whole.rfind(b"PK\x01\x02"), whole.rfind(b"PK\x05\x06")
+    local = put(whole[:directory], 8, sizes) + body
+    return local + put(whole[directory:end], 10, sizes) + put(whole[end:], 16, struct.pack("<I", len(local)))
+
+
+def faulty_zip(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in a member of an archive by its own kind, or in the archive around it."""
+    members, kind = (
+        members_of(data),
+        dice.choice((*("member",) * 7, "list", "name", "bytes", "bytes", "method", "bomb")),
+    )
+    name, method = dice.choice(list(members)), zipfile.ZIP_STORED
+    if kind == "member":
+        told, members[name] = FORMATS.get(Path(name).suffix, faulty_bytes)(members[name], dice)
+        kind = f"{name[:20]} {told}"
+    elif kind == "list":
+        members = dict(zip(members, faulty_list(list(members.values()), dice), strict=False))
+    elif kind == "name":
+        members[dice.choice(("../x", "/x", f"{name}.npy", "", "a\x1b[31m", "f" * 5000))] = members.pop(name)
+    elif kind == "bomb":
+        amount = dice.choice((1 << 30, 3 << 30, 6 << 30))
+        head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({amount // 12}, 3), }}\n".encode()
+        head = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head if name.endswith(".npy") else b""
+        return kind, bomb_of(name, amount, head)
+    elif kind == "method":
+        method = dice.choice((zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2))
+    whole = zip_of(members, method)
+    return (kind, faulty_bytes(whole, dice, 150)[1]) if kind == "bytes" else (kind, whole)
+
+
+def _gzip_of_zeros(head: bytes, amount: int) -> bytes:
+    """Return a gzip file of some bytes and many zeros, which are its second and further members."""
+    member = gzip.compress(bytes(1 << 24), 9, mtime=0)
+    return gzip.compress(head, 9, mtime=0) + member * -(-amount // (1 << 24))
+
+
+def faulty_spz(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in the header or the columns of a .spz, or in the gzip around them."""
+    plain, kind = gzip.decompress(data), dice.choice((*("inner",) * 6, "claim", "bomb", "gzip", "members"))
+    if kind == "claim":  # as many Gaussians as it says, all of them zero
+        count, degree = dice.choice((100_000, 2_000_000, 2_000_001)), dice.randrange(5)
+        head = put(put(plain[:16], 8, count.to_bytes(4, "little")), 12, bytes([degree]))
+        return kind, _gzip_of_zeros(head, count * (20 + 3 * ((degree + 1) ** 2 - 1)))
+    if kind == "bomb":
+        return kind, _gzip_of_zeros(plain, dice.choice((1 << 30, 6 << 30)))
+    if kind == "gzip":
+        return kind, faulty_bytes(data, dice, 30)[1]
+    told, plain = faulty_bytes(plain, dice, 16) if kind == "inner" else (kind, plain)
+    return told, gzip.compress(plain, 1, mtime=0) * (dice.choice((2, 1000)) if kind == "members" else 1)
+
+
+def _faulty_header(content: Any, body: bytes, dice: Random) -> tuple[str, bytes, bytes]:
+    """Make a fault in a json header, mostly in some of its larger parts, or in the numbers after it."""
+    kind = dice.choice(("value",) * 6 + ("numbers", "cut", "text"))
+    if kind == "numbers":
+        for _ in range(dice.choice((1, 30))):
+            number = edge_for(np.dtype("<f4"), dice).tobytes()
+            body = put(body, 4 * dice.randrange(len(body) // 4), number)
+    elif kind == "cut":
+        body = dice.choice((body[: dice.randrange(len(body))], b"\xff" * len(body), body + body))
+    elif kind == "text":
+        return kind, faulty_text(json.dumps(content).encode(), dice)[1], body
+    else:
+        large = [place for place in entries(content) if isinstance(place[0][place[1]], (dict, list))]
+        container, key = dice.choice([({"": content}, ""), *large[:200]])
+        kind, container[key] = faulty_value(container[key], dice)
+        content = container[key] if key == "" else content
+    return kind, written(content, dice), body
+
+
+def faulty_packed(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in the header or the arrays of a .packed file, or in the gzip around them."""
+    plain = gzip.decompress(data)
+    length = int.from_bytes(plain[:4], "little")
+    kind, text, arrays = _faulty_header(json.loads(plain[4 : 4 + length]), plain[4 + length :], dice)
+    text += b" " * (-(4 + len(text)) % 4)
+    kind = dice.choice((kind,) * 9 + ("length", "bomb", "gzip"))
+    size = packed_integer(dice, 4) if kind == "length" else struct.pack("<I", len(text))
+    if kind == "bomb":
+        return kind, _gzip_of_zeros(size + text + arrays, dice.choice((1 << 28, 3 << 30)))
+    packed = gzip.compress(size + text + arrays, 1, mtime=0)
+    return kind, flip_or_cut(packed, dice) if kind == "gzip" else packed
+
+
+def faulty_glb(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in the json of a .glb, in its buffer, or in the lengths around them."""
+    length = int.from_bytes(data[12:16], "little")
+    kind, text, buffer = _faulty_header(json.loads(data[20 : 20 + length]), data[28 + length :], dice)
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(buffer), len(text), 0x4E4F534A)
+    whole = head + text + struct.pack("<II", len(buffer), 0x004E4942) + buffer
+    if dice.random() < 0.1:
+        return "frame", put(whole, dice.choice((0, 4, 8, 12, 16, 20 + len(text))), packed_integer(dice, 4))
+    return kind, repair_glb(whole)
+
+
+def png_of(chunks: Sequence[tuple[bytes, bytes]]) -> bytes:
+    """Return a PNG with these chunks and correct checksums."""
+    parts = [struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+             for name, body in chunks]  # fmt: skip
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+_SIDES = (0, 1, 2, 31, 33, 255, 4096, 20_000, 65_535, 2**20, 2**31 - 1, 2**31, 2**32 - 1)
+_CHUNKS = (
+    (b"tRNS", bytes(6)), (b"PLTE", bytes(range(255))), (b"eXIf", b"MM\x00*\x00\x00\x00\x08" + b"\xff" * 40),
+    (b"acTL", struct.pack(">II", 2**31 - 1, 0)), (b"iCCP", b"x\x00\x00" + zlib.compress(b"x" * 200)),
+    (b"tEXt", b"Comment\x00\x1b]0;own\x07"), (b"zTXt", b"Comment\x00\x00\x78\x9c" + zeros(64 << 20)),
+    (b"IHDR", bytes(13)),
+)  # fmt: skip
+
+
+def faulty_png(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in a PNG with correct checksums, or anywhere in its bytes."""
+    chunks, at = [], 8
+    while at + 12 <= len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
+        at += 12 + size
+    kind = dice.choice(("size", "header", "pixels", "extra", "list", "bytes") * 3 + ("bomb",))
+    head, pixels = chunks[0][1], b"".join(body for name, body in chunks if name == b"IDAT")
+    if kind == "size":
+        chunks[0] = chunks[0][0], put(head, dice.choice((0, 4)), struct.pack(">I", dice.choice(_SIDES)))
+    elif kind == "header":
+        chunks[0] = chunks[0][0], put(head, dice.randrange(8, 13), bytes([dice.choice((0, 1, 2, 3, 6, 7, 16, 255))]))
+    elif kind == "pixels":
+        raw = zlib.decompress(pixels)
+        raw = dice.choice((raw[: len(raw) // 2], raw + raw, b"", bytes([dice.randrange(256)]) * len(raw), raw[1:]))
+        chunks = [chunks[0], (b"IDAT", dice.choice((zlib.compress(raw), raw))), chunks[-1]]
+    elif kind == "bomb":
+        side = dice.choice((20_000, 30_000, 60_000))
+        packed = b"\x78\x9c" + zeros(side * (side // 8 + 1) + (1 << 20)) + bytes(4)
+        chunks = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", packed), chunks[-1]]
+    elif kind == "extra":
+        chunks.insert(dice.randrange(len(chunks) + 1), dice.choice(_CHUNKS))
+    elif kind == "list":
+        chunks = faulty_list(chunks, dice)
+    return (kind, faulty_bytes(data, dice)[1]) if kind == "bytes" else (kind, png_of(chunks))
+
+
+_OPERATIONS = (*(bytes([one]) for one in b"(]}NtRb.02Q\x93\x81oeua"), b"cos\nsystem\n", b"cbuiltins\neval\n",
+               b"cmien.cli\nmain\n", b"c\n\n", b"cnumpy\nndarray\n", b"c" + b"x" * 9999 + b"\n\x1b[31m\n")  # fmt: skip
+
+
+def faulty_pickle(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make faults in the operations of a pickle, or return a small pickle that asks for much memory."""
+    kind = dice.choice(("list", "list", "argument", "argument", "insert", "insert", "small", "cut"))
+    if kind == "small":
+        return kind, dice.choice(list(SMALL_PICKLES.values()))
+    starts = [position for _, _, position in pickletools.genops(data) if position is not None]
+    operations = [data[start:end] for start, end in zip(starts, [*starts[1:], len(data)], strict=True)]
+    for _ in range(dice.choice((1, 1, 3))):
+        index = dice.randrange(len(operations))
+        one = operations[index]
+        if kind == "list":
+            operations = faulty_list(operations, dice) or operations
+        elif kind == "insert":
+            operations[index : index + dice.randrange(2)] = [dice.choice(_OPERATIONS)]
+        elif kind == "argument" and len(one) > 1:
+            operations[index] = one[:1] + packed_integer(dice, min(len(one) - 1, 8)) + one[9:]
+    whole = b"".join(operations)
+    return kind, whole[: dice.randrange(len(whole))] if kind == "cut" else whole
+
+
+def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in the header of a .ply, or in its numbers."""
+    head, mark, body = data.partition(b"end_header\n")
+    if dice.random() < 0.6:
+        numbers = " ".join(str(edge_number(dice)) for _ in range(dice.choice((0, 1, 16, 17, 10_000))))
+        lines = (f"comment mien frame {numbers}", f"comment T_world_local {numbers}", "property list uchar int x",
+                 "property double x", "element face 9", f"element vertex {edge_number(dice)}", "format ascii 1.0",
+                 "format binary_big_endian 1.0", *head.decode("latin1").splitlines())  # fmt: skip
+        kind, head = faulty_text(head, dice, lines)
+    else:
+        kind, _, body = _faulty_header({}, body, dice)
+    return kind, head + dice.choice((mark,) * 9 + (b"", b"end_header\r\n", b"x" * 1_000_000)) + body
+
+
+FORMATS: dict[str, Fault] = {
+    ".json": faulty_json, ".partial": faulty_lines, ".csv": faulty_text, ".ply": faulty_ply, ".npy": faulty_npy,
+    ".safetensors": lambda data, dice: _repaired(*faulty_tensors(data, dice)), ".mien": faulty_portable,
+    **dict.fromkeys((".npz", ".sog", ".usdz", ".frame"), faulty_zip), ".spz": faulty_spz, ".packed": faulty_packed,
+    ".glb": faulty_glb, ".png": faulty_png, ".pkl": faulty_pickle,
+    ".usda": lambda data, dice: faulty_text(data, dice, USD_LINES),
+}  # fmt: skip
+"""Faults by the ending of a file; others get faults of their bytes."""
+
+
+def _repaired(kind: str, data: bytes) -> tuple[str, bytes]:
+    return kind, repair_tensors(data)
