@@ -22,7 +22,7 @@ FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
 STAGE = "`mien capture`"
 REMEDY = "run `mien capture` on its video again, which repairs it"
 """Remedy for a damaged capture."""
-_PNG_OPTIONS = (
+PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
     # Plain pip installs OpenCV 4.11 with mediapipe, which cannot choose the filter (docs/platforms.md).
@@ -173,6 +173,6 @@ def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[
 
 
 def _write_png(path: Path, picture: np.ndarray) -> None:
-    data = encode_picture(picture, options=_PNG_OPTIONS)
+    data = encode_picture(picture, options=PNG_OPTIONS)
     with open_new(path) as file:
         file.write(data)
