@@ -6,60 +6,39 @@ import numpy as np
 from native_mesh_baselines import (
     F32,
     I32,
+    MESHES,
     U8,
     Arguments,
     Baseline,
     Rng,
-    align_mesh,
-    align_surface,
-    antialias,
-    antialias_backward,
-    bake_texture,
-    barycentric_backward,
     below,
     camera,
     empty,
     few,
-    interpolate_mesh,
-    interpolate_mesh_backward,
-    light_equations,
-    mesh_loss,
     normal,
     picture,
-    rasterize_mesh,
-    sample_texture,
-    sample_texture_backward,
 )
 
 
-def sigmoid(native: Any, rng: Rng) -> Arguments:
-    shape = (few(rng), few(rng))
-    return [normal(rng, *shape), empty(*shape)]
+def of(*arrays: str) -> Baseline:
+    """Return a baseline of arrays, such as "n 3" of random numbers, or "=n 3" to be filled; letters are lengths."""
 
+    def make(native: Any, rng: Rng) -> Arguments:
+        lengths: dict[str, int] = {}
 
-def sigmoid_backward(native: Any, rng: Rng) -> Arguments:
-    n = few(rng)
-    return [normal(rng, n), normal(rng, n), empty(n)]
+        def length(name: str) -> int:
+            if name.isdigit():
+                return int(name)
+            own = {"k": int(rng.integers(0, 5)), "r": int(rng.integers(1, 9))}
+            return lengths.setdefault(name, own.get(name, few(rng)))
+
+        shapes = [(array[0] == "=", [length(name) for name in array.removeprefix("=").split()]) for array in arrays]
+        return [empty(*shape) if filled else normal(rng, *shape) for filled, shape in shapes]
+
+    return make
 
 
 # Changes with the expression
-
-
-def expression_activations(native: Any, rng: Rng) -> Arguments:
-    i, r = few(rng), int(rng.integers(1, 9))
-    return [normal(rng, i), normal(rng, i), normal(rng, i, r), normal(rng, int(rng.integers(0, 5)), r), empty(r)]
-
-
-def expression_activations_backward(native: Any, rng: Rng) -> Arguments:
-    i, r = few(rng), int(rng.integers(1, 9))
-    return [
-        normal(rng, i),
-        normal(rng, i),
-        normal(rng, i, r),
-        normal(rng, int(rng.integers(0, 5)), r),
-        normal(rng, r),
-        empty(i),
-    ]
 
 
 def expression_change(native: Any, rng: Rng) -> Arguments:
@@ -138,11 +117,6 @@ def point_network_backward(native: Any, rng: Rng) -> Arguments:
     return [layers, inputs, normal(rng, len(inputs), kept), by_outputs, gradients, by_inputs]
 
 
-def add_bone(native: Any, rng: Rng) -> Arguments:
-    n = few(rng)
-    return [normal(rng, n, 3), normal(rng, n), normal(rng, 3, 4), normal(rng, n, 3)]
-
-
 def activate_points(native: Any, rng: Rng) -> Arguments:
     n = few(rng)
     raw = native.RawPoints(normal(rng, n, 11), normal(rng, n, 3), normal(rng, n, 4), normal(rng, n), normal(rng, n, 3))
@@ -204,24 +178,6 @@ def pose_face_backward(native: Any, rng: Rng) -> Arguments:
     model, face, (v, e, j), b = posing(native, rng)
     outputs = [empty(b, v, 3), empty(b, j + 1, 3), empty(b, e), empty(b, j, 3), empty(b, 3), empty(b, 3)]
     return [model, face, normal(rng, b, v, 3), normal(rng, b, v, 3), native.FaceArrays(*outputs)]
-
-
-def head_poses(native: Any, rng: Rng) -> Arguments:
-    b = few(rng)
-    return [normal(rng, b, 3), normal(rng, b, 3), empty(b, 4, 4)]
-
-
-def head_poses_backward(native: Any, rng: Rng) -> Arguments:
-    b = few(rng)
-    return [normal(rng, b, 3), normal(rng, b, 4, 4), empty(b, 3)]
-
-
-def compose_rigid(native: Any, rng: Rng) -> Arguments:
-    return [normal(rng, 4, 4), normal(rng, 4, 4), empty(4, 4)]
-
-
-def compose_rigid_backward(native: Any, rng: Rng) -> Arguments:
-    return [*(normal(rng, 4, 4) for _ in range(3)), empty(4, 4), empty(4, 4)]
 
 
 # Rigs
@@ -391,20 +347,24 @@ def composite(native: Any, rng: Rng) -> Arguments:
 BASELINES: dict[str, Baseline] = {
     one.__name__: one
     for one in (
-        sigmoid, sigmoid_backward, expression_activations, expression_activations_backward, expression_change,
-        expression_change_backward,
-        feature_network, feature_network_backward, factored_update, point_network, point_network_backward, skin_points,
-        skin_points_backward, add_bone, activate_points,
-        make_face_model, pose_face, pose_face_backward, head_poses, head_poses_backward,
-        compose_rigid, compose_rigid_backward, rasterize_mesh, interpolate_mesh, interpolate_mesh_backward,
-        barycentric_backward, sample_texture, sample_texture_backward, antialias, antialias_backward, mesh_loss,
-        align_mesh, bake_texture, light_equations, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
+        expression_change, expression_change_backward, feature_network, feature_network_backward, factored_update,
+        point_network, point_network_backward, skin_points, skin_points_backward, activate_points, make_face_model,
+        pose_face, pose_face_backward, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
         rasterize_views, rasterize_views_backward, photometric_loss, adam_update, factored_adam_update,
-        triangle_penalties, observe_view, keep_on_surface, clear_rows, mean_squared_difference,
-        absolute_difference, box_of_nonzero, composite,
+        triangle_penalties, observe_view, keep_on_surface, clear_rows, mean_squared_difference, absolute_difference,
+        box_of_nonzero, composite,
     )
 } | {
-    "AlignSurface": align_surface,
+    **MESHES,
+    "sigmoid": of("n m", "=n m"),
+    "sigmoid_backward": of("n", "n", "=n"),
+    "expression_activations": of("i", "i", "i r", "k r", "=r"),
+    "expression_activations_backward": of("i", "i", "i r", "k r", "r", "=i"),
+    "add_bone": of("n 3", "n", "3 4", "n 3"),
+    "head_poses": of("b 3", "b 3", "=b 4 4"),
+    "head_poses_backward": of("b 3", "b 4 4", "=b 3"),
+    "compose_rigid": of("4 4", "4 4", "=4 4"),
+    "compose_rigid_backward": of("4 4", "4 4", "4 4", "=4 4", "=4 4"),
     "recycled": lambda native, rng: [[few(rng), few(rng)]],
     "thread_count": lambda native, rng: [],
     "set_thread_count": lambda native, rng: [int(rng.integers(1, 4))],

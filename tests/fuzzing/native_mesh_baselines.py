@@ -151,3 +151,13 @@ def bake_texture(native: Any, rng: Rng) -> Arguments:
 def light_equations(native: Any, rng: Rng) -> Arguments:
     surface, seen, _, _ = sighting(native, rng)
     return [surface, seen, empty(3, 9, 9, dtype=F64), empty(3, 9, dtype=F64)]
+
+
+MESHES: dict[str, Baseline] = {
+    one.__name__: one
+    for one in (
+        rasterize_mesh, interpolate_mesh, interpolate_mesh_backward, barycentric_backward, sample_texture,
+        sample_texture_backward, antialias, antialias_backward, mesh_loss, align_mesh, bake_texture, light_equations,
+    )
+} | {"AlignSurface": align_surface}  # fmt: skip
+"""Functions that make the positional arguments of a valid call, by the name of the native function."""

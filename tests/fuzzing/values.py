@@ -257,11 +257,11 @@ def edit(file: Path, where: str, value: Any) -> bytes | None:
 def _edit_value(content: Any, where: str, value: Any) -> None:
     parts = where.removeprefix("+").replace("\\.", "\0").split(".")
     *way, names = [part.replace("\0", ".") for part in parts]
-    inner = content
+    inner: Any = content
     for name in way:
         inner = inner[int(name) if isinstance(inner, list) else name]
     for name in names.split("+"):
-        key = int(name) if isinstance(inner, list) else name
+        key: Any = int(name) if isinstance(inner, list) else name
         if not where.startswith("+") and inner[key] == value:
             raise KeyError(key)  # it has to be there, with another value
         if value is GONE:
