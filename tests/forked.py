@@ -73,7 +73,8 @@ class ForkServer:
 
     def __enter__(self) -> "ForkServer":
         self._folder = Path(tempfile.mkdtemp(prefix="mien-forks-"))
-        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+        places = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
         self._server = subprocess.Popen(
             [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )

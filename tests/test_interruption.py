@@ -108,40 +108,45 @@ def test_stopped_rendering_ends_alike_the_next_time(
         assert content(out / path.relative_to(undisturbed)) == content(path)
 
 
-def test_killed_scoring_goes_on(fork_server: ForkServer, workspace: Path, tmp_path: Path) -> None:
-    for name in ("undisturbed", "killed"):
-        shutil.copytree(workspace, tmp_path / name)
-    assert main(["evaluate", str(tmp_path / "undisturbed"), *EVALUATE]) == 0
-    run = tmp_path / "killed" / "runs" / "toy"
+@pytest.fixture(scope="module")
+def evaluated(workspace: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A workspace whose run was scored undisturbed."""
+    folder = shutil.copytree(workspace, tmp_path_factory.mktemp("evaluated") / "workspace")
+    assert main(["evaluate", str(folder), *EVALUATE]) == 0
+    return folder
+
+
+def test_killed_scoring_goes_on(fork_server: ForkServer, workspace: Path, evaluated: Path, tmp_path: Path) -> None:
+    killed = shutil.copytree(workspace, tmp_path / "killed")
+    run = killed / "runs" / "toy"
     before = visible(run)
-    stop(fork_server, ["evaluate", str(tmp_path / "killed"), *EVALUATE], 2, signal.SIGKILL)
+    stop(fork_server, ["evaluate", str(killed), *EVALUATE], 2, signal.SIGKILL)
     assert visible(run) == before, "figures of a part of the frames"
     assert len((run / ".self_reenactment_tail.partial").read_text().splitlines()) >= 3
-    assert main(["evaluate", str(tmp_path / "killed"), *EVALUATE]) == 0
+    assert main(["evaluate", str(killed), *EVALUATE]) == 0
     figures = []
-    for name in ("undisturbed", "killed"):
-        content = json.loads((tmp_path / name / "runs/toy/metrics.json").read_text())
+    for folder in (evaluated, killed):
+        content = json.loads((folder / "runs/toy/metrics.json").read_text())
         figures.append(content["protocols"]["self_reenactment_tail"])
         del figures[-1]["seconds_per_frame"]
     assert figures[0] == figures[1]
     assert not list(run.glob(".*.partial"))
 
 
-@pytest.mark.parametrize("part", ["write_report", "write_comparison_video"])
 def test_figures_stay_whole_where_the_report_is_interrupted(
-    part: str, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shutil.copytree(workspace, tmp_path / "w")
-    run = tmp_path / "w/runs/toy"
-    assert main(["evaluate", str(tmp_path / "w"), *EVALUATE]) == 0
+    folder = shutil.copytree(evaluated, tmp_path / "w")
+    run = folder / "runs/toy"
     before = (run / "metrics.json").read_bytes()
 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched:
-        patched.setattr(importlib.import_module("mien.evaluation.evaluate"), part, interrupted)
-        assert main(["evaluate", str(tmp_path / "w"), *EVALUATE]) == 130
-    assert (run / "metrics.json").read_bytes() == before
-    assert main(["evaluate", str(tmp_path / "w"), *EVALUATE]) == 0
+    for part in ("write_report", "write_comparison_video"):
+        with monkeypatch.context() as patched:
+            patched.setattr(importlib.import_module("mien.evaluation.evaluate"), part, interrupted)
+            assert main(["evaluate", str(folder), *EVALUATE]) == 130
+        assert (run / "metrics.json").read_bytes() == before
+    assert main(["evaluate", str(folder), *EVALUATE]) == 0
     assert [path.name for path in run.rglob(".*")] == []

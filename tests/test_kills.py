@@ -87,7 +87,6 @@ def run_until_a_file(words: list[str], number: int, file: int) -> int:
 def test_random_kills_leave_nothing_to_do_by_hand(tmp_path: Path) -> None:
     seed, findings = os.environ.get("MIEN_SEED", "0"), tmp_path / "kills.jsonl"
     words = ["-m", "fuzzing.kills", "--kills", str(KILLS), "--seed", seed, "--findings", str(findings)]
-    environment = {**os.environ, "PYTHONPATH": str(TESTS)}
-    result = subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True, check=False)
+    result = subprocess.run([sys.executable, *words], cwd=TESTS, capture_output=True, text=True, check=False)
     assert result.returncode == 0, f"seed {seed}:\n{result.stdout}\n{result.stderr[-3000:]}\n{findings.read_text()}"
-    assert "| all | " in result.stdout
+    assert " kills; " in result.stdout

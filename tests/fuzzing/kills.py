@@ -65,16 +65,13 @@ class Tally:
 
     def table(self) -> str:
         """Return the kills as a table of Markdown."""
-        names = [signal.Signals(number).name for number in SIGNALS]
-        rows = [f"| stage | {' | '.join(names)} | all | chains | findings |", "|---|" + "---|" * (len(names) + 3)]
-        for stage in [*STAGES, "all"]:
-            own = {key: count for key, count in self.kills.items() if stage in (key[0], "all")}
-            counts = [sum(count for key, count in own.items() if key[1] == name) for name in names]
-            chains = sum(self.chains.values()) if stage == "all" else self.chains[stage]
-            found = sum(stage in (each["stage"], "all") for each in self.findings)
-            rows.append(f"| {' | '.join(map(str, [stage, *counts, sum(counts), chains, found]))} |")
-        more = f"{self.late} signals came too late; {self.leftovers} hidden files stayed after SIGKILL; "
-        return "\n".join([*rows, more + f"at most {self.slowest:.1f} s from a signal to the end"])
+        rows = ["| stage | SIGKILL | SIGTERM | SIGINT | chains | findings |", "|---|---|---|---|---|---|"]
+        for stage in STAGES:
+            counts = [self.kills[stage, name] for name in ("SIGKILL", "SIGTERM", "SIGINT")]
+            found = sum(each["stage"] == stage for each in self.findings)
+            rows.append(f"| {' | '.join(map(str, [stage, *counts, self.chains[stage], found]))} |")
+        more = f"{self.kills.total()} kills; {self.late} signals came too late; at most {self.slowest:.1f} s from one "
+        return "\n".join([*rows, more + f"to the end; {self.leftovers} hidden files stayed after SIGKILL"])
 
 
 class Place:
