@@ -91,6 +91,11 @@ def test_batches_equal_their_single_pictures(backend: Backend) -> None:
     one_scene = rasterize(scenes[1].gaussians, cameras, background, backend)
     assert torch.equal(one_scene.image[1], singles[1].image)
     assert rasterize(scenes[1].gaussians, cameras[:1], background, backend).image.shape == (1, 45, 61, 3)
+    assert one_scene.means2d_offset.requires_grad
+    with torch.no_grad():
+        fixed = rasterize(scenes[1].gaussians, cameras, background, backend)
+    assert not fixed.image.requires_grad
+    assert not fixed.means2d_offset.requires_grad
 
 
 def test_shared_tensors_of_a_batch_gather_all_gradients() -> None:
@@ -124,14 +129,6 @@ def test_means2d_gradient_is_per_pixel_of_motion(backend: Backend) -> None:
     change = rasterize(gaussians, moved, torch.zeros(3), backend).alpha[7, 12] - rendering.alpha[7, 12]
     assert gradient[0, 0].item() == pytest.approx(change.item() / 1e-2, rel=2e-2)
     assert gradient[0, 1].abs() < 1e-6
-
-
-def test_no_gradients_without_grad_mode() -> None:
-    """Without grad mode nothing requires a gradient."""
-    with torch.no_grad():
-        rendering = rasterize(one_gaussian(), front_camera())
-    assert not rendering.image.requires_grad
-    assert not rendering.means2d_offset.requires_grad
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -20,7 +20,7 @@ from mien.training.footage.frames import Frame, resolved
 from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
 from mien.training.whole_head.unseen import fills_sides
 from plain_settings import plain_gaussian_avatars
-from test_runtime import new_avatar
+from test_methods import new_avatar
 from toy_scene import surface_of
 
 _PROGRESS = Progress(0, 100, 0, 1.0, 1)
@@ -75,19 +75,14 @@ def test_a_head_turns_about_its_own_upright_axis(anny):
     assert turned.head_translation.equal(face.head_translation)
 
 
-@pytest.mark.parametrize(("step", "most"), [(0, 0.7), (4, 0.3)])  # From aside, the neck below the cut costs too.
-def test_a_head_in_the_colors_of_the_mesh_costs_less_than_one_in_others(anny, step, most):
-    views = _views(anny)
-    costs = [float(_loss(views, _opaque_avatar(anny, color), _face(anny), step).detach()) for color in (0.5, 0.9)]
-    assert costs[0] < most * costs[1]
-
-
-def test_transparent_sides_cost(anny):
-    views, avatar = _views(anny), _opaque_avatar(anny, 0.5)
-    closed = float(_loss(views, avatar, _face(anny), 0).detach())
+def test_a_head_in_other_colors_than_the_mesh_costs_and_so_do_transparent_sides(anny):
+    views, face, avatar = _views(anny), _face(anny), _opaque_avatar(anny, 0.5)
+    other = _opaque_avatar(anny, 0.9)
+    costs = {step: float(_loss(views, avatar, face, step).detach()) for step in (0, 4)}
+    for step, most in ((0, 0.7), (4, 0.3)):  # From aside, the neck below the cut costs too.
+        assert costs[step] < most * float(_loss(views, other, face, step).detach())
     avatar.store.assign("opacity_logits", torch.full_like(avatar.store["opacity_logits"], -4.0))
-    opened = _loss(views, avatar, _face(anny), 0)
-    assert float(opened.detach()) > 3 * closed
+    assert float(_loss(views, avatar, face, 0).detach()) > 3 * costs[0]
 
 
 def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
@@ -123,6 +118,8 @@ def test_gradients_reach_gaussians_and_not_the_face(anny):
 
 def test_raised_expressions_stay_within_the_bounds_and_change_with_the_random_numbers(anny):
     views, rest = _views(anny), _face(anny).expression
+    assert [step for step in range(17) if views.due(step)] == [0, 4, 8, 12, 16]
+    assert not replace(views, weight=0.0).due(0)
     raised = [views.raised(rest, _random(seed)) for seed in (0, 1)]
     for one in raised:
         assert bool((one <= anny.expression_bounds[:, 1] + 1e-6).all())
@@ -149,12 +146,6 @@ def test_the_outline_ends_at_the_cut_at_the_neck(anny):
     torch.testing.assert_close(picture[alpha == 0], view.plan.background.expand(int((alpha == 0).sum()), 3))
 
 
-def test_every_fourth_step_has_a_view(anny):
-    views = _views(anny)
-    assert [step for step in range(17) if views.due(step)] == [0, 4, 8, 12, 16]
-    assert not replace(views, weight=0.0).due(0)
-
-
 @pytest.mark.parametrize(("cameras", "filled"), [(1, True), (3, False)])
 def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
     frames = [Frame(0, 0, camera) for camera in range(cameras)]
@@ -166,28 +157,26 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
     assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
 
 
-@pytest.mark.parametrize(("filled", "expected"), [(True, "mixed"), (False, "white")])
-def test_background_and_edges_follow_the_sides(filled: bool, expected: str) -> None:
-    assert resolved(TrainSettings(background="auto"), filled=filled).background == expected
-    assert resolved(TrainSettings(background="white"), filled=filled).background == "white"
-    assert resolved(TrainSettings(edges="auto"), filled=filled).edges == ("cleaned" if filled else "filmed")
-    assert resolved(TrainSettings(edges="cleaned"), filled=filled).edges == "cleaned"
+def test_background_and_edges_follow_the_sides() -> None:
+    for filled, background, edges in ((True, "mixed", "cleaned"), (False, "white", "filmed")):
+        assert resolved(TrainSettings(background="auto"), filled=filled).background == background
+        assert resolved(TrainSettings(background="white"), filled=filled).background == "white"
+        assert resolved(TrainSettings(edges="auto"), filled=filled).edges == edges
+        assert resolved(TrainSettings(edges="cleaned"), filled=filled).edges == "cleaned"
 
 
-@pytest.mark.parametrize(
-    ("method", "background", "unseen", "white"),
-    [
+def test_transparent_pictures_warn_of_white_only_where_it_was(tmp_path, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(pictures, "say", said.append)
+    for method, background, unseen, white in (
         ("gaussian_avatars", "auto", "auto", False),
         ("gaussian_avatars", "auto", "trained", True),
         ("gaussian_avatars", "white", "auto", True),
         ("gaussian_avatars", "random", "trained", False),
         ("headgas", "auto", "auto", True),
-    ],
-)
-def test_transparent_pictures_warn_of_white_only_where_it_was(method, background, unseen, white, tmp_path, monkeypatch):
-    config = {"settings": {"background": background, "unseen": unseen}}
-    said: list[str] = []
-    monkeypatch.setattr(pictures, "read_run_config", lambda run_dir: config)
-    monkeypatch.setattr(pictures, "say", said.append)
-    pictures.warn_of_white(PictureOptions(background="transparent"), tmp_path, new_avatar(method))
-    assert bool(said) is white
+    ):
+        config = {"settings": {"background": background, "unseen": unseen}}
+        monkeypatch.setattr(pictures, "read_run_config", lambda run_dir, config=config: config)
+        said.clear()
+        pictures.warn_of_white(PictureOptions(background="transparent"), tmp_path, new_avatar(method))
+        assert bool(said) is white, (method, background, unseen)
