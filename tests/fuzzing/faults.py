@@ -216,6 +216,7 @@ FIXED: dict[str, Callable[[Place], str]] = {
     "cut": _changed(lambda data: data[: len(data) // 2]),
     "a bit": _changed(_with_a_bit),
     "the first byte": _changed(lambda data: bytes([data[0] ^ 1]) + data[1:]),
+    "the last byte": _changed(lambda data: data[:-1] + bytes([data[-1] ^ 1])),
     "zeros": _changed(lambda data: bytes(len(data))),
 }
 """Damage that every reader gets."""

@@ -108,7 +108,7 @@ VALUES: dict[str, tuple[Row, ...]] = {
     ),
     "crops.safetensors": tuple(
         ("crops", lambda array, crop=crop: np.tile(np.array(crop, np.int32), (5, 1, 1)))
-        for crop in ([-1, 0, 8, 8], [0, 0, 33, 8], [2**31 - 1, 0, 2**31 - 1, 1], [0, 0, 0, 0])
+        for crop in ([-1, 0, 8, 8], [0, 0, 33, 8], [2**31 - 1, 0, 2**31 - 1, 1], [0, 0, 0, 0], [4, 4, 0, 20])
     ),
     "config.json": (
         ("data.0.camera.width", 10**9), ("data.0.camera.K", [[3e38] * 3] * 3), ("data.0.camera.K", "wide"),
