@@ -154,10 +154,7 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
 
 
 def test_mattes_may_be_a_video(test_data, tmp_path):
-    """Mattes may be a video of any matting program.
-
-    H.264 changes their values a little; they are cropped like the pictures.
-    """
+    """H.264 changes their values a little; they are cropped like the pictures."""
     clip, mattes = tmp_path / "clip.mp4", tmp_path / "mattes.mp4"
     write_video(clip, iter([face_picture(test_data, 160, 80)] * 5), 25.0)
     column = np.arange(320)

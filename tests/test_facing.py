@@ -34,24 +34,17 @@ def heads_turned(*angles: float) -> torch.Tensor:
     return state
 
 
-def test_side_views_count_little():
+def test_side_views_count_little_and_trust_goes_with_the_head():
     trust = trust_of(views_of((0, 0), (0, 1), (0, 2)), heads_turned(0.0), cameras_at(0.0, 0.3, -1.2))
     torch.testing.assert_close(trust[:2], torch.tensor([1.0, 0.5]).double(), atol=1e-6, rtol=0)
     assert trust[2] < 0.02
-
-
-def test_trust_goes_with_the_head():
-    cameras = cameras_at(0.0, 1.0)
-    trust = trust_of(views_of((0, 0), (0, 1), (1, 0), (1, 1)), heads_turned(0.0, 1.0), cameras)
+    trust = trust_of(views_of((0, 0), (0, 1), (1, 0), (1, 1)), heads_turned(0.0, 1.0), cameras_at(0.0, 1.0))
     assert trust[0] == trust[3] == 1
     assert trust[1:3].max() < 0.05
 
 
 def test_the_best_picture_of_a_timestep_counts_whole():
-    """The best picture of a timestep counts in full, even if it shows the head from the side.
-
-    Otherwise priors would decide.
-    """
+    """It counts in full even if it shows the head from the side; otherwise priors would decide."""
     trust = trust_of(views_of((0, 0), (1, 1), (2, 0), (2, 1)), heads_turned(0.0, 0.0, 0.0), cameras_at(1.2, -1.5))
     assert trust[:3].eq(1).all()
     assert 0.2 < trust[3] < 0.6

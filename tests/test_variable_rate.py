@@ -75,6 +75,13 @@ def test_a_driver_moves_at_the_times_of_its_video(tmp_path: Path) -> None:
     assert shown[-1] == 29
 
 
+def test_a_steady_driver_is_not_touched(tmp_path: Path) -> None:
+    times = np.arange(9) / 25
+    driver = filmed_at(tmp_path, times, 25.0)
+    assert driver.fps == 25
+    assert torch.equal(driver.face.head_rotation[:, 1], 0.01 * torch.from_numpy(times).float())
+
+
 def test_a_driver_waits_in_a_pause(tmp_path: Path) -> None:
     """In a pause of two seconds, the face is held, and it moves on just before the next frame."""
     times = np.concatenate([np.arange(10), 60 + np.arange(10)]) / 25
@@ -83,13 +90,6 @@ def test_a_driver_waits_in_a_pause(tmp_path: Path) -> None:
     angles = driver.face.head_rotation[:, 1]
     assert (angles[9:60] - angles[9]).abs().max() < 1e-6
     torch.testing.assert_close(angles[60:], 0.01 * torch.from_numpy(times[10:]).float(), atol=1e-6, rtol=0)
-
-
-def test_a_steady_driver_is_not_touched(tmp_path: Path) -> None:
-    times = np.arange(9) / 25
-    driver = filmed_at(tmp_path, times, 25.0)
-    assert driver.fps == 25
-    assert torch.equal(driver.face.head_rotation[:, 1], 0.01 * torch.from_numpy(times).float())
 
 
 def test_a_pause_that_never_ends_is_refused(tmp_path: Path) -> None:
