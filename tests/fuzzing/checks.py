@@ -26,7 +26,10 @@ def _run(cases: Iterable[str], folder: str, material: str) -> list[Result]:
 
 
 def check_damage(folder: str, material: str, kind: str) -> None:
-    """Check one kind of damage to the file of every reader. Readers of exact content notice all of it."""
+    """Check one kind of damage to the file of every reader. Readers of exact content refuse all of it.
+
+    Only an analysis that is missing is made anew.
+    """
     names = [
         name
         for name in present(Path(material))
@@ -36,8 +39,9 @@ def check_damage(folder: str, material: str, kind: str) -> None:
     amounts = {name: len(list(Path(material).glob(one))) if one.endswith("/*") else 1 for name, one in patterns.items()}
     cases = [f"{name}:{kind}:{number}" for name in names for number in range(min(amounts[name], 6))]
     results = _run(cases, folder, material)
-    exact = [result for result in results if TARGETS[result.case.split(":")[0]].exact]
-    assert sum(result.outcome == "refused" for result in exact) > 10, table_of(results)
+    silent = [result.case for result in results if result.outcome != "refused"]
+    silent = [case for case in silent if TARGETS[case.split(":")[0]].exact and case != "analysis.json:missing:0"]
+    assert not silent, silent
 
 
 def check_values(folder: str, material: str, name: str) -> None:

@@ -19,11 +19,11 @@ from random import Random
 from typing import Any
 
 from fuzzing import uses
+from fuzzing.content import content_of
 from fuzzing.edges import SCRIPT
 from fuzzing.faults import DAMAGE, FIXED, Place, outside_of
 from fuzzing.material import copy_of
 from fuzzing.targets import TARGETS, Target
-from fuzzing.uses import content_of
 from fuzzing.values import SANE, VALUES, concrete, edit
 from mien.errors import UserError
 from mien.terminal import tell

@@ -8,6 +8,7 @@ from random import Random
 from typing import Any
 
 from fuzzing import faults, lines, uses
+from fuzzing.content import expect_finite
 from fuzzing.faults import Place
 from fuzzing.material import ANALYSIS, PIECES, RUN, SEQUENCE
 from mien.avatar import load_avatar
@@ -122,9 +123,9 @@ _TARGETS = (
     Target("miens", "miens/*", _of(read_portable), uses.use_portable, 3),
     Target("head.ply", "head.ply", _of(read_ply), uses.use_gaussians, 2),
     Target("pictures", "pictures/*", uses.read_pictures, weight=5),
-    Target("mattes", "given/mattes/*", uses.read_mattes, uses.expect_finite),
+    Target("mattes", "given/mattes/*", uses.read_mattes, expect_finite),
     Target("points", "given/points.*", lambda root, file: read_landmarks(file, 3), uses.expect_rows, 2),
-    Target("crops.json", "given/crops.json", _of(read_crops), uses.expect_finite),
+    Target("crops.json", "given/crops.json", _of(read_crops), expect_finite),
     Target("cameras.json", "given/cameras.json", _of(read_cameras), uses.use_cameras, 1.5, parts=("head.ply",)),
     Target("rig.json", "rig/rig.json", _of(read_calibration), uses.use_rig, 2),
     Target("take.csv", "given/take.csv", uses.read_motion, uses.expect_motion, 2),
