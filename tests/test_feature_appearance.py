@@ -13,8 +13,8 @@ from mien.avatar.ops.feature_network import Layers, feature_network_reference
 from mien.errors import UserError
 from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
 from mien.export.packed import pack
-from mien.render.rendering import Rendering
 from mien.runtime.checks import baked_fault
+from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
 
@@ -103,9 +103,7 @@ def test_a_gaussian_without_features_never_changes() -> None:
 def test_changes_have_a_penalty_of_their_own() -> None:
     avatar = new_avatar(replace(CONFIG, appearance_weight=0.5))
     posed, count = avatar.pose(toy_face(5)[1]), len(avatar.store)
-    radii = torch.zeros(count, dtype=torch.int32)
-    rendering = Rendering(torch.zeros(4, 4, 3), torch.zeros(4, 4), radii, torch.zeros(count, 2))
-    losses = avatar.regularizers(posed, rendering, Progress(0, 1))
+    losses = avatar.regularizers(posed, pictured(count), Progress(0, 1))
     squares = sum(posed.aux[name].square().mean() for name in ("feature_color", "feature_opacity"))
     torch.testing.assert_close(losses["appearance"], 0.5 * squares)
 

@@ -85,9 +85,12 @@ def test_reference_has_the_gradients_of_finite_differences() -> None:
     )
 
 
-def test_gradients_are_the_same_whether_own_numbers_have_one(isa: str) -> None:
+def test_gradients_are_the_same_whether_own_numbers_have_one_and_outputs_without_any(isa: str) -> None:
     (bases, inputs, neutral, own, *layers), by = arguments(SIZES[4]), gradients_of(SIZES[4])
     found = []
+    with torch.no_grad():
+        alone = feature_network(bases, inputs, neutral, own, Layers(*layers), FactoredGradient())
+    assert all(torch.equal(a, b) for a, b in zip(alone, ours(arguments(SIZES[4]), by), strict=False))
     for wanted in (False, True):
         leaves = [tensor.clone().requires_grad_() for tensor in (inputs, neutral, *layers)]
         outputs = feature_network(
@@ -95,14 +98,6 @@ def test_gradients_are_the_same_whether_own_numbers_have_one(isa: str) -> None:
         )
         found.append(torch.autograd.grad(outputs, leaves, by))
     assert all(torch.equal(one, two) for one, two in zip(*found, strict=True))
-
-
-def test_without_gradients_the_outputs_are_the_same() -> None:
-    given = arguments(SIZES[0])
-    with torch.no_grad():
-        bases, inputs, neutral, own, *layers = given
-        alone = feature_network(bases, inputs, neutral, own, Layers(*layers), FactoredGradient())
-    assert all(torch.equal(a, b) for a, b in zip(alone, ours(given, gradients_of(SIZES[0])), strict=False))
 
 
 def test_bases_may_lie_in_memory_in_either_order(isa: str) -> None:
@@ -161,16 +156,12 @@ def test_rows_and_columns_without_gradient_stay() -> None:
     assert not torch.equal(update.values[1::3], before[1::3])
 
 
-def test_several_terms_add_up() -> None:
-    one, parts = update_of(torch.float64), update_of(torch.float64)
+def test_terms_add_up_and_those_that_cancel_leave_everything_finite(isa: str) -> None:
+    one, parts, update = update_of(torch.float64), update_of(torch.float64), update_of()
     ((rows, columns),) = parts.terms
     factored_update(one)
     factored_update(parts._replace(terms=[(0.25 * rows, columns), (rows, 0.75 * columns)]))
     torch.testing.assert_close(one.values, parts.values)
-
-
-def test_terms_that_cancel_leave_everything_finite(isa: str) -> None:
-    update = update_of()
     ((rows, columns),) = update.terms
     factored_update(update._replace(terms=[(rows, columns), (-rows * (1 - 1e-7), columns)]))
     assert update.values.isfinite().all()

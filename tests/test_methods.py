@@ -165,6 +165,7 @@ def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> N
         np.testing.assert_allclose(portable.render(found)[0], picture, atol=1e-3, rtol=0)
 
 
+@pytest.mark.unchecked
 @method
 def test_an_avatar_becomes_a_file_a_page_and_a_mesh(method: str, tmp_path: Path) -> None:
     """The whole avatar is in a .mien and in a .glb file, and a page loses nothing that can be seen."""

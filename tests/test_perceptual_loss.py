@@ -1,5 +1,6 @@
 """The perceptual loss: its features, its crops and its steps."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import train_toy
 from mien.avatar import PerceptualLoss, Photometric
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.perceptual import load_training_features, weights
+from mien.perceptual import load_training_features
 from mien.perceptual.weights import weights_path
 from mien.render.rendering import Rendering
 from mien.training import Sequence, TrainSettings, read_curves, train
@@ -178,7 +179,7 @@ def test_missing_features_are_told_before_the_run_begins(
     scene: tuple[FaceModel, Sequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load_training_features.cache_clear()
-    monkeypatch.setattr(weights, "_PACKAGE", "no_such_package_here")
+    monkeypatch.setitem(sys.modules, "stlpips_pytorch", None)
     face_model, sequence = scene
     with pytest.raises(UserError, match="pip install stlpips-pytorch"):
         train([sequence], face_model, CONFIG, train_toy.SETTINGS, tmp_path / "run", silence)

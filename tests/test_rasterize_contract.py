@@ -14,7 +14,7 @@ from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render import rasterize as rasterize_in_place
 from mien.render.rasterize import Backend, choose_backend
 from mien.render.validation import drawable
-from rasterize_scenes import GSPLAT, Scene, random_scene, relative_error
+from rasterize_scenes import GSPLAT, Scene, random_scene
 from rasterize_scenes import rasterize_anywhere as rasterize
 
 BACKENDS = ["native", "reference", GSPLAT]
@@ -96,26 +96,6 @@ def test_batches_equal_their_single_pictures(backend: Backend) -> None:
         fixed = rasterize(scenes[1].gaussians, cameras, background, backend)
     assert not fixed.image.requires_grad
     assert not fixed.means2d_offset.requires_grad
-
-
-def test_shared_tensors_of_a_batch_gather_all_gradients() -> None:
-    scenes = [random_scene(seed, count=50) for seed in range(3)]
-    means = torch.stack([scene.gaussians.means for scene in scenes]).requires_grad_()
-    opacities = scenes[0].gaussians.opacities.clone().requires_grad_()
-    shared = replace(scenes[0].gaussians, means=means, opacities=opacities)
-    batch = rasterize(shared, scenes[0].camera, scenes[0].background)
-    (batch.image**2).sum().backward()
-    expected = torch.zeros_like(opacities)
-    for index in range(3):
-        own = scenes[0].gaussians.opacities.clone().requires_grad_()
-        single = replace(scenes[0].gaussians, means=means[index].detach(), opacities=own)
-        (rasterize(single, scenes[0].camera, scenes[0].background).image ** 2).sum().backward()
-        assert own.grad is not None
-        expected += own.grad
-    assert opacities.grad is not None
-    assert relative_error(opacities.grad, expected) < 1e-6
-    assert batch.means2d_offset.grad is not None
-    assert batch.means2d_offset.grad.shape == (3, 50, 2)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -57,6 +57,7 @@ def means_moments(state: TrainingState) -> Moments:
     return moments
 
 
+@pytest.mark.unchecked
 def test_a_step_follows_the_mean_of_its_frames() -> None:
     both = pull_at(*new_state(replace(SMALL, frames_per_step=2)), 2)
     own = [pull_at(*new_state(replace(SMALL, frames_per_step=1)), frame) for frame in (2, 3)]
@@ -64,7 +65,11 @@ def test_a_step_follows_the_mean_of_its_frames() -> None:
     torch.testing.assert_close(both, (own[0] + own[1]) / 2, rtol=1e-4, atol=1e-4 * float(both.abs().max()))
 
 
-def test_every_loss_of_a_picture_is_a_mean() -> None:
+def test_losses_of_a_picture_are_means_and_steps_pass_every_multiple_once() -> None:
+    assert [now for now in range(1, 30, 4) if passed(now - 4 if now > 1 else 0, now, 10)] == [13, 21]
+    assert not passed(10, 11, 10)
+    progress = Progress(8, 100, frames=4)
+    assert [count for count in range(20) if progress.completes([count])] == [9, 10, 11, 12]
     weights = Photometric(0.7, 0.3, 0.2, 0.5, PerceptualLoss(0.4))
     assert weights.scaled(1.0) is weights
     half = weights.scaled(0.5)
@@ -72,6 +77,7 @@ def test_every_loss_of_a_picture_is_a_mean() -> None:
     assert half == Photometric(0.35, 0.15, 0.1, 0.5, PerceptualLoss(0.2))
 
 
+@pytest.mark.unchecked
 def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     state, data = new_state()
     rounds: list[bool] = []
@@ -120,15 +126,15 @@ def test_many_points_mean_fewer_frames() -> None:
         replace(SMALL, frames_per_step=0).check()
 
 
-@pytest.mark.parametrize("method", ["gaussian_avatars", "headgas"])
 def test_other_methods_use_one_frame_and_have_no_such_setting(
-    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert new_avatar(method).extras.frames_per_step() == 1
-    assert main(["train", str(tmp_path), "--method", method, "--method.frames-per-step", "4"]) == 2
+    assert [new_avatar(method).extras.frames_per_step() for method in ("gaussian_avatars", "headgas")] == [1, 1]
+    assert main(["train", str(tmp_path), "--method", "headgas", "--method.frames-per-step", "4"]) == 2
     assert "frames-per-step" in capsys.readouterr().err
 
 
+@pytest.mark.unchecked
 def test_the_number_of_threads_changes_no_bit() -> None:
     """Pictures of a step are drawn side by side, or one by one if there are more threads than frames."""
     results, before = [], _native.thread_count()
@@ -143,13 +149,6 @@ def test_the_number_of_threads_changes_no_bit() -> None:
         _native.set_thread_count(before)
     for other in results[1:]:
         assert all(torch.equal(tensor, other[name]) for name, tensor in results[0].items())
-
-
-def test_steps_pass_every_multiple_once() -> None:
-    assert [now for now in range(1, 30, 4) if passed(now - 4 if now > 1 else 0, now, 10)] == [13, 21]
-    assert not passed(10, 11, 10)
-    progress = Progress(8, 100, frames=4)
-    assert [count for count in range(20) if progress.completes([count])] == [9, 10, 11, 12]
 
 
 def test_entries_of_a_batch_are_its_timesteps() -> None:

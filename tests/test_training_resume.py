@@ -139,7 +139,9 @@ def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     assert curves["step_ms"][:2].tolist() == tensors["curves.step_ms"].tolist()
 
 
-def test_finished_run_is_loaded(undisturbed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_finished_run_is_loaded_and_other_settings_are_refused(
+    undisturbed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = (undisturbed / "training.json").read_bytes()
     train_toy.main(undisturbed, STEPS)
     assert "step" not in capsys.readouterr().out
@@ -147,6 +149,11 @@ def test_finished_run_is_loaded(undisturbed: Path, capsys: pytest.CaptureFixture
     summary = read_training_summary(undisturbed)
     assert summary["steps"] == STEPS
     assert set(summary) == {"steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"}
+    with pytest.raises(UserError, match="settings.steps"):
+        train_toy.main(undisturbed, STEPS + 1)
+    face_model, sequence = toy_sequence(timesteps=5, size=32)
+    with pytest.raises(UserError, match="method"):
+        train([sequence], face_model, replace(train_toy.CONFIG, sh_degree=1), train_toy.SETTINGS, undisturbed)
 
 
 @pytest.mark.exact
@@ -171,12 +178,3 @@ def test_threads_do_not_change_a_bit() -> None:
     for other in results[1:]:
         for name, tensor in results[0].items():
             assert torch.equal(tensor, other[name]), name
-
-
-def test_other_settings_are_refused(undisturbed: Path) -> None:
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    with pytest.raises(UserError, match="settings.steps"):
-        train_toy.main(undisturbed, STEPS + 1)
-    other = replace(train_toy.CONFIG, sh_degree=1)
-    with pytest.raises(UserError, match="method"):
-        train([sequence], face_model, other, train_toy.SETTINGS, undisturbed)

@@ -120,12 +120,8 @@ def test_gradients_go_only_where_they_are_wanted():
     vertices, faces, face_index, *local = random_rig(dtype=torch.float32)
     local[0].requires_grad_()
     means, quats, scales = bind_to_world(vertices, faces, face_index, *local)
-    quats.sum().backward(retain_graph=True)
-    assert local[0].grad is not None
-    assert local[0].grad.abs().max() == 0
-    (means.sum() + scales.sum()).backward()
-    assert local[0].grad.abs().min() > 0
-    assert vertices.grad is None
+    assert torch.autograd.grad(quats.sum(), local[0], retain_graph=True)[0].abs().max() == 0
+    assert torch.autograd.grad(means.sum() + scales.sum(), local[0])[0].abs().min() > 0
 
 
 def test_indices_are_checked():
