@@ -10,15 +10,18 @@ import pytest
 
 from mien.avatar import METHODS
 from mien.cli import main
+from mien.commands.bench import Compare
 from mien.commands.stages import comparing
 from mien.commands.stages.comparing import Budget, CompareSettings
 from mien.face import add_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
-from mien.training import read_run_config, read_training_summary
+from mien.training import PRESETS, read_run_config, read_training_summary, trainer
 from mien.training.settings import Preset
+from mien.workspace import Workspace
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 
+pytestmark = pytest.mark.unchecked
 METRICS = {"psnr": 30.0, "ssim": 0.9, "l1": 0.01, "perceptual": 0.2}
 
 
@@ -36,16 +39,14 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Return the folders of the runs that are really trained, in order."""
-    from mien.training import trainer
-
     seen: list[Path] = []
-    original = trainer._train_to_the_end
+    write = trainer.write_results
 
-    def watched(state: Any, data: Any, settings: Any, run_dir: Path, progress: Any, watch: Any) -> None:
+    def watched(run_dir: Path, *more: Any) -> None:
         seen.append(run_dir)
-        original(state, data, settings, run_dir, progress, watch)
+        write(run_dir, *more)
 
-    monkeypatch.setattr(trainer, "_train_to_the_end", watched)
+    monkeypatch.setattr(trainer, "write_results", watched)
     return seen
 
 
@@ -63,17 +64,20 @@ def few_lessons(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_films", "few_lessons")
-def test_every_method_gets_the_same_frames_and_steps(
+def test_methods_get_the_same_frames_and_steps(
     workspace: Path, tmp_path: Path, trained: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
+    assert Compare().methods == tuple(METHODS)
+    methods = ("gaussian_avatars", "mono_gaussian_avatar", "textured_mesh")
     command = ["bench", "compare", str(workspace), "--steps", "6", "--split", "tail", "--out", str(tmp_path)]
     assert main([*command, "--methods", "gaussian_avatars"]) == 0
+    command += ["--methods", *methods]
     assert main([*command, "--json"]) == 0
-    assert [folder.name for folder in trained] == [f"compare-{method}-6-tail" for method in METHODS]
+    assert [folder.name for folder in trained] == [f"compare-{method}-6-tail" for method in methods]
     content = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert content["format"] == "mien.bench_compare"
     rows = content["rows"]
-    assert [(row["capture"], row["method"], row["steps"]) for row in rows] == [("anna", m, 6) for m in METHODS]
+    assert [(row["capture"], row["method"], row["steps"]) for row in rows] == [("anna", m, 6) for m in methods]
     stored = json.loads((tmp_path / "compare.json").read_text())
     assert stored["rows"] == rows
     scored_on = []
@@ -91,31 +95,40 @@ def test_every_method_gets_the_same_frames_and_steps(
     table = (tmp_path / "compare.md").read_text()
     assert table.startswith("| capture | protocol | method | head: PSNR, dB |")
     assert "unseen" not in table
-    assert all(f"| {method} |" in table for method in METHODS)
+    assert all(f"| {method} |" in table for method in methods)
     before = len(trained)
     assert main(command) == 0
     assert len(trained) == before
     assert table.strip() in capsys.readouterr().out
 
 
-@pytest.mark.alone
+class TenthsOfSeconds:
+    """A clock that goes on by a tenth of a second whenever it is read."""
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def perf_counter(self) -> float:
+        self.reads += 1
+        return self.reads / 10
+
+
+@pytest.mark.usefixtures("short_films")
 def test_minutes_become_steps_by_trials_that_are_kept(
     workspace: Path, tmp_path: Path, trained: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = ["bench", "compare", str(workspace), "--minutes", "0.02", "--methods", "gaussian_avatars"]
+    """On a clock on which a step takes a tenth of a second, 3 seconds are 30 steps."""
+    monkeypatch.setattr(trainer, "time", TenthsOfSeconds())
+    monkeypatch.setattr(comparing, "FIRST_TRIAL_STEPS", 5)
+    run = "compare-gaussian_avatars-0.05min-tail"
+    command = ["bench", "compare", str(workspace), "--minutes", "0.05", "--methods", "gaussian_avatars"]
     command += ["--out", str(tmp_path), "--split", "tail"]
-    monkeypatch.setattr(comparing, "_FIRST_TRIAL_STEPS", 5)
     assert main(command) == 0
-    summary = read_training_summary(workspace / "runs" / "compare-gaussian_avatars-0.02min-tail")
-    assert summary["steps"] > 5
-    assert 0.2 < summary["seconds"] < 6  # 1.2 s on an idle machine
-    first = trained[0]
-    assert first.name.startswith("first-5-")
-    assert first.parent == tmp_path / "trials" / "anna" / "compare-gaussian_avatars-0.02min-tail"
-    assert trained[-1].name == "compare-gaussian_avatars-0.02min-tail"
-    before = len(trained)
+    assert read_training_summary(workspace / "runs" / run)["steps"] == 30
+    assert [folder.name.rpartition("-")[0] for folder in trained] == ["first-5", "second-10", run.rpartition("-")[0]]
+    assert trained[0].parent == tmp_path / "trials" / "anna" / run
     assert main(command) == 0
-    assert len(trained) == before
+    assert len(trained) == 3
 
 
 def test_what_two_trials_share_is_not_counted_for_each_step(
@@ -128,26 +141,24 @@ def test_what_two_trials_share_is_not_counted_for_each_step(
         asked.append(settings.steps)
         return times[settings.steps]
 
-    monkeypatch.setattr(comparing, "_trial", trial)
-    from mien.commands.stages.comparing import _of_workspace, _steps
-    from mien.training import PRESETS
-    from mien.workspace import Workspace
-
+    monkeypatch.setattr(comparing, "trial_seconds", trial)
     chosen = CompareSettings(("gaussian_avatars",), "standard", Budget(minutes=2.0), "tail")
-    subject = _of_workspace(Workspace(workspace), chosen)
+    subject = comparing.of_workspace(Workspace(workspace), chosen)
     config = PRESETS["standard"].config("gaussian_avatars")
     # 6 s beside the steps, and 40 ms for each.
-    assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == 114 / 0.04
+    assert comparing.steps_for(subject, config, subject.settings, chosen.budget, tmp_path / "new") == 114 / 0.04
     assert asked == [100, 200]
     times[200] = 9.0  # The machine was busier in the first trial: a step takes at least 0.3 of the mean.
-    assert _steps(subject, config, subject.settings, chosen.budget, tmp_path / "new") == round(113.7 / 0.0135)
+    assert comparing.steps_for(subject, config, subject.settings, chosen.budget, tmp_path / "new") == round(
+        113.7 / 0.0135
+    )
     # There is no time for a second trial.
-    assert _steps(subject, config, subject.settings, Budget(minutes=0.2), tmp_path / "new") == 120
+    assert comparing.steps_for(subject, config, subject.settings, Budget(minutes=0.2), tmp_path / "new") == 120
     assert "too few steps" not in capsys.readouterr().err
-    assert _steps(subject, config, subject.settings, Budget(minutes=0.002), tmp_path / "new") == 1
+    assert comparing.steps_for(subject, config, subject.settings, Budget(minutes=0.002), tmp_path / "new") == 1
     assert "0.002 minutes are too few steps to see each of" in capsys.readouterr().err
-    assert _steps(subject, config, subject.settings, Budget(steps=7), tmp_path / "new") == 7
-    assert _steps(subject, config, subject.settings, Budget(), tmp_path / "new") == subject.settings.steps
+    assert comparing.steps_for(subject, config, subject.settings, Budget(steps=7), tmp_path / "new") == 7
+    assert comparing.steps_for(subject, config, subject.settings, Budget(), tmp_path / "new") == subject.settings.steps
 
 
 def row(capture: str, method: str, psnr: float, unseen: dict[str, Any] | None = None, **parts: Any) -> MethodRow:

@@ -32,7 +32,7 @@ from mien.workspace import COMPARED, Workspace
 
 _FORMAT, _VERSION = "mien.bench_compare", 1
 _SCORED = EvaluationSettings(video_frames=0)
-_FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
+FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
 """Least and largest number of steps of the first trial. Between them, it uses each training frame once."""
 _TRIAL_SHARE = 0.1
 """Share of the budget that the second trial may take beside it. A shorter one grows fewer Gaussians than the run."""
@@ -72,7 +72,7 @@ class CompareSettings:
 
 
 @dataclass(frozen=True)
-class _Subject:
+class Subject:
     """A capture on which all methods are trained."""
 
     name: str
@@ -102,7 +102,7 @@ def run_compare_stage(
     """
     references = [reference_named(name) for name in captures]
     with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
-        subjects = [_of_workspace(workspace, settings) for workspace in workspaces]
+        subjects = [of_workspace(workspace, settings) for workspace in workspaces]
         rows: list[MethodRow] = []
         content: dict[str, Any] = {}
         for subject in (*subjects, *(_of_reference(reference, out, settings) for reference in references)):
@@ -123,27 +123,28 @@ def _write(out: Path, rows: Items[MethodRow], settings: CompareSettings) -> dict
     return {"format": _FORMAT, "version": _VERSION, **content}
 
 
-def _of_workspace(workspace: Workspace, settings: CompareSettings) -> _Subject:
+def of_workspace(workspace: Workspace, settings: CompareSettings) -> Subject:
+    """The tracked workspace as something to compare on."""
     names = workspace.tracked_names()
     if not names:
         raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
     held = replace(PRESETS[settings.preset].settings, split=settings.split)
-    return _Subject(workspace.root.resolve().name, workspace, names, held)
+    return Subject(workspace.root.resolve().name, workspace, names, held)
 
 
-def _of_reference(reference: ReferenceCapture, out: Path, settings: CompareSettings) -> _Subject:
+def _of_reference(reference: ReferenceCapture, out: Path, settings: CompareSettings) -> Subject:
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / "seconds.json"))
     held = reference_settings(reference, PRESETS[settings.preset].settings)
-    return _Subject(reference.name, workspace, list(trackings), held, reference, drawn)
+    return Subject(reference.name, workspace, list(trackings), held, reference, drawn)
 
 
-def _row(subject: _Subject, method: str, settings: CompareSettings, out: Path) -> MethodRow:
+def _row(subject: Subject, method: str, settings: CompareSettings, out: Path) -> MethodRow:
     """Train and score a method on a capture, unless that is done."""
     workspace, run, preset = subject.workspace, settings.run_name(method), PRESETS[settings.preset]
     run_dir, config = workspace.run_dir(run), preset.config(method)
     own = replace(subject.settings, steps=preset.settings_of(method).steps)
-    own = replace(own, steps=_steps(subject, config, own, settings.budget, out / "trials" / subject.name / run))
+    own = replace(own, steps=steps_for(subject, config, own, settings.budget, out / "trials" / subject.name / run))
     run_training_stage(workspace, subject.sequences, run, config, own)
     metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
     summary = read_training_summary(run_dir)
@@ -154,7 +155,7 @@ def _row(subject: _Subject, method: str, settings: CompareSettings, out: Path) -
     )  # fmt: skip
 
 
-def _unseen(subject: _Subject, run: str) -> dict[str, Any]:
+def _unseen(subject: Subject, run: str) -> dict[str, Any]:
     if subject.reference is None or subject.drawn is None or subject.reference.views is None:
         return {}
     known = subject.workspace.run_dir(run) / "unseen_view.json"
@@ -165,7 +166,7 @@ def _unseen(subject: _Subject, run: str) -> dict[str, Any]:
     return score_unseen_views(subject.reference, subject.drawn, subject.workspace, run)
 
 
-def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, budget: Budget, folder: Path) -> int:
+def steps_for(subject: Subject, config: MethodConfig, settings: TrainSettings, budget: Budget, folder: Path) -> int:
     """The number of steps of a run. A budget of minutes is turned into steps by two trials, which are kept.
 
     The run is expected to need as much time beside its steps as the trials, and for each step the time that a step of
@@ -180,12 +181,12 @@ def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, bud
     tracked = "".join(file_digest(one / "tracking/tracking.safetensors")[:8] for one in folders)[:32]
     sequences = [read_sequence(one) for one in folders]
     pictures = len(training_frames(sequences, settings))
-    count = max(_FIRST_TRIAL_STEPS, min(pictures, _MOST_FIRST_STEPS))
-    took = _trial(sequences, config, replace(settings, steps=count), folder / f"first-{count}-{tracked}")
+    count = max(FIRST_TRIAL_STEPS, min(pictures, _MOST_FIRST_STEPS))
+    took = trial_seconds(sequences, config, replace(settings, steps=count), folder / f"first-{count}-{tracked}")
     rate, began = took / count, 0.0
     longer = max(2 * count, round(_TRIAL_SHARE * 60 * budget.minutes / rate))
     if longer * rate < 60 * budget.minutes:
-        both = _trial(sequences, config, replace(settings, steps=longer), folder / f"second-{longer}-{tracked}")
+        both = trial_seconds(sequences, config, replace(settings, steps=longer), folder / f"second-{longer}-{tracked}")
         rate = min(max((both - took) / (longer - count), _LEAST_MARGIN * both / longer), both / longer)
         began = both - longer * rate
     steps = max(1, round((60 * budget.minutes - began) / rate))
@@ -201,7 +202,7 @@ def _steps(subject: _Subject, config: MethodConfig, settings: TrainSettings, bud
     return steps
 
 
-def _trial(sequences: list[Sequence], config: MethodConfig, settings: TrainSettings, run_dir: Path) -> float:
+def trial_seconds(sequences: list[Sequence], config: MethodConfig, settings: TrainSettings, run_dir: Path) -> float:
     """Seconds of a short run, whose schedules are as short. A trial that was done is only read."""
     if not (run_dir / "training.json").is_file():
         say(f"{run_dir.parent.name}: a trial of {settings.steps} steps")
