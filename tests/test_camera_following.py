@@ -15,6 +15,7 @@ from mien.capture.faces import LandmarkDetector
 from mien.capture.video import probe_video, read_video_frames, write_video
 from mien.cli import main
 from mien.commands.stages import viewing_motions
+from mien.driving.constants import DRIVING
 from mien.driving.live import Follower, FollowOptions, LandmarkFit, OneEuro
 from mien.face import load_face_model
 from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
@@ -146,7 +147,14 @@ def test_an_avatar_learns_follows_without_lag_and_goes_to_rest(
     assert one.state == "learning"
 
 
+@pytest.fixture
+def few_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the face at rest be learnt from a few frames, which takes half a second and not several."""
+    monkeypatch.setattr("mien.driving.live.follower.DRIVING", replace(DRIVING, learn_least_frames=2))
+
+
 @pytest.mark.unchecked
+@pytest.mark.usefixtures("few_learnt")
 def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
     """A mouth that is open, and a head that is aside, from the first frame on reach the avatar."""
     fit, one = LandmarkFit(MODEL, MODEL.neutral()), follower()
@@ -159,7 +167,7 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
     turned = fit.pixels(turn, place, 0 * coefficients, SIZE, SIZE)
 
     def last(follows: Follower, pixels: np.ndarray, began: float = 0.0) -> runtime.Face:
-        return [follows(pixels, SIZE, SIZE, began + index / 10) for index in range(20)][-1]
+        return [follows(pixels, SIZE, SIZE, began + index / 8) for index in range(16)][-1]
 
     assert last(one, open_mouth).expression[column("jawOpen")] > 0.6
     assert one.state == "following"
@@ -171,6 +179,7 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
 
 
 @pytest.mark.unchecked
+@pytest.mark.usefixtures("few_learnt")
 def test_head_pose_can_be_left_out_and_limits_hold(landmarks: np.ndarray) -> None:
     inputs = len(MODEL.expression_names) + 3 * len(MODEL.free_joint_names)
     zeros = np.zeros(inputs, np.float32)
@@ -181,7 +190,7 @@ def test_head_pose_can_be_left_out_and_limits_hold(landmarks: np.ndarray) -> Non
     kept = Follower(MODEL, MODEL.neutral(), filmed, np.array([0, 0, 1], np.float32))
     free = Follower(MODEL, MODEL.neutral(), filmed, np.array([0, 0, 1], np.float32), FollowOptions(unlimited=True))
     most = {"kept": 0.0, "free": 0.0, "turn": 0.0}
-    for index in (*range(0, 35, 3), *range(36, len(landmarks), 6)):
+    for index in (*range(0, 35, 3), *range(36, len(landmarks), 8)):
         found = landmarks[index]
         face = still(found, SIZE, SIZE, index / FPS)
         np.testing.assert_array_equal(face.head_rotation, np.zeros(3, np.float32))

@@ -29,10 +29,7 @@ def test_written_frames_are_read_back(tmp_path):
 
 
 def test_colors_keep_their_level(tmp_path):
-    """Colours keep their level.
-
-    Wrong matrices or ranges shift whole colours, which a mean over a picture would hide.
-    """
+    """Wrong matrices or ranges shift whole colours, which a mean over a picture would hide."""
     colors = np.array([[200, 30, 40], [30, 180, 60], [20, 60, 220], [128, 128, 128], [255, 255, 255], [0, 0, 0]])
     for color in colors.astype(np.uint8):
         path = tmp_path / "color.mp4"

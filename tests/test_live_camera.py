@@ -19,7 +19,7 @@ from mien.errors import UserError
 FPS = 25
 
 
-def until(done: Callable[[], bool], seconds: float = 120.0) -> None:
+def until(done: Callable[[], bool], seconds: float = 60.0) -> None:
     ends = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < ends, "it never came"
@@ -40,7 +40,7 @@ class Stage:
         if not self.waits:
             until(self.begins)
         elif seconds and not stopping.is_set():
-            assert self.turns.acquire(timeout=120)
+            assert self.turns.acquire(timeout=60)
         self.waits.append(seconds)
         self.now += seconds
 

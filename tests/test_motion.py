@@ -25,13 +25,8 @@ def jaw(motion) -> list[float]:
     return motion.coefficients[:, ARKIT_NAMES.index("jawOpen")].tolist()
 
 
-def test_layout_is_live_link_faces() -> None:
-    assert len(COLUMNS) == 63
-    assert COLUMNS[2] == "EyeBlinkLeft"
-    assert COLUMNS[53:57] == ["TongueOut", "HeadYaw", "HeadPitch", "HeadRoll"]
-
-
 def test_values_times_and_turns(tmp_path: Path) -> None:
+    assert (len(COLUMNS), COLUMNS[2], COLUMNS[53:55]) == (63, "EyeBlinkLeft", ["TongueOut", "HeadYaw"])
     first = row("11:59:59:58.5", JawOpen=0.25, HeadYaw=0.3, EyeLookOutLeft=1, EyeLookInRight=1, EyeLookDownLeft=0.5)
     motion = read_live_link_face(write_csv(tmp_path / "a.csv", first, row("11:59:59:59.5", JawOpen=0.5),
                                            row("12:00:00:00.5", JawOpen=1, HeadPitch=-0.2)))  # fmt: skip
@@ -102,7 +97,6 @@ def test_head_angles_are_unreals(tmp_path: Path) -> None:
 
 
 def test_bad_csv_files(tmp_path: Path) -> None:
-    """Bad csv files are refused with line, column and value."""
     good = row("0:00:00:01.0")
     without = [name for name in COLUMNS if name not in ("JawOpen", "TongueOut")]
     for rows, columns, part in (
@@ -135,7 +129,6 @@ def test_plain_json(tmp_path: Path) -> None:
 
 
 def test_face_landmarker_results(tmp_path: Path) -> None:
-    """Results of MediaPipe's face landmarker are read with the head's rotation."""
     turn = matrix_from_axis_angle(torch.tensor([0.1, -0.4, 0.2])).numpy()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, [1, 2, -45]
@@ -153,7 +146,6 @@ def test_face_landmarker_results(tmp_path: Path) -> None:
 
 
 def test_bad_json_files(tmp_path: Path) -> None:
-    """Bad json files are refused with frame and value."""
     good = {"timestamp_ms": 0, "blendshapes": {}}
     for content, part in (
         ([], "is not a list of frames"),

@@ -13,20 +13,19 @@ def _flat(height: int, width: int, value: int) -> np.ndarray:
     return np.full((height, width, 3), value, np.uint8)
 
 
-def test_to_uint8_rounds_and_clamps() -> None:
+def test_levels_are_rounded_and_clamped_and_pictures_shrunk() -> None:
     image = torch.tensor([[[-0.5, 0.5, 1.5], [0.0, 1.0, 1 / 255]]])
     assert to_uint8(image).tolist() == [[[0, 128, 255], [0, 255, 1]]]
+    assert shrink(_flat(100, 50, 3), 40).shape == (40, 20, 3)
+    assert shrink(_flat(10, 5, 3), 40).shape == (10, 5, 3), "nothing is enlarged"
 
 
-def test_side_by_side_scales_to_the_first() -> None:
+def test_sheets_of_pictures() -> None:
     joined = side_by_side([_flat(10, 8, 0), _flat(20, 30, 100)], gap=2)
     assert joined.shape == (10, 8 + 2 + 15, 3)
     assert (joined[:, :8] == 0).all()
     assert (joined[:, 8:10] == 255).all()
     assert (joined[:, 10:] == 100).all()
-
-
-def test_picture_grid_fills_the_last_row() -> None:
     sheet = picture_grid([_flat(4, 6, value) for value in (10, 20, 30)], columns=2, gap=1)
     assert sheet.shape == (9, 13, 3)
     assert sheet[0, 7, 0] == 20
@@ -54,8 +53,3 @@ def test_picture_uri_is_a_picture() -> None:
         assert decoded.shape == picture.shape
         if quality is None:
             assert (decoded == picture).all()
-
-
-def test_shrink_never_enlarges() -> None:
-    assert shrink(_flat(100, 50, 3), 40).shape == (40, 20, 3)
-    assert shrink(_flat(10, 5, 3), 40).shape == (10, 5, 3)
