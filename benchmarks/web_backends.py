@@ -14,10 +14,9 @@ from pathlib import Path
 
 from mien.export import write_packed
 from mien.runtime import PortableAvatar
-from test_web_element import script, served
 from test_web_gpu import PAGE, opened
 from test_web_skinned import skinned_head
-from web_case import browse, build, drawn_head, painted_head
+from web_case import browse, build, drawn_head, painted_head, script, served
 
 HEADS: dict[str, Callable[[], PortableAvatar]] = {
     "gaussian_avatars, 40,000": lambda: drawn_head(40_000, rank=8),

@@ -8,15 +8,21 @@ import numpy as np
 import pytest
 import torch
 
+import train_toy
 from mien import runtime
 from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, load_avatar, make_portable, measure_filmed, write_avatar
+from mien.cli import main
+from mien.commands.stages.viewing import viewed_file
 from mien.driving import keep_to_filmed
 from mien.errors import UserError
 from mien.face import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
+from mien.training import read_coverage
+from mien.training.footage.filmed import FILE
 from plain_settings import plain_config
 from toy_scene import toy_camera, toy_face_model, toy_sequence
+from toy_workspace import write_toy_workspace
 
 EYE = np.array([0.0, 0.0, 1.0])
 
@@ -125,20 +131,6 @@ def test_it_is_kept_in_a_run_and_in_a_mien_file(tmp_path: Path) -> None:
             assert np.array_equal(getattr(found, name), getattr(avatar.filmed, name)), name
 
 
-def test_a_mien_file_keeps_the_confidence_of_each_triangle(tmp_path: Path) -> None:
-    plain = make_portable(_avatar(toy_sequence()[1].tracking.face), toy_camera(32), "toy")
-    assert isinstance(plain.baked, runtime.MeshBound)
-    confidence = np.linspace(0, 1, len(plain.baked.faces), dtype=np.float32)
-    for name in ("a.mien", "b.mien"):
-        runtime.write_portable(tmp_path / name, replace(plain, confidence=confidence))
-    assert (tmp_path / "a.mien").read_bytes() == (tmp_path / "b.mien").read_bytes()
-    found = runtime.read_portable(tmp_path / "a.mien").confidence
-    assert found is not None
-    assert found.tobytes() == confidence.tobytes()
-    runtime.write_portable(tmp_path / "plain.mien", plain)
-    assert runtime.read_portable(tmp_path / "plain.mien").confidence is None
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_confidence_that_does_not_fit_is_refused(method: str, tmp_path: Path) -> None:
     kind = METHODS[method]
@@ -172,3 +164,28 @@ def test_a_range_that_does_not_fit_is_refused(tmp_path: Path) -> None:
             load_avatar(tmp_path / "a")
         with pytest.raises(UserError, match="filmed"):
             runtime.write_portable(tmp_path / "a.mien", make_portable(avatar, toy_camera(32), "toy"))
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("unseen", ["trained", "filled"])
+def test_a_mien_file_and_the_viewer_have_the_confidence_of_the_run(
+    unseen: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, steps=2, unseen=unseen))
+    write_toy_workspace(tmp_path / "me")
+    run = tmp_path / "me" / "runs" / "toy"
+    covered = read_coverage(run, load_avatar(run).face_model)
+    assert covered is not None
+    assert covered.seen.unique().numel() > 1
+    path = tmp_path / "me.mien"
+    assert main(["export", str(tmp_path / "me"), "--out", str(path)]) == 0
+    found = runtime.read_portable(path).confidence
+    assert found is not None
+    assert torch.equal(torch.from_numpy(found), covered.seen)
+    mesh = viewed_file(path).mesh
+    assert mesh is not None
+    assert mesh.seen is not None
+    assert np.array_equal(mesh.seen, found)
+    (run / FILE).unlink()
+    assert main(["export", str(tmp_path / "me"), "--out", str(path)]) == 0
+    assert runtime.read_portable(path).confidence is None

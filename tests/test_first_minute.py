@@ -13,7 +13,7 @@ import pytest
 
 from mien.capture.video import write_video
 from mien.export import write_page
-from web_case import chromium, drawn_head, node
+from web_case import browse, chromium, drawn_head, node
 
 _FILE = Path(__file__).parents[1] / "docs" / "pictures" / "first_minute.py"
 
@@ -30,11 +30,9 @@ def minute() -> Iterator[ModuleType]:
     del sys.modules["first_minute"]
 
 
-@pytest.mark.slow
-def test_a_page_is_walked_through(minute: ModuleType, tmp_path: Path) -> None:
-    chromium()
-    node()
-    write_page(tmp_path / "me.html", drawn_head(6000, rank=2))
+def test_a_page_is_walked_through(minute: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(minute, "node", lambda address, given: browse(address, **given))
+    write_page(tmp_path / "me.html", drawn_head(800, rank=2))
     made = minute.Walk(tmp_path)
     minute.look_at_page(made, tmp_path / "me.html", "landscape", "dark")
     minute.write_sheet(made)
@@ -54,10 +52,13 @@ def test_a_page_is_walked_through(minute: ModuleType, tmp_path: Path) -> None:
     assert sheet.std() > 20
 
 
-@pytest.mark.slow
-def test_the_walk_stumbles_where_a_stranger_would(minute: ModuleType, tmp_path: Path) -> None:
+def test_the_walk_stumbles_where_a_stranger_would(
+    minute: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     chromium()
     node()
+    own = minute.node
+    monkeypatch.setattr(minute, "node", lambda address, given: browse(address, **given))
     portable, page = drawn_head(300), tmp_path / "me.html"
     unseen = replace(portable.baked.attributes, opacity_logits=np.full(300, -20, np.float32))
     write_page(page, replace(portable, baked=replace(portable.baked, attributes=unseen)))
@@ -67,6 +68,7 @@ def test_the_walk_stumbles_where_a_stranger_would(minute: ModuleType, tmp_path: 
         ('<img src="http://127.0.0.1:9/a.png">', r"asks for \['http://127.0.0.1:9/a.png'\]"),
         ("<script>console.warn('careful')</script>", r"says \['careful'\]"),
     ):
+        monkeypatch.setattr(minute, "node", own)
         page.write_text(f"<!doctype html><title>A</title>{text}")
         with pytest.raises(minute.WalkError, match=message):
             minute.shoot(minute.Walk(tmp_path), page, "a", {"": "walk.wait(100)"}, "phone")

@@ -78,7 +78,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "written"
 
 
-@pytest.mark.parametrize("config", [{}, {"sh_degree": 1}, {"sh_degree": 3}, {"sh_degree": 2, "sh_frame": "head"}])
+@pytest.mark.parametrize("config", [{}, {"sh_degree": 3}, {"sh_degree": 2, "sh_frame": "head"}])
 def test_a_written_folder_draws_the_same(config: dict, tmp_path: Path) -> None:
     """Every frame looks as before; the face model is in the folder."""
     model, face = toy_face_model(), replace(toy_face(5), vertex_offsets=None)
@@ -128,7 +128,7 @@ def test_parameters_are_those_of_flame(flame: FaceModel, tmp_path: Path) -> None
 
 def test_offsets_without_teeth_are_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flame: FaceModel) -> None:
     v = len(flame.template)
-    monkeypatch.setattr("mien.export.flame_params._TEETH", (v - 20, v))
+    monkeypatch.setattr("mien.export.flame_params.TEETH", (v - 20, v))
     path = tmp_path / "flame_param.npz"
     write_flame_params(path, flame, flame_face(flame))
     with np.load(path) as file:
@@ -140,9 +140,6 @@ def test_offsets_without_teeth_are_padded(tmp_path: Path, monkeypatch: pytest.Mo
     assert offsets is not None
     assert np.array_equal(offsets[: v - 20].numpy(), stored["static_offset"][0])
     assert not offsets[v - 20 :].any()
-
-
-# Gaussians without their mesh -------------------------------------------------------------------------------------
 
 
 def test_a_ply_with_local_means_is_refused_without_its_mesh(folder: Path) -> None:
@@ -166,20 +163,17 @@ def _count(header: bytes) -> int:
     return int(header.split(b"element vertex ")[1].split(b"\n")[0])
 
 
-@pytest.mark.parametrize(
-    ("kind", "numpy_kind"),
-    [("int", "<i4"), ("uint", "<u4"), ("int32", "<i4"), ("short", "<i2"), ("float", "<f4"), ("double", "<f8")],
-)
+@pytest.mark.parametrize(("kind", "numpy_kind"), [("int32", "<i4"), ("short", "<i2"), ("double", "<f8")])
 def test_the_binding_may_be_of_any_type(kind: str, numpy_kind: str, folder: Path) -> None:
     before = read_gaussian_avatars_folder(folder).avatar.gaussian_store()["face_index"]
     with_binding(folder, kind, numpy_kind, lambda values: values)
     assert torch.equal(read_gaussian_avatars_folder(folder).avatar.gaussian_store()["face_index"], before)
 
 
-FIRST = {"nan": np.nan, "inf": np.inf, "half": 2.5, "negative": -1, "too_large": 1e6}
+FIRST = {"nan": np.nan, "half": 2.5, "negative": -1, "too_large": 1e6}
 
 
-@pytest.mark.parametrize("fault", [*FIRST, "negative int", "too large int", "too large uint", "missing"])
+@pytest.mark.parametrize("fault", [*FIRST, "negative int", "too large uint", "missing"])
 def test_a_damaged_binding_is_named(fault: str, folder: Path) -> None:
     path = folder / "point_cloud.ply"
     if fault == "missing":
@@ -195,9 +189,6 @@ def test_a_damaged_binding_is_named(fault: str, folder: Path) -> None:
         read_gaussian_avatars_folder(folder)
     assert "\n" not in str(error.value)
     assert "; " in str(error.value)
-
-
-# Damaged and hostile folders -------------------------------------------------------------------------------------
 
 
 def change(folder: Path, **arrays: np.ndarray | None) -> None:

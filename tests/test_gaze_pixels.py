@@ -5,7 +5,6 @@ The avatar has green eyeballs with blue irises, and everything else has one colo
 
 import json
 import math
-import subprocess
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from mien.avatar import GaussianAvatars, make_portable
 from mien.camera import Camera
 from mien.cli import main
 from mien.commands.stages.sheets import expression_tiles
-from mien.export import write_glb, write_packed, write_page
+from mien.export import write_glb, write_page
 from mien.face import FaceModel, load_face_model
 from mien.runtime.named import GAZE_NAMES
 from mien.runtime.posing import SH_C0
@@ -29,12 +28,10 @@ from mien.training.run import write_imported_run
 from needs import NO_NODE_PACKAGES
 from plain_settings import plain_gaussian_avatars
 from test_glb import mesh_model
-from test_web import picture
-from test_web_element import LOADED, STILL, script, served
 from toy_scene import toy_camera
-from web_case import WEB, browse, build, chromium, node
+from web_case import WEB, browse, bundle, picture, script, served
 
-SIDE = 256
+SIDE = 192
 DISTANCE, ZOOM = 0.55, 2.0
 """The camera's distance to the middle of the head in metres, and how much nearer than `toy_camera` it sees."""
 COLORS = {"eyes": (0.1, 0.8, 0.1), "irises": (0.1, 0.1, 0.9)}
@@ -182,9 +179,7 @@ def check_shots(told: dict[str, list[list[str]]]) -> None:
     check(before, dict(zip(GAZE_NAMES, after, strict=True)))
 
 
-@pytest.mark.slow
 def test_the_sliders_of_a_page_move_them(portable: runtime.PortableAvatar, tmp_path: Path) -> None:
-    chromium()
     write_page(tmp_path / "me.html", portable)
     setting = """
     for (const each of given) {
@@ -198,30 +193,16 @@ def test_the_sliders_of_a_page_move_them(portable: runtime.PortableAvatar, tmp_p
 
 @pytest.fixture(scope="module")
 def site(portable: runtime.PortableAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the avatar in an element and as a .glb file, and three.js."""
-    chromium()
-    folder = build(tmp_path_factory.mktemp("site"))
+    """A folder with the avatar as a .glb file, and three.js."""
+    folder = tmp_path_factory.mktemp("site")
     if not (WEB / "node_modules" / "three").is_dir():
         pytest.skip(NO_NODE_PACKAGES)
-    write_packed(folder / "me.packed", portable)
-    (folder / "index.html").write_text((WEB / "examples" / "element.html").read_text())
     write_glb(folder / "me.glb", portable, mesh_model(portable), 512)
-    command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(WEB / "tests" / "glb.mjs")]
-    bundle = [*command, "--bundle", "--format=esm", f"--outfile={folder / 'glb.bundle.js'}"]
-    subprocess.run(bundle, check=True, capture_output=True)
+    bundle(WEB / "tests" / "glb.mjs", folder / "glb.bundle.js")
     (folder / "glb.html").write_text('<link rel="icon" href="data:,">')
     return folder
 
 
-@pytest.mark.slow
-def test_an_element_moves_them(site: Path) -> None:
-    setting = "for (const each of given) avatar.setExpression(each, each === name ? 1 : 0);"
-    with served(site) as address:
-        steps = [script(LOADED, STILL, "const { viewer } = avatar;", shots(setting))]
-        check_shots(browse(f"{address}/index.html", steps, (SIDE, SIDE)))
-
-
-@pytest.mark.slow
 def test_morph_targets_of_a_glb_file_move_them(site: Path) -> None:
     """three.js draws the mesh, whose eyes are painted into its texture."""
     degrees = math.degrees(2 * math.atan(0.5 / (1.2 * ZOOM)))

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 
 import train_toy
 from capture_helpers import tree_bytes
+from forked import ForkServer
 from mien import runtime
 from mien.avatar import Avatar, make_portable
 from mien.cli import main
@@ -22,11 +22,10 @@ from mien.commands.stages import live_view, viewing
 from mien.commands.stages.live_view import LiveView
 from mien.training import train
 from mien.viewer import Session
+from shared_things import MadeOnce, toy_workspace
 from test_runtime import new_avatar
 from toy_scene import toy_camera, toy_sequence
-from toy_workspace import write_toy_workspace
-
-PATIENCE_SECONDS = 240
+from web_case import told_by, until
 
 
 @pytest.fixture
@@ -38,7 +37,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         files.append(file)
         return subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
 
-    monkeypatch.setattr(live_view, "_start", start)
+    monkeypatch.setattr(live_view, "start_viewer", start)
     return files
 
 
@@ -76,7 +75,7 @@ def test_what_cannot_be_shown_is_said_once(started: list[Path], capsys: pytest.C
 def test_a_watched_training_has_the_same_bytes(
     started: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_view, "_LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(live_view, "LEAST_SECONDS", 0.0)
     face_model, sequence = toy_sequence(5, 32)
     live = LiveView("toy", toy_camera(32))
     seen = []
@@ -117,66 +116,50 @@ def test_a_viewer_follows_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(viewing.os, "kill", lambda process, number: signals.append((process, number)))
     monkeypatch.setenv(live_view.PARENT_VARIABLE, str(os.getppid()))
     with pytest.raises(StopIteration):
-        viewing._follow(session, file)
+        viewing.follow_file(session, file)
     monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
     monkeypatch.setattr(viewing.time, "sleep", lambda _: None)
-    viewing._follow(session, file)
+    viewing.follow_file(session, file)
     assert signals == [(os.getpid(), signal.SIGTERM)]
     assert session.version > 0
 
 
 def test_options_are_checked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    made_once: MadeOnce, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_toy_workspace(tmp_path / "W")
-    assert main(["view", str(tmp_path / "W"), "--follow"]) == 2
+    workspace = str(toy_workspace(made_once))
+    assert main(["view", workspace, "--follow"]) == 2
     assert "--follow: needs a .mien file" in capsys.readouterr().err
     monkeypatch.setattr(options.importlib.util, "find_spec", lambda name: None)
-    assert main(["train", str(tmp_path / "W"), "--view"]) == 2
+    assert main(["train", workspace, "--view"]) == 2
     assert "pip install 'mien[viewer]'" in capsys.readouterr().err
 
 
-TRAIN = """
-import signal, sys
-from dataclasses import replace
-from pathlib import Path
-import train_toy
-from mien.commands.stages.live_view import LiveView
-from mien.training import train
-from toy_scene import toy_camera, toy_sequence
-signal.signal(signal.SIGINT, signal.default_int_handler)
-face_model, sequence = toy_sequence(5, 32)
-live, settings = LiveView("toy", toy_camera(32)), replace(train_toy.SETTINGS, steps=1_000_000)
-try:
-    train([sequence], face_model, train_toy.CONFIG, settings, Path(sys.argv[1]), watch=live)
-finally:
-    live.close()
-"""
+def watched_training(folder: str) -> None:
+    """Train with a viewer until Ctrl-C."""
+    face_model, sequence = toy_sequence(5, 32)
+    live, settings = LiveView("toy", toy_camera(32)), replace(train_toy.SETTINGS, steps=1_000_000)
+    try:
+        train([sequence], face_model, train_toy.CONFIG, settings, Path(folder), watch=live)
+    finally:
+        live.close()
 
 
-@pytest.mark.slow
-def test_a_browser_can_watch_a_training(tmp_path: Path) -> None:
+def test_a_browser_can_watch_a_training(tmp_path: Path, fork_server: ForkServer) -> None:
     """The address is printed early, and answers; Ctrl-C ends training and viewer, and leaves no file."""
-    paths = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
-    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": paths}
-    command = [sys.executable, "-c", TRAIN, str(tmp_path / "run")]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
-        try:
-            assert process.stderr is not None
-            began = time.monotonic()
-            while not (line := process.stderr.readline()).startswith("Open http"):
-                assert time.monotonic() - began < PATIENCE_SECONDS
-                assert process.poll() is None, line
-            address = line.split()[1]
-            browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-            assert browser.open(address, timeout=30).status == 200
-            assert list(tmp_path.glob("mien-view-*/training.mien"))
-            process.send_signal(signal.SIGINT)
-            _, told = process.communicate(timeout=PATIENCE_SECONDS)
-        finally:
-            process.kill()
-    assert "The viewer is closed; `mien view` shows the finished avatar" in told
-    assert process.returncode != 0
+    environment = {"TMPDIR": str(tmp_path)}
+    process = fork_server.call("test_live_view:watched_training", str(tmp_path / "run"), env=environment)
+    try:
+        until(lambda: "Open http" in told_by(process) or process.poll() is not None)
+        address = next(word for word in process.stderr.split() if word.startswith("http"))
+        browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        assert browser.open(address, timeout=60).status == 200
+        assert list(tmp_path.glob("mien-view-*/training.mien"))
+        process.send_signal(signal.SIGINT)
+        assert process.wait() != 0
+    finally:
+        process.kill()
+    assert "The viewer is closed; `mien view` shows the finished avatar" in process.stderr
     assert not list(tmp_path.glob("mien-view-*"))
     with pytest.raises(OSError):  # noqa: PT011
         urllib.request.urlopen(address, timeout=5)

@@ -1,5 +1,6 @@
 """Sheets show every expression or side once, above its name, and drive and render tell what is beyond the film."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,18 +25,16 @@ from mien.driving import ARKIT_NAMES
 from mien.face import FaceModel, load_face_model
 from mien.render.camera_paths import orbit
 from mien.runtime import Filmed
+from shared_things import MadeOnce, toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera
-from toy_workspace import write_toy_workspace
 
 CAMERA = toy_camera(32)
 
 
-@pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("sheets") / "W"
-    write_toy_workspace(root)
-    return root
+@pytest.fixture
+def workspace(made_once: MadeOnce) -> Path:
+    return toy_workspace(made_once)
 
 
 def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
@@ -134,12 +133,14 @@ def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: lis
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
 
 
-def test_a_sheet_without_a_name_lies_in_the_runs_folder(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sheet_without_a_name_lies_in_the_runs_folder(
+    workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Other pictures need a name, because it says what they are."""
+    workspace = Path(shutil.copytree(workspace, tmp_path / "W"))
     assert main(["render", str(workspace), "--size", "32", "--sheet", "turntable"]) == 0
     (sheet,) = (workspace / "runs").glob("*/sheet_turntable.png")
     assert f"{sheet}: 9 pictures" in capsys.readouterr().err
-    sheet.unlink()
     assert main(["render", str(workspace), "--size", "32"]) == 2
     assert "--out: is missing" in capsys.readouterr().err
 

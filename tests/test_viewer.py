@@ -16,18 +16,11 @@ from mien.export import Motion
 from mien.export.pixels import to_rgb
 from mien.face import load_face_model
 from mien.runtime.posing import rig_points
-from mien.viewer.drawing import Look, Mesh, View, beside, draw, words_about_view
-from mien.viewer.faces import (
-    RANDOM_EXPRESSIONS,
-    group_of,
-    grouped,
-    matches,
-    random_expression,
-    readable,
-)
+from mien.viewer.drawing import Mesh, View, beside, words_about_view
+from mien.viewer.faces import RANDOM_EXPRESSIONS, group_of, grouped, matches, random_expression, readable
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
 from mien.viewer.session import Clip, Session, center_of
-from toy_workspace import write_toy_workspace
+from shared_things import MadeOnce, toy_workspace
 from web_case import drawn_head, faces_of
 
 NAMES = load_face_model("anny").expression_names
@@ -36,7 +29,7 @@ BOUNDS = load_face_model("anny").expression_bounds.numpy()
 
 @pytest.fixture(scope="module")
 def avatar() -> runtime.Avatar:
-    return runtime.Avatar(drawn_head(2000))
+    return runtime.Avatar(drawn_head(1000))
 
 
 @pytest.fixture
@@ -58,9 +51,6 @@ def front_view(avatar: runtime.Avatar, width: int = 96, height: int = 64) -> Vie
     camera = avatar.camera
     field = 2 * np.arctan(0.5 * camera.height / camera.K[1, 1])
     return View(camera.viewmat.astype(float), float(field), width, height)
-
-
-# Faces.
 
 
 def test_expressions_are_in_groups_for_people() -> None:
@@ -96,9 +86,6 @@ def test_random_faces_differ_and_are_alike_on_both_sides() -> None:
             assert min(face[NAMES.index(f"{part}{side}")] for side in ("Left", "Right")) == 0
     aside = [NAMES.index(name) for name in ("jawLeft", "jawRight", "mouthLeft", "mouthRight")]
     assert max(face[aside].max() for face in faces) > 0
-
-
-# The session.
 
 
 def test_sliders_change_the_face_within_bounds(session: Session) -> None:
@@ -240,7 +227,7 @@ def test_mesh_and_wireframe(session: Session) -> None:
     assert (colored[..., 0].astype(int) - colored[..., 2]).max() > 20
     assert (colored[..., 2].astype(int) - colored[..., 0]).max() > 20
     without = Session(session.avatar)
-    without.show(wireframe=True)
+    without.show(wireframe=True, surface="mesh")
     np.testing.assert_array_equal(without.picture(view), plain)
 
 
@@ -293,9 +280,6 @@ def test_words_tell_which_side_was_filmed(session: Session) -> None:
     assert "not known" in words_about_view(None, face, view)
 
 
-# Files.
-
-
 @pytest.mark.parametrize(
     ("window", "picture"),
     [((96, 1200), (96, 1200)), ((96, 540), (192, 1080)), ((540, 96), (2048, 364)), ((0, 0), (16, 16))],
@@ -332,9 +316,6 @@ def test_a_turntable_keeps_its_distance(session: Session) -> None:
     np.testing.assert_allclose(around(half, center, np.pi).viewmat, view.viewmat, atol=1e-6)
 
 
-# The command.
-
-
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     assert main(["view", *arguments]) == 2
     told = capsys.readouterr().err
@@ -343,10 +324,9 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def test_mistakes_are_told_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, made_once: MadeOnce, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_toy_workspace(tmp_path / "W")
-    workspace, file = str(tmp_path / "W"), tmp_path / "a.mien"
+    workspace, file = str(toy_workspace(made_once)), tmp_path / "a.mien"
     runtime.write_portable(file, drawn_head(10))
     capsys.readouterr()
     for words, *arguments in (
@@ -365,10 +345,3 @@ def test_mistakes_are_told_in_one_line(
     assert "a.mien: is damaged" in complaint(capsys, str(file))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "run `pip install 'mien[viewer]'`" in complaint(capsys, workspace)
-
-
-def test_draw_without_a_mesh_draws_the_avatar(avatar: runtime.Avatar) -> None:
-    camera = avatar.camera.resized(32, 32)
-    face = avatar.face()
-    shown = draw(avatar.pose(), face, None, Look(surface="mesh", wireframe=True), camera)
-    np.testing.assert_array_equal(shown, to_rgb(avatar.render(camera=camera)[0]))

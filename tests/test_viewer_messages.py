@@ -2,14 +2,9 @@
 
 import asyncio
 import contextlib
-import json
 import math
-import os
-import subprocess
-import sys
 import threading
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import AsyncIterator, Iterator
 from typing import Any
 
 import numpy as np
@@ -22,17 +17,17 @@ import websockets
 import zstandard
 from viser import _messages
 
+from fuzzing.viewer_messages import campaign
 from mien import runtime
 from mien.viewer import panel
 from mien.viewer.access import Door
 from mien.viewer.messages import MOST_TEXT, Gate
-from mien.viewer.server import _MOST_BROWSERS, Serving
+from mien.viewer.server import MOST_BROWSERS, Serving
 from mien.viewer.session import Session
 from test_viewer import clip_of
-from test_viewer_page import Client, connect, until
-from web_case import drawn_head
+from test_viewer_page import Client, connect
+from web_case import drawn_head, until
 
-SECONDS = 400
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 0.5], "fov": 0.4, "near": 0.01, "far": 100,
     "image_height": 64, "image_width": 96, "look_at": [0, 0, 1], "up_direction": [0, -1, 0],
@@ -41,7 +36,7 @@ CAMERA = {
 
 @pytest.fixture(scope="module")
 def avatar() -> runtime.Avatar:
-    return runtime.Avatar(drawn_head(2000))
+    return runtime.Avatar(drawn_head(500))
 
 
 @pytest.fixture
@@ -54,7 +49,7 @@ def serving(avatar: runtime.Avatar) -> Iterator[Serving]:
 
 def control(serving: Serving, label: str) -> Any:
     """The handle of a control, by its label."""
-    handles = serving._server.gui._gui_input_handle_from_uuid.values()
+    handles = serving.server.gui._gui_input_handle_from_uuid.values()
     return next(handle for handle in handles if handle.label == label)  # type: ignore[attr-defined]
 
 
@@ -66,7 +61,7 @@ def update(serving: Serving, label: str, value: object, name: str = "value") -> 
 def passed(serving: Serving, label: str, value: object, name: str = "value") -> object:
     """The value of a control that the gate lets through, or None."""
     gate = Gate()
-    gate.open(serving._server.gui)
+    gate.open(serving.server.gui)
     message = gate.checked(update(serving, label, value, name))
     return None if message is None else msgspec.msgpack.decode(message)["updates"]["value"]
 
@@ -83,7 +78,6 @@ def passed(serving: Serving, label: str, value: object, name: str = "value") -> 
         ("jaw open", "0.5", None),
         ("jaw open", True, None),
         ("jaw open", [0.5], None),
-        ("jaw open", {"a": 1}, None),
         ("Frame", 1e300, 1),
         ("Frame", 0.7, 0),
         ("Height in pixels", 1e300, 1080),
@@ -91,7 +85,6 @@ def passed(serving: Serving, label: str, value: object, name: str = "value") -> 
         ("Height in pixels", 2**64 - 1, 1080),
         ("Background", "grey", "grey"),
         ("Background", "purple", None),
-        ("Background", 1, None),
         ("Motion", "clip", "clip"),
         ("Motion", "../clip", None),
         ("Filmed frame beside it", True, True),
@@ -114,7 +107,7 @@ def test_only_values_of_controls_pass(serving: Serving) -> None:
     gate = Gate()
     good = update(serving, "jaw open", 0.5)
     assert gate.checked(good) is None, "it is not open yet"
-    gate.open(serving._server.gui)
+    gate.open(serving.server.gui)
     assert gate.checked(good) is not None
     strange = {"type": "GuiUpdateMessage", "uuid": "none", "updates": {"value": 0.5}}
     for message in (
@@ -151,8 +144,8 @@ def test_cameras_are_checked_and_clamped() -> None:
 
 
 def test_one_browser_cannot_end_the_viewer_for_others(serving: Serving) -> None:
-    session, gui = serving._session, serving._server.gui
-    joint = serving._panel._sliders[f"{session.avatar.joint_names[0]}_x"].label
+    session, gui = serving.session, serving.server.gui
+    joint = serving.panel.sliders[f"{session.avatar.joint_names[0]}_x"].label
     messages = [update(serving, joint, value) for value in (math.nan, math.inf, -math.inf)]
     messages += [update(serving, "Background", "purple"), update(serving, "Search", "x" * 60_000)]
     messages += [update(serving, label, 1e300) for label in ("Height in pixels", "Frame", "jaw open")]
@@ -187,6 +180,16 @@ def test_one_browser_cannot_end_the_viewer_for_others(serving: Serving) -> None:
     assert (serving.loop.error, serving.failures) == (None, [])
 
 
+@contextlib.asynccontextmanager
+async def watching(serving: Serving) -> AsyncIterator[Client]:
+    """Connect a browser that has seen a picture."""
+    async with connect(serving) as connection:
+        client = Client(connection)
+        await client.look(serving.session, 96, 64)
+        await client.picture(64)
+        yield client
+
+
 def test_queued_screenshots_are_dropped(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
     taken, go_on = [], threading.Event()
 
@@ -198,13 +201,11 @@ def test_queued_screenshots_are_dropped(serving: Serving, monkeypatch: pytest.Mo
     monkeypatch.setattr(panel, "screenshot", slow)
 
     async def talk() -> None:
-        async with connect(serving) as connection:
-            await Client(connection).look(serving._session, 96, 64)
-            await Client(connection).picture(64)
+        async with watching(serving) as client:
             for _ in range(300):
-                await connection.send(update(serving, "Screenshot", True))
-            await Client(connection).look(serving._session, 48, 32)
-            await Client(connection).picture(32)
+                await client.connection.send(update(serving, "Screenshot", True))
+            await client.look(serving.session, 48, 32)
+            await client.picture(32)
 
     asyncio.run(talk())
     until(lambda: len(taken) == 1)
@@ -215,16 +216,13 @@ def test_queued_screenshots_are_dropped(serving: Serving, monkeypatch: pytest.Mo
 
 def test_files_wait_until_a_browser_takes_them(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a browser does not take stays in memory, so no more is made for it."""
-    monkeypatch.setattr(panel, "_MOST_PARTS", -1)
+    monkeypatch.setattr(panel, "MOST_PARTS", -1)
     monkeypatch.setattr(panel, "screenshot", lambda *_: pytest.fail("a picture was drawn"))
 
     async def talk() -> None:
-        async with connect(serving) as connection:
-            client = Client(connection)
-            await client.look(serving._session, 96, 64)
-            await client.picture(64)
-            await connection.send(update(serving, "Screenshot", True))
-            while b"still on its way" not in await told(connection):
+        async with watching(serving) as client:
+            await client.connection.send(update(serving, "Screenshot", True))
+            while b"still on its way" not in await told(client.connection):
                 pass
 
     asyncio.run(talk())
@@ -243,17 +241,14 @@ def test_a_failure_is_told_and_the_viewer_goes_on(
     def fail(*arguments: object) -> None:
         raise ArithmeticError("a bug")
 
-    monkeypatch.setattr(serving._session, "set_expression", fail)
+    monkeypatch.setattr(serving.session, "set_expression", fail)
     monkeypatch.setattr(panel, "screenshot", fail)
 
     async def talk() -> None:
-        async with connect(serving) as connection:
-            client = Client(connection)
-            await client.look(serving._session, 96, 64)
-            await client.picture(64)
-            await connection.send(update(serving, "jaw open", 0.5))
-            await connection.send(update(serving, "Screenshot", True))
-            await client.look(serving._session, 48, 32)
+        async with watching(serving) as client:
+            await client.connection.send(update(serving, "jaw open", 0.5))
+            await client.connection.send(update(serving, "Screenshot", True))
+            await client.look(serving.session, 48, 32)
             await client.picture(32)
 
     asyncio.run(talk())
@@ -264,7 +259,7 @@ def test_a_failure_is_told_and_the_viewer_goes_on(
 def test_there_are_only_so_many_browsers(serving: Serving) -> None:
     async def talk() -> None:
         async with contextlib.AsyncExitStack() as stack:
-            there = [await stack.enter_async_context(connect(serving)) for _ in range(_MOST_BROWSERS)]
+            there = [await stack.enter_async_context(connect(serving)) for _ in range(MOST_BROWSERS)]
             async with connect(serving) as one_more:
                 with pytest.raises(websockets.ConnectionClosed, match="too many browsers"):
                     await one_more.recv()
@@ -277,23 +272,13 @@ def test_there_are_only_so_many_browsers(serving: Serving) -> None:
 
 async def gets_a_picture(serving: Serving) -> bool:
     with contextlib.suppress(websockets.ConnectionClosed):
-        async with connect(serving) as connection:
-            await Client(connection).look(serving._session, 96, 64)
-            await Client(connection).picture(64)
+        async with watching(serving):
             return True
     return False
 
 
-@pytest.mark.slow
 def test_hostile_messages_do_no_harm() -> None:
-    """A real viewer and a real WebSocket client; tests/fuzzing/viewer_messages.py does the same at length."""
-    result = subprocess.run(
-        [sys.executable, "-m", "fuzzing.viewer_messages", "--count", "30", "--seed", "1"],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-        capture_output=True,
-        text=True,
-        timeout=SECONDS,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert json.loads(result.stdout)["messages"] == 30
+    """A real viewer and a real WebSocket client; `make fuzz` does the same at length."""
+    figures = campaign(30, 1)
+    assert figures.findings == []
+    assert figures.messages == 30

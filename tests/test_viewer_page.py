@@ -4,15 +4,11 @@ import asyncio
 import contextlib
 import gzip
 import http.client
-import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +25,7 @@ import zstandard
 from viser._messages import ViewerCameraMessage
 from viser.transforms import SO3
 
+from forked import ForkServer
 from mien import runtime
 from mien.errors import UserError
 from mien.viewer.access import Door
@@ -37,7 +34,7 @@ from mien.viewer.panel import filmed_from
 from mien.viewer.server import Serving
 from mien.viewer.session import Session
 from test_viewer import clip_of
-from web_case import WEB, chromium, drawn_head, node
+from web_case import browse, drawn_head, told_by, until
 
 PROTOCOL = f"viser-v{viser.__version__}"
 PATIENCE_SECONDS = 60.0
@@ -45,7 +42,7 @@ PATIENCE_SECONDS = 60.0
 
 @pytest.fixture(scope="module")
 def avatar() -> runtime.Avatar:
-    return runtime.Avatar(drawn_head(3000))
+    return runtime.Avatar(drawn_head(1000))
 
 
 @pytest.fixture
@@ -105,14 +102,6 @@ def request(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, 
     return answer.status, dict(answer.getheaders()), content
 
 
-def until(done: Callable[[], bool]) -> None:
-    """Wait until something is so."""
-    ends = time.monotonic() + PATIENCE_SECONDS
-    while not done():
-        assert time.monotonic() < ends, "it never came"
-        time.sleep(0.01)
-
-
 def test_the_page_does_not_look_for_a_gpu_and_folds_its_panel_on_phones(serving: Serving) -> None:
     for encoding in ("identity", "gzip"):
         status, headers, body = request(
@@ -155,7 +144,7 @@ def test_two_clients_see_their_own_views_and_one_may_vanish(serving: Serving, se
 
     asyncio.run(talk())
     assert (serving.loop.error, serving.failures) == (None, [])
-    until(lambda: not serving._server.get_clients())
+    until(lambda: not serving.server.get_clients())
 
 
 def test_moving_pictures_are_smaller_and_still_ones_full(session: Session) -> None:
@@ -240,8 +229,8 @@ def test_without_a_token_only_loopback_is_answered(session: Session) -> None:
 
 def test_the_viewer_is_never_passed_on(serving: Serving) -> None:
     """viser has a button and a message that make a server public through a machine of its makers."""
-    assert serving._server.request_share_url() is None
-    assert serving._server._share_tunnel is None
+    assert serving.server.request_share_url() is None
+    assert serving.server._share_tunnel is None
 
 
 def test_a_port_that_is_taken_is_told(session: Session) -> None:
@@ -269,70 +258,44 @@ def test_nothing_is_left_after_the_end(session: Session, capfd: pytest.CaptureFi
     assert capfd.readouterr().out == ""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_signals_end_the_command(number: signal.Signals, code: int, tmp_path: Path) -> None:
+def test_signals_end_the_command(number: signal.Signals, code: int, tmp_path: Path, fork_server: ForkServer) -> None:
+    """Also while a browser has sent half of a request."""
     runtime.write_portable(tmp_path / "a.mien", drawn_head(100))
-    # A shell lets its background jobs, such as these tests, ignore Ctrl-C.
-    heard = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from mien.cli import main"
-    command = [sys.executable, "-c", f"{heard}; sys.exit(main())", "view", str(tmp_path / "a.mien")]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stderr is not None
-            line = process.stderr.readline()
-            assert line.startswith("Open http://127.0.0.1:")
-            port = int(line.split(":")[2].partition("/")[0])
-            assert request(port, line.split()[1].partition(str(port))[2])[0] == 303
-            with socket.create_connection(("127.0.0.1", port)) as vanished:
-                vanished.sendall(b"GET / HT")
-            time.sleep(0.5)
-            os.kill(process.pid, number)
-            out, told = process.communicate(timeout=PATIENCE_SECONDS)
-        finally:
-            process.kill()
-    assert process.returncode == code
-    assert told == ("The viewer is closed\n" if code == 0 else "")
-    assert out == ""
+    process = fork_server.mien("view", tmp_path / "a.mien")
+    try:
+        until(lambda: "\n" in told_by(process))
+        assert process.stderr.startswith("Open http://127.0.0.1:")
+        address = process.stderr.split()[1]
+        port = int(address.split(":")[2].partition("/")[0])
+        with socket.create_connection(("127.0.0.1", port)) as vanished:
+            vanished.sendall(b"GET / HT")
+            assert request(port, address.partition(str(port))[2])[0] == 303
+        process.send_signal(number)
+        assert process.wait() == code
+    finally:
+        process.kill()
+    assert process.stderr.partition("\n")[2] == ("The viewer is closed\n" if code == 0 else "")
+    assert process.stdout == ""
 
 
-def browse(address: str, steps: list[dict[str, Any]], size: tuple[int, int] = (1100, 700)) -> dict[str, Any]:
-    """Open an address in Chromium and do the steps of web/tests/view.mjs."""
-    told = json.dumps({"width": size[0], "height": size[1], "steps": steps})
-    command = [node(), str(WEB / "tests" / "view.mjs"), chromium(), address]
-    done = subprocess.run(command, input=told, capture_output=True, text=True, timeout=400)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+def seen_by_browser(address: str, steps: list[dict[str, Any]], size: tuple[int, int] = (1100, 700)) -> dict[str, Any]:
+    """Do steps of web/tests/browser.mjs at an address. Nothing may fail, or be asked for from elsewhere."""
+    told = browse(address, size=size, device=["mobile"] if size[0] < 600 else [], steps=steps)
+    here = "/".join(address.split("/")[:3])
+    assert told["messages"] == []
+    assert [one for one in told["requests"] if not one.startswith((here, f"blob:{here}", "data:"))] == []
+    return told
 
 
-@pytest.mark.slow
 def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path: Path) -> None:
-    chromium()
-    node()
     shots = [tmp_path / f"{index}.png" for index in range(4)]
     steps: list[dict[str, Any]] = [
-        {"see": "Expressions"},
-        {"wait": 3000},
-        {"screenshot": str(shots[0])},
-        {"click": "Random face"},
-        {"wait": 3000},
-        {"screenshot": str(shots[1])},
-        {"drag": [120, 0]},
-        {"wait": 3000},
-        {"screenshot": str(shots[2])},
-        {"click": "Save"},
-        {"wait": 1000},
-        {"save": ["Screenshot", str(tmp_path / "saved.png")]},
-        {"fill": ["Search", "smile left"]},
-        {"wait": 3000},
-        {"reload": True},
-        {"see": "Expressions"},
-        {"wait": 3000},
-        {"screenshot": str(shots[3])},
-    ]
-    told = browse(serving.address, steps)
-    here = (f"http://127.0.0.1:{serving.port}/", f"blob:http://127.0.0.1:{serving.port}/", "data:")
-    assert told["errors"] == []
-    assert [address for address in told["requests"] if not address.startswith(here)] == []
+        {"see": "Expressions"}, {"settled": shots[0]}, {"click": "Random face"}, {"settled": shots[1]},
+        {"drag": [120, 0]}, {"settled": shots[2]}, {"click": "Save"}, {"save": ["Screenshot", tmp_path / "saved.png"]},
+        {"fill": ["Search", "smile left"]}, {"reload": True}, {"see": "Expressions"}, {"settled": shots[3]},
+    ]  # fmt: skip
+    told = seen_by_browser(serving.address, steps)
     rest, random, turned, again = (read(path)[:, :700] for path in shots)
     view = (rest[350:] < 250).any(-1)
     assert 0.1 < view.mean() < 0.9, "a head over white"
@@ -343,20 +306,15 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
     saved = read(tmp_path / "saved.png")
     assert len(saved) == SCREENSHOT_HEIGHT
     assert [saved.shape[1] / len(saved)] == pytest.approx(told["shapes"], rel=0.01)
-    visible = {
-        name for name, slider in serving._panel._sliders.items() if slider.visible and name[0] != name[0].upper()
-    }
-    assert {name for name in visible if name in session.avatar.expression_names} == {"mouthSmileLeft"}
+    visible = {name for name, slider in serving.panel.sliders.items() if slider.visible}
+    assert visible & set(session.avatar.expression_names) == {"mouthSmileLeft"}
     assert (serving.loop.error, serving.failures) == (None, [])
 
 
-@pytest.mark.slow
 def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
     """The head fits the narrow window, and the panel, which would cover half of it, is folded."""
     shot = tmp_path / "phone.png"
-    steps: list[dict[str, Any]] = [{"see": "mien"}, {"wait": 6000}, {"screenshot": str(shot)}]
-    told = browse(serving.address, steps, (390, 844))
-    assert told["errors"] == []
+    seen_by_browser(serving.address, [{"see": "mien"}, {"settled": shot}], (390, 844))
     drawn = np.any(read(shot)[:700] < 250, axis=-1)
     columns = np.nonzero(drawn.any(0))[0]
     assert 10 < columns[0] < columns[-1] < 380
@@ -375,7 +333,10 @@ def proxied(port: int, folder: str) -> Iterator[int]:
                 await writer.drain()
         writer.close()
 
+    writers: list[asyncio.StreamWriter] = []
+
     async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writers.append(writer)
         with contextlib.suppress(asyncio.IncompleteReadError):
             head = await reader.readuntil(b"\r\n\r\n")
             if not head.startswith(b"GET /%s/" % folder.encode()):
@@ -383,8 +344,17 @@ def proxied(port: int, folder: str) -> Iterator[int]:
                 writer.close()
                 return
             inner, onward = await asyncio.open_connection("127.0.0.1", port)
+            writers.append(onward)
             onward.write(head.replace(b"/%s/" % folder.encode(), b"/", 1))
             await asyncio.gather(pipe(inner, writer), pipe(reader, onward))
+
+    async def end() -> None:
+        server.close()
+        for task in asyncio.all_tasks() - {asyncio.current_task()}:
+            task.cancel()
+        for writer in writers:
+            writer.close()
+        await asyncio.gather(*(writer.wait_closed() for writer in writers), return_exceptions=True)
 
     loop = asyncio.new_event_loop()
     server = loop.run_until_complete(asyncio.start_server(answer, "127.0.0.1", 0))
@@ -393,21 +363,17 @@ def proxied(port: int, folder: str) -> Iterator[int]:
     try:
         yield server.sockets[0].getsockname()[1]
     finally:
+        asyncio.run_coroutine_threadsafe(end(), loop).result(60)
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
-        server.close()
         loop.close()
 
 
-@pytest.mark.slow
 def test_a_browser_behind_a_proxy_with_a_path_of_its_own(serving: Serving, tmp_path: Path) -> None:
-    chromium()
-    node()
     shot = tmp_path / "shot.png"
     with proxied(serving.port, "deep/mien") as port:
         address = f"http://127.0.0.1:{port}/deep/mien/?token={serving.door.token}"
-        told = browse(address, [{"see": "Expressions"}, {"wait": 3000}, {"screenshot": str(shot)}])
-    assert told["errors"] == []
+        seen_by_browser(address, [{"see": "Expressions"}, {"settled": shot}])
     assert 0.1 < (read(shot)[350:, :700] < 250).any(-1).mean() < 0.9, "a head over white"
 
 

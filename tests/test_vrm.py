@@ -1,12 +1,9 @@
 """A .vrm file: what @pixiv/three-vrm makes of it in a real browser, and the validator."""
 
-import base64
 import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -15,10 +12,9 @@ from mien.export import read_glb, write_vrm
 from mien.export.vrm import BODY, LICENCE
 from mien.runtime.named import visemes
 from needs import NO_THREE_VRM, NO_VALIDATOR
+from shared_things import MadeOnce, toy_workspace
 from test_glb import mesh_model
-from test_web_element import served
-from toy_workspace import write_toy_workspace
-from web_case import WEB, browse, chromium, drawn_head, node
+from web_case import WEB, browse, bundle, drawn_head, picture, run_node, served
 
 SIDE = 256
 PAGE = '<link rel="icon" href="data:,"><body></body>'
@@ -38,25 +34,14 @@ OPEN = f"""(async () => {{
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a .vrm file, and a page that opens it."""
-    chromium()
-    node()
     if not (WEB / "node_modules" / "@pixiv" / "three-vrm").is_dir():
         pytest.skip(NO_THREE_VRM)
     path = tmp_path_factory.mktemp("vrm")
     portable = drawn_head(3000)
     write_vrm(path / "drawn.vrm", portable, mesh_model(portable), 128)
-    bundle = ["--bundle", "--format=esm", f"--outfile={path / 'vrm.bundle.js'}"]
-    esbuild = WEB / "node_modules" / ".bin" / "esbuild"
-    subprocess.run([str(esbuild), str(WEB / "tests" / "vrm.mjs"), *bundle], check=True, capture_output=True)
+    bundle(WEB / "tests" / "vrm.mjs", path / "vrm.bundle.js")
     (path / "index.html").write_text(PAGE)
     return path
-
-
-def picture(address: str) -> np.ndarray:
-    data = base64.b64decode(address.partition(",")[2])
-    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return decoded.astype(float)
 
 
 def shown(*given: Any) -> str:
@@ -70,7 +55,6 @@ def middle(moved: np.ndarray) -> tuple[float, float]:
     return float(rows.mean() / len(moved)), float(columns.mean() / moved.shape[1])
 
 
-@pytest.mark.slow
 def test_three_vrm_opens_the_file_and_moves_the_face(folder: Path) -> None:
     steps = [OPEN, shown(), shown({"aa": 1}), shown({"blinkLeft": 1}), shown({"browInnerUp": 1}), shown({"happy": 1}),
              shown({}, [3, 0, 0]), shown({}, [-3, 0, 0]), shown({}, None, 0.5)]  # fmt: skip
@@ -94,7 +78,7 @@ def test_three_vrm_opens_the_file_and_moves_the_face(folder: Path) -> None:
     assert 0 < bones["rightFoot"][1] < 0.15
     np.testing.assert_allclose(bones["leftHand"] * [-1, 1, 1], bones["rightHand"], atol=1e-6)
 
-    rest, aa, wink, brows, happy, left, right, turned = map(picture, addresses)
+    rest, aa, wink, brows, happy, left, right, turned = (255 * picture(address)[..., :3] for address in addresses)
     row, column = middle(np.abs(aa - rest))
     assert row > 0.55, "the mouth is below the middle"
     row, column = middle(np.abs(wink - rest))
@@ -121,11 +105,9 @@ def test_looks_to_a_side_turn_the_eyes_there(folder: Path) -> None:
     assert 13 < looks["rangeMapVerticalUp"]["inputMaxValue"] < 14.1
 
 
-def test_export_writes_a_vrm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_writes_a_vrm(tmp_path: Path, made_once: MadeOnce, capsys: pytest.CaptureFixture[str]) -> None:
     """A face model without ARKit's names has its own expressions, and no presets but neutral."""
-    write_toy_workspace(tmp_path / "W")
-    capsys.readouterr()
-    workspace, out = str(tmp_path / "W"), str(tmp_path / "a.vrm")
+    workspace, out = str(toy_workspace(made_once)), str(tmp_path / "a.vrm")
     assert main(["export", workspace, "--out", out]) == 0
     assert "2 expressions in VRM 1.0" in capsys.readouterr().err
     vrm = read_glb(tmp_path / "a.vrm").content["extensions"]["VRMC_vrm"]
@@ -139,9 +121,7 @@ def test_export_writes_a_vrm(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_the_validator_finds_no_error_in_a_vrm(folder: Path) -> None:
     if not (WEB / "node_modules" / "gltf-validator").is_dir():
         pytest.skip(NO_VALIDATOR)
-    command = [node(), str(WEB / "tests" / "validate.mjs"), str(folder / "drawn.vrm")]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    issues = json.loads(done.stdout)["issues"]["messages"]
+    issues = run_node("validate.mjs", folder / "drawn.vrm")["issues"]["messages"]
     told = {
         "UNSUPPORTED_EXTENSION": "it does not know VRM",
         "UNUSED_OBJECT": "the thumbnail",

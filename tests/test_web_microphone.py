@@ -1,7 +1,5 @@
 """A microphone in the exported page: the lips follow a voice in front of Chromium's fake device, and nothing leaves."""
 
-import json
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +9,10 @@ from mien.capture.sound import RATE
 from mien.cli import main
 from mien.driving.constants import DRIVING
 from mien.export import write_page
-from mien.export.web_page import MICROPHONE
 from mien.runtime import write_portable
 from test_driving_by_speech import synthesised, tone, write_wav
-from test_web_webcam import ALLOWED, DENIED, FAKE, TRY_TO_SEND
-from web_case import WEB, browse, chromium, drawn_head, node
+from test_web_webcam import ALLOWED, FAKE, TRY_TO_SEND
+from web_case import WEB, browse, bundle, drawn_head, run_node
 
 WINDOW = (320, 240)
 FPS = 60
@@ -52,7 +49,6 @@ PRESS = """(async () => {
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    chromium()
     path = tmp_path_factory.mktemp("page") / "me.html"
     write_page(path, drawn_head(150), microphone=True)
     return path
@@ -76,26 +72,18 @@ def mouths(voice: Path, sound: np.ndarray) -> list[dict[str, float]]:
         vowel = 10 * np.dot(np.log10(np.maximum(vowel, DRIVING.speech_least_share)), DRIVING.speech_band_weights)
         loudness = 10 * np.log10(max(float((piece**2).mean()), 1e-12))
         heard.append([loudness, float(vowel), float(low), float(high), index / FPS])
-    command = [node(), str(WEB / "tests" / "voice.mjs"), str(voice)]
-    done = subprocess.run(command, input=json.dumps(heard), capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    return run_node("voice.mjs", voice, heard)
 
 
 @pytest.fixture(scope="module")
 def voice(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The part that hears, as a module."""
     path = tmp_path_factory.mktemp("voice") / "voice.js"
-    command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(WEB / "src" / "voice.ts")]
-    subprocess.run([*command, "--format=esm", f"--outfile={path}"], check=True, capture_output=True)
+    bundle(WEB / "src" / "voice.ts", path)
     return path
 
 
-def test_the_committed_part_of_the_page_is_that_of_a_fresh_build(built: Path) -> None:
-    fresh = (built / "microphone.html").read_text()
-    assert fresh == MICROPHONE.read_text(), "microphone.html is older than web/: run `make web`, and commit it"
-
-
-@pytest.mark.parametrize(("seed", "even"), [(0, False), (1, False), (2, True), (3, True)])
+@pytest.mark.parametrize(("seed", "even"), [(0, False), (2, True)])
 def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(voice: Path, seed: int, even: bool) -> None:
     """As those of `mien drive --by voice.wav`, without knowing what comes next. A second of noise comes before."""
     sound, jaw, shut = synthesised(seed, 24, even)
@@ -122,7 +110,6 @@ def test_low_sounds_round_the_lips_and_high_ones_stretch_them(voice: Path) -> No
     assert most[1]["jawOpen"] < 0.6 * most[0]["jawOpen"]
 
 
-@pytest.mark.slow
 def test_a_voice_drives_the_page(page: Path, tmp_path: Path) -> None:
     """The fake device plays a voice of six seconds, a second of silence first, again and again."""
     sound = write_wav(tmp_path / "voice.wav", tone(300.0)[0])
@@ -141,11 +128,11 @@ def test_a_voice_drives_the_page(page: Path, tmp_path: Path) -> None:
     assert np.corrcoef(heard[:-1], shown[1:])[0, 1] > 0.95, "the avatar's jaw is that of the voice"
 
 
-@pytest.mark.slow
 def test_what_is_wrong_is_said_and_nothing_could_be_sent(page: Path) -> None:
     """The page's own policy forbids every way out."""
     gone = "Object.defineProperty(navigator, 'mediaDevices', { value: undefined });"
-    told = browse(page, [PRESS % "", PRESS % gone, TRY_TO_SEND], WINDOW, flags=[FAKE, DENIED])
+    denied = "navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('', 'NotAllowedError'); };"
+    told = browse(page, [PRESS % denied, PRESS % gone, TRY_TO_SEND], WINDOW)
     assert set(told["requests"]) <= {"https://example.com/"}, "those that the last script tries, and the page refuses"
     *pressed, refused = told["results"]
     messages = ("The microphone is not allowed. Allow it for this page", "This browser gives no microphone")

@@ -1,7 +1,5 @@
 """How a page follows a face that its camera sees: relative to the neutral face, within limits, and calmly."""
 
-import json
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mien.driving.live import OneEuro
-from web_case import WEB, node
+from web_case import run_node
 
 
 def found(
@@ -28,10 +26,7 @@ def found(
 
 
 def followed(built: Path, mirrored: bool, pictures: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
-    given = json.dumps({"mirrored": mirrored, "found": pictures, **more})
-    command = [node(), str(WEB / "tests" / "webcam.mjs"), str(built / "webcam.js")]
-    done = subprocess.run(command, input=given, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    return run_node("webcam.mjs", built / "webcam.js", {"mirrored": mirrored, "found": pictures, **more})
 
 
 AT_REST = {"jawOpen": 0.1, "eyeBlinkLeft": 0.2, "eyeBlinkRight": 0.15, "mouthSmileLeft": 0.3, "mouthSmileRight": 0.3}

@@ -1,27 +1,41 @@
 """Avatars without a person for the tests of web pages, and programs that these tests need."""
 
+import atexit
+import base64
 import json
+import math
 import os
 import shutil
 import subprocess
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from forked import Forked
 from mien import runtime
 from mien.avatar import GaussianAvatars, HeadGas, HeadGasConfig, make_portable
 from mien.face import load_face_model
 from mien.runtime.baked import FeatureChanges
+from mien.runtime.posing import expression_changes, rig_points
 from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES, NO_TASKS_VISION
 from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera
 
 WEB = Path(__file__).parent.parent / "web"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+PATIENCE_SECONDS = 300.0
+"""Time after which a page or a script of node counts as hung."""
 
 
 def node() -> str:
@@ -37,7 +51,7 @@ def node() -> str:
 def chromium() -> str:
     """Return the path of Chromium, or skip the test."""
     given = os.environ.get("MIEN_CHROMIUM")
-    found = given or next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    found = given or next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         pytest.skip(NO_CHROMIUM)
     return found
@@ -58,17 +72,86 @@ def build(folder: Path) -> Path:
     return folder
 
 
+def bundle(source: Path, out: Path, *options: str) -> None:
+    """Bundle a script and the packages that it imports into one file, as a module."""
+    command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(source), "--bundle"]
+    subprocess.run([*command, "--format=esm", f"--outfile={out}", *options], check=True, capture_output=True)
+
+
+class _Server:
+    """A process of node that serves all tests of a worker, with one browser (web/tests/server.mjs)."""
+
+    def __init__(self) -> None:
+        browser = os.environ.get("MIEN_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), "")
+        command = [node(), str(WEB / "tests" / "server.mjs"), browser]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        atexit.register(self.end)
+
+    def end(self) -> None:
+        """Let it close its browser, and end."""
+        try:
+            self.process.communicate(timeout=PATIENCE_SECONDS)
+        except (subprocess.TimeoutExpired, ValueError, OSError):
+            self.process.kill()
+
+    def ask(self, question: dict[str, Any]) -> Any:
+        """Return the answer to one question. A process that hangs is killed."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        hangs = threading.Timer(PATIENCE_SECONDS, self.process.kill)
+        hangs.start()
+        self.process.stdin.write(json.dumps(question, default=str) + "\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        hangs.cancel()
+        assert answer, "web/tests/server.mjs has ended, or was killed because it did not answer"
+        told = json.loads(answer)
+        assert "error" not in told, told["error"]
+        return told.get("told")
+
+
+_servers: list[_Server] = []
+
+
+def ask_node(**question: Any) -> Any:
+    """Ask the worker's process of node, which is started if there is none."""
+    if not _servers or _servers[-1].process.poll() is not None:
+        _servers.append(_Server())
+    return _servers[-1].ask(question)
+
+
+def run_node(script: str, *given: Any) -> Any:
+    """Return what the function of a script in web/tests returns."""
+    return ask_node(run=script, given=given)
+
+
+def pose_by_node(built: Path, path: Path, faces: list[runtime.Face], sizes: Sequence[int] = ()) -> list[Any]:
+    """Return what the web runtime computes for each face of a file, in parts of these sizes, if they are given."""
+    out = path.with_suffix(".out")
+    run_node("pose.mjs", built / "mien.js", path, as_json(faces), out)
+    rows = np.fromfile(out, np.float32).reshape(len(faces), -1)
+    return [np.split(row, np.cumsum(sizes)[:-1]) for row in rows] if sizes else list(rows)
+
+
+def posed_by_python(baked: runtime.MeshBound, face: runtime.Face) -> tuple[np.ndarray, ...]:
+    """Return points, centres in the head frame, raw opacities and first colours, as `pose_by_node` does."""
+    in_head = replace(face, head_rotation=np.zeros(3, np.float32), head_translation=np.zeros(3, np.float32))
+    changes = expression_changes(baked.changes, face) if baked.changes else {}
+    return (
+        rig_points(baked.rig, face),
+        runtime.pose(baked, in_head).means,
+        baked.attributes.opacity_logits + changes.get("opacity_logits", 0),
+        baked.attributes.sh[:, 0] + changes.get("color", 0),
+    )
+
+
 def browse(
     page: Path | str,
-    scripts: list[str],
+    scripts: Sequence[str] = (),
     size: tuple[int, int] = (900, 600),
-    screenshots: list[str | None] | None = None,
-    downloads: Path | None = None,
     fragment: str = "",
-    webgpu: bool = False,
-    flags: Sequence[str] = (),
     device: Sequence[str] = (),
-    opening: str = "",
+    **more: Any,
 ) -> dict[str, Any]:
     """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
 
@@ -76,39 +159,80 @@ def browse(
         page: The page's file, or its address on this machine.
         scripts: JavaScript.
         size: Width and height of the window.
-        screenshots: A file for the window after each script, or None.
-        downloads: Folder for the files that the page saves.
         fragment: What follows the address after a #.
-        webgpu: Whether the browser has WebGPU, in software.
-        flags: Further options of Chromium.
         device: What the browser is: `lively` (it does not ask for reduced motion), `dark` (it asks for dark colours),
-            `touch` (it has a touch screen).
-        opening: JavaScript that runs before the page's own.
+            `touch` (it has a touch screen), `mobile`.
+        more: What else can be asked for, such as screenshots and flags (web/tests/browser.mjs).
     """
-    given = {"width": size[0], "height": size[1], "scripts": scripts, "screenshots": screenshots or []}
-    given |= {"webgpu": webgpu, "flags": list(flags), "opening": opening, **dict.fromkeys(device, True)}
-    told = json.dumps(given | ({"downloads": str(downloads)} if downloads else {}))
+    chromium()
     address = f"{page}#{fragment}" if fragment else str(page)
-    command = [node(), str(WEB / "tests" / "browser.mjs"), chromium(), address]
-    done = subprocess.run(command, input=told, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    told = {"width": size[0], "height": size[1], "scripts": list(scripts), **dict.fromkeys(device, True), **more}
+    return ask_node(page=address, **told)
 
 
-def violations(page: Path | str, size: tuple[int, int], device: Sequence[str] = (), first: str = "") -> list[list[str]]:
+def until(done: Callable[[], bool]) -> None:
+    """Wait until something is so."""
+    ends = time.monotonic() + PATIENCE_SECONDS
+    while not done():
+        assert time.monotonic() < ends, "it never came"
+        time.sleep(0.01)
+
+
+def told_by(process: Forked) -> str:
+    """Return what a forked process has complained until now, which is nothing before it has begun."""
+    try:
+        return process.stderr
+    except FileNotFoundError:
+        return ""
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        """Say nothing."""
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder from loopback, as a web server of one's own does."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+
+
+def script(*parts: str) -> str:
+    """Return parts of JavaScript, which may wait, as one script."""
+    return "(async () => {" + "".join(parts) + "})()"
+
+
+def picture(address: str) -> np.ndarray:
+    """Decode the picture that a page returned, as RGB or RGBA, 0 to 1."""
+    data = np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    return pixels[..., [2, 1, 0, 3][: pixels.shape[-1]]].astype(np.float32) / 255
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    """Return how alike two pictures are, in dB."""
+    error = np.square(first.clip(0, 1) - second.clip(0, 1), dtype=np.float64).mean()
+    return float(-10 * np.log10(error)) if error > 0 else math.inf  # two back ends may draw the same bytes
+
+
+def violations(page: Path | str, size: tuple[int, int], device: Sequence[str] = (), *steps: str) -> list[list[str]]:
     """Return what axe-core finds in a page with all parts unfolded: each rule, and the first element that breaks it.
 
-    `first` is JavaScript that runs before.
+    With steps, which are JavaScript, the page is looked at after each of them.
     """
     node()
     axe = (WEB / "node_modules" / "axe-core" / "axe.min.js").read_text()
-    script = f"""(async () => {{
-      {first}
+    look = """
       document.querySelectorAll("details").forEach((each) => (each.open = true));
-      const {{ violations }} = await axe.run();
-      return violations.map(({{ id, nodes }}) => [id, nodes[0].html.slice(0, 200)]);
-    }})()"""
-    return browse(page, [f"{axe};0", script], size, device=device)["results"][1]
+      const { violations } = await axe.run();
+      return violations.map(({ id, nodes }) => [id, nodes[0].html.slice(0, 200)]);
+    """
+    told = browse(page, [f"{axe};0", *(script(step, look) for step in steps or ("",))], size, device=device)
+    return [found for each in told["results"][1:] for found in each]
 
 
 def drawn_head(

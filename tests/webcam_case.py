@@ -1,7 +1,7 @@
-"""A drawn head as a webcam: a video whose motion is known, with each frame's number beside the head."""
+"""A drawn head as a webcam: pictures of a known motion, which a page sees one after the other at the pace of a test."""
 
+import base64
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,37 +13,52 @@ from mien.lab.synthetic.painter import develop, draw, to_uint8
 from mien.lab.synthetic.posing import head_pose
 from mien.lab.synthetic.subject import pose_subject
 
-FPS = 4.0
-"""Frames per second. Few, because software WebGL leaves the detector four to eight on a busy machine."""
-STILL = 20
-"""Frames at the start in which nothing moves."""
+STILL = 12
+"""Pictures at the start in which nothing moves."""
 TRUE = ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight")
-WIDTH, HEIGHT = 640, 480
-CELL, BITS = 40, 10
-"""The number is a column of cells at the left: black or white for each bit, the lowest on top, and their parity."""
-_SIDE = HEIGHT
-_JAW = ((24, 14, 0.35), (44, 16, 0.6), (70, 14, 0.45), (92, 12, 0.25))
-_BLINKS = ((33, 7), (57, 7), (64, 6), (86, 7))
-_COUNT = 108
+_SIDE = 360
+_JAW, _BLINKS = ((14, 14, 0.6), (34, 12, 0.4)), ((24, 7), (46, 7))
+_COUNT = 56
 _YAW = 0.12
+CAMERA = """(() => {
+  const picture = new OffscreenCanvas(360, 360), brush = picture.getContext("2d"), make = createImageBitmap;
+  const { postMessage } = Worker.prototype;
+  let see = () => {}, answered = () => {};
+  HTMLVideoElement.prototype.requestVideoFrameCallback = (callback) => void (see = callback);
+  window.createImageBitmap = () => make(picture);
+  Worker.prototype.postMessage = function (message, moved) {
+    if (message.picture) this.addEventListener("message", () => setTimeout(answered), { once: true });
+    postMessage.call(this, message, moved);
+  };
+  let milliseconds = 0;
+  window.film = async (address) => {
+    const image = new Image(), done = new Promise((resolve) => (answered = resolve));
+    image.src = address;
+    await image.decode();
+    brush.drawImage(image, 0, 0);
+    see((milliseconds += 250));
+    await done;
+  };
+})()"""
+"""Lets `film` show the page a picture, 0.25 s after the last one, and wait until the detector has seen it."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A video, and what it shows."""
+    """Pictures, and what they show."""
 
-    path: Path
-    """An uncompressed video (.y4m), as Chromium's fake camera takes it."""
+    pictures: list[str]
+    """Addresses that hold the pictures themselves."""
     truth: Float[np.ndarray, "t 3"]
     """Coefficients of `TRUE` at each frame."""
     yaw: Float[np.ndarray, " t"]
     """Turn of the head to the person's left, in radians."""
 
 
-def write_clip(folder: Path) -> Clip:
-    """Draw a person who opens the mouth four times, blinks four times, and turns the head a little."""
+def draw_clip() -> Clip:
+    """Draw a person who opens the mouth twice, blinks twice, and turns the head a little."""
     recipe = SyntheticRecipe(
-        width=_SIDE, height=_SIDE, fps=FPS, seconds=_COUNT / FPS, glasses=False, supersample=1, texture_size=768
+        width=_SIDE, height=_SIDE, fps=4.0, seconds=_COUNT / 4, glasses=False, supersample=1, texture_size=512
     )
     scene = SyntheticScene(recipe, 2)
     time = np.arange(_COUNT)
@@ -67,30 +82,19 @@ def write_clip(folder: Path) -> Clip:
         head_rotation=rotation,
         head_translation=first.head_translation.expand(_COUNT, -1),
     )
-    path = folder / "drawn.y4m"
-    with path.open("wb") as file:
-        file.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F{FPS:.0f}:1 Ip A1:1 C420jpeg\n".encode())
-        for step in range(_COUNT):
-            posed = pose_subject(scene.subject, face[step], scene.camera.position.numpy())
-            camera = scene.camera.in_frame(torch.from_numpy(head_pose(face[step])))
-            posed = replace(posed, viewpoint=camera.position.numpy())
-            colors, coverage = draw(scene.subject, posed, camera, recipe.supersample)
-            image = to_uint8(develop(colors, coverage, scene.background), recipe.noise, np.random.default_rng(step))
-            file.write(b"FRAME\n" + cv2.cvtColor(_numbered(image, step), cv2.COLOR_RGB2YUV_I420).tobytes())
-    return Clip(path, truth, turn)
+    pictures = []
+    for step in range(_COUNT):
+        posed = pose_subject(scene.subject, face[step], scene.camera.position.numpy())
+        camera = scene.camera.in_frame(torch.from_numpy(head_pose(face[step])))
+        posed = replace(posed, viewpoint=camera.position.numpy())
+        colors, coverage = draw(scene.subject, posed, camera, recipe.supersample)
+        image = to_uint8(develop(colors, coverage, scene.background), recipe.noise, np.random.default_rng(step))
+        _, packed = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+        pictures.append("data:image/jpeg;base64," + base64.b64encode(packed.tobytes()).decode())
+    return Clip(pictures, truth, turn)
 
 
 def _bump(time: np.ndarray, start: int, length: int) -> np.ndarray:
     """Return a raised cosine, 0 at both ends and 1 in its middle."""
     share = np.clip((time - start) / length, 0, 1)
     return 0.5 - 0.5 * np.cos(2 * np.pi * share)
-
-
-def _numbered(image: np.ndarray, number: int) -> np.ndarray:
-    frame = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
-    left = (WIDTH - _SIDE) // 2
-    frame[:, left : left + _SIDE] = image
-    bits = [(number >> bit) & 1 for bit in range(BITS)]
-    for cell, bit in enumerate([*bits, sum(bits) & 1]):
-        frame[cell * CELL : (cell + 1) * CELL, :CELL] = 255 * bit
-    return frame

@@ -31,7 +31,11 @@ window.walk = {
   async face(name) {
     const viewer = await mien, buttons = [...document.querySelectorAll("#faces button")];
     buttons.find((each) => each.textContent === name).click();
-    await wait(2000);
+    // A face comes softly, and then stays.
+    for (let before = NaN, moved = strayed(viewer); moved !== before; moved = strayed(viewer)) {
+      before = moved;
+      for (let k = 0; k < 4; ++k) await new Promise(requestAnimationFrame);
+    }
     return { moved: strayed(viewer) };
   },
   /** Opens what is behind "More", with one group of sliders. */

@@ -176,8 +176,9 @@ def viewer(made: Walk, workspace: Path) -> None:
                     steps += [{"click": "Random face"}, {"wait": 3000}]
                 steps += [{"screenshot": shots[2]}]
                 width, height, _ = SCREENS[screen]
-                told = node("view.mjs", address, {"width": width, "height": height, "steps": steps})
-                expect(not told["errors"], f"viewer: {told['errors']}")
+                given = {"width": width, "height": height, "steps": steps, "mobile": screen == "phone"}
+                told = node(address, given)
+                expect(not told["messages"], f"viewer: {told['messages']}")
         finally:
             process.terminate()
 
@@ -233,7 +234,7 @@ def shoot(
     given |= {"flags": list(flags), "lively": True}
     given |= {"dark": theme == "dark", "touch": screen != "desktop", "scripts": list(scripts.values())}
     given |= {"screenshots": [made.picture("_".join(filter(None, (name, state)))) for state in scripts]}
-    told = node("browser.mjs", str(page), given | {"opening": (HERE / "first_minute.js").read_text(encoding="utf-8")})
+    told = node(str(page), given | {"opening": (HERE / "first_minute.js").read_text(encoding="utf-8")})
     here = str(page).rpartition("/")[0] if str(page).startswith("http") else "blob:"
     outside = [address for address in told["requests"] if not address.startswith((here, "blob:", "data:"))]
     expect(not outside, f"{name}: asks for {outside}")
@@ -241,11 +242,11 @@ def shoot(
     return dict(zip(scripts, told["results"], strict=True))
 
 
-def node(script: str, address: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a script of web/tests with Chromium, and return what it tells."""
+def node(address: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Open a page in Chromium by web/tests/browser.mjs, and return what it tells."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     expect(chromium is not None, "there is no Chromium")
-    command = ["node", str(WEB / "tests" / script), str(chromium), address]
+    command = ["node", str(WEB / "tests" / "browser.mjs"), str(chromium), address]
     done = subprocess.run(command, input=json.dumps(given), text=True, capture_output=True, check=False, timeout=400)
     expect(done.returncode == 0, f"{address}: {done.stderr.strip()[-400:]}")
     return json.loads(done.stdout)

@@ -1,39 +1,114 @@
-// Opens a page in headless Chromium with software WebGL, runs scripts in it one after the other, and prints their
-// results and all requests as json. tests/test_web.py and tests/test_study.py call it:
-//   node browser.mjs CHROMIUM PAGE (a file, or an address on this machine) < {"width", "height", "scripts": [..], "screenshots": [path or null, ..], "downloads": folder, "webgpu": true for WebGPU in software, "lively": true for a page that may move by itself, "dark", "touch", "scale": pixels of the screen for each of the page, "whole": true for screenshots of the whole page and not of the window, "flags": [..], "opening": a script that runs before those of the page}
+// Opens a page in headless Chromium with software WebGL, and does its scripts or steps one after the other.
+//   node browser.mjs CHROMIUM PAGE (a file, or an address on this machine) < {"width", "height", ..}
+// prints json: results of the scripts, requests of the page, its messages, and the ratio of the canvas at each saving.
+// server.mjs does the same for many pages in one browser. What can be asked for:
+//   "scripts": [..], "screenshots": [path or null, ..], "whole": true for screenshots of the whole page and not of the window
+//   "steps": [..] instead of scripts, each one of {"see": text}, {"click": text of a button}, {"drag": [x, y]},
+//     {"fill": [label, text]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
+//     {"settled": path}: a screenshot that differs from the last one and stays as it is
+//   "webgpu": true for WebGPU in software, "flags": further options of Chromium, "downloads": folder, "opening": a script
+//   that runs before those of the page, "lively": true for a page that may move by itself, "dark", "touch", "mobile",
+//   "scale": pixels of the screen for each of the page
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";
 import { chromium } from "playwright-core";
 
-const [executablePath, page] = process.argv.slice(2);
-const { width, height, scripts, screenshots = [], downloads, webgpu, flags = [], lively, dark, touch, scale, whole, opening } = JSON.parse(readFileSync(0, "utf8"));
-const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-  "--disable-background-networking", "--disable-component-update", "--disable-sync", ...flags];
-if (webgpu) args.push("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader");
-const browser = await chromium.launch({ executablePath, args });
-try {
-  const tab = await browser.newPage({
-    viewport: { width, height }, reducedMotion: lively ? "no-preference" : "reduce", colorScheme: dark ? "dark" : "light", hasTouch: touch, deviceScaleFactor: scale,
+const PATIENCE = 120000;
+
+/** Starts Chromium. */
+export function launch(executablePath, { webgpu, flags = [] }) {
+  const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", ...flags];
+  if (webgpu) args.push("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader");
+  return chromium.launch({ executablePath, args });
+}
+
+/** Opens a page, does what is asked for, and closes it. */
+export async function visit(browser, page, { width, height, scripts = [], screenshots = [], steps = [], downloads, lively, dark, touch, mobile, scale, whole, opening }) {
+  const context = await browser.newContext({
+    viewport: { width, height }, reducedMotion: lively ? "no-preference" : "reduce", colorScheme: dark ? "dark" : "light",
+    hasTouch: touch || mobile, isMobile: mobile, deviceScaleFactor: scale,
   });
-  const requests = [], messages = [], results = [], files = [];
-  if (downloads) tab.on("download", (file) => files.push(file.saveAs(join(downloads, file.suggestedFilename()))));
-  tab.on("request", (request) => requests.push(request.url()));
-  tab.on("console", (message) => messages.push(message.text()));
-  tab.on("pageerror", (error) => messages.push(`${error}`));
-  if (opening) await tab.addInitScript(opening);
-  const [place, hash] = page.split("#");
-  const address = place.startsWith("http://") ? place : pathToFileURL(place).href;
-  await tab.goto(hash ? `${address}#${hash}` : address);
-  for (let i = 0; i < scripts.length; ++i) {
-    results.push(await tab.evaluate(scripts[i]));
-    if (!screenshots[i]) continue;
-    // Software WebGL has no larger pictures; below, Chromium would begin at the top again.
-    const clip = whole && { x: 0, y: 0, width, height: Math.min(8192, await tab.evaluate("document.documentElement.scrollHeight")) };
-    await tab.screenshot({ path: screenshots[i], fullPage: whole, timeout: 120000, ...(clip && { clip }) });
+  try {
+    const tab = await context.newPage(), requests = [], messages = [], results = [], files = [], shapes = [];
+    tab.setDefaultTimeout(PATIENCE);
+    if (downloads) tab.on("download", (file) => files.push(file.saveAs(join(downloads, file.suggestedFilename()))));
+    tab.on("request", (request) => requests.push(request.url()));
+    if (!steps.length) tab.on("console", (message) => messages.push(message.text()));
+    tab.on("pageerror", (error) => messages.push(`${error}`));
+    if (opening) await tab.addInitScript(opening);
+    const [place, hash] = page.split("#");
+    const address = place.startsWith("http://") ? place : pathToFileURL(place).href;
+    await tab.goto(hash ? `${address}#${hash}` : address);
+    for (let i = 0; i < scripts.length; ++i) {
+      results.push(await tab.evaluate(scripts[i]));
+      if (!screenshots[i]) continue;
+      // Software WebGL has no larger pictures; below, Chromium would begin at the top again.
+      const clip = whole && { x: 0, y: 0, width, height: Math.min(8192, await tab.evaluate("document.documentElement.scrollHeight")) };
+      await tab.screenshot({ path: screenshots[i], fullPage: whole, ...(clip && { clip }) });
+    }
+    const act = actions(tab, width, height, shapes);
+    for (const step of steps) {
+      const [[name, given]] = Object.entries(step);
+      await act[name](given);
+    }
+    await Promise.all(files);
+    return { requests: requests.filter((url) => url !== address), messages, results, shapes };
+  } finally {
+    await context.close();
   }
-  await Promise.all(files);
-  console.log(JSON.stringify({ requests: requests.filter((url) => url !== address), messages, results }));
-} finally {
-  await browser.close();
+}
+
+/** What steps do, by their names. */
+function actions(tab, width, height, shapes) {
+  let last = Buffer.alloc(0);
+  return {
+    wait: (milliseconds) => tab.waitForTimeout(milliseconds),
+    see: (text) => tab.getByText(text).first().waitFor(),
+    click: (text) => tab.getByText(text, { exact: true }).first().click(),
+    fill: ([label, text]) => tab.locator(`xpath=//*[text()="${label}"]/following::input[1]`).fill(text),
+    screenshot: (path) => tab.screenshot({ path }),
+    reload: () => tab.reload(),
+    async settled(path) {
+      let before = last, same = 0;
+      for (const began = Date.now(); same < 2; await tab.waitForTimeout(200)) {
+        if (Date.now() - began > PATIENCE) throw new Error(`the picture of ${path} does not settle`);
+        const now = await tab.screenshot({ path });
+        same = now.equals(before) && !now.equals(last) ? same + 1 : 0;
+        before = now;
+      }
+      last = before;
+    },
+    async drag([right, down]) {
+      const [x, y] = [0.3 * width, 0.5 * height];
+      await tab.mouse.move(x, y);
+      await tab.mouse.down();
+      await tab.mouse.move(x + right, y + down, { steps: 5 });
+      await tab.mouse.up();
+    },
+    async save([name, path]) {
+      shapes.push(await tab.locator("canvas").first().evaluate((canvas) => canvas.clientWidth / canvas.clientHeight));
+      const coming = tab.waitForEvent("download", { timeout: 170000 }), button = tab.getByText(name, { exact: true }).first();
+      // A button in a folder that is still opening moves away from the pointer on a busy machine, so it is pressed again.
+      const pressing = (async () => {
+        for (let press = 0; press < 3; press++) {
+          await button.click();
+          if (await Promise.race([coming.then(() => true), tab.waitForTimeout(50000).then(() => false)])) return;
+        }
+      })();
+      const [download] = await Promise.all([coming, pressing]);
+      await download.saveAs(path);
+    },
+  };
+}
+
+if (process.argv[1]?.endsWith("browser.mjs")) {
+  const [executablePath, page] = process.argv.slice(2), given = JSON.parse(readFileSync(0, "utf8"));
+  const browser = await launch(executablePath, given);
+  try {
+    console.log(JSON.stringify(await visit(browser, page, given)));
+  } finally {
+    await browser.close();
+  }
 }

@@ -1,8 +1,8 @@
-// Mouths of what a voice sounds like at each moment, for tests/test_web_microphone.py:
-//   node voice.mjs VOICE.JS < [[loudness, vowel, low, high, seconds], ..] prints them as json.
-import { readFileSync } from "node:fs";
+// Mouths of what a voice sounds like at each moment [loudness, vowel, low, high, seconds], for tests/test_web_microphone.py.
 import { pathToFileURL } from "node:url";
 
-const { Voice } = await import(pathToFileURL(process.argv[2]).href);
-const voice = new Voice();
-console.log(JSON.stringify(JSON.parse(readFileSync(0, "utf8")).map((moment) => voice.next(...moment))));
+export default async function voice(script, moments) {
+  const { Voice } = await import(pathToFileURL(script).href);
+  const one = new Voice();
+  return moments.map((moment) => one.next(...moment));
+}

@@ -22,7 +22,7 @@ FILM = "film.mp4"
 """Name of the film in a run's folder."""
 SECONDS, FPS, SIDE = 5.0, 25, 512
 """Length in seconds, frames per second, and sides in pixels of the film."""
-_MOST_YAW, _LEAST_YAW, _MOST_PITCH = 0.4, 0.1, 0.08
+MOST_YAW, LEAST_YAW, _MOST_PITCH = 0.4, 0.1, 0.08
 """Largest turns of the head to a side, turns that every head makes, and largest nods, in radians."""
 _MARGIN = 0.06
 """Width of the free space around the head, as a share of the picture."""
@@ -60,8 +60,8 @@ def living(avatar: Avatar, camera: Camera, name: str, coverage: Coverage | None)
     neutral, reached = avatar.face_model.head_vertices(avatar.subject)[0], None
     if coverage is not None:
         reached = filmed_yaws(avatar.face_model, neutral, coverage) or (0, 0)
-    yaws = _yaws(alive, reached)
-    return Living(alive, _near(alive, yaws), yaws)
+    yaws = yaws_of(alive, reached)
+    return Living(alive, near_camera(alive, yaws), yaws)
 
 
 def write_film(path: Path, alive: Living) -> None:
@@ -70,7 +70,7 @@ def write_film(path: Path, alive: Living) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    write_video(path, _pictures(alive), FPS)
+    write_video(path, pictures_of(alive), FPS)
 
 
 def strip(alive: Living) -> list[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
@@ -85,7 +85,8 @@ def to_bytes(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.rint(255 * image.clip(0, 1)).astype(np.uint8)
 
 
-def _pictures(alive: Living) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def pictures_of(alive: Living) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Yield the pictures of the film."""
     avatar, (right, left) = alive.avatar, alive.yaws
     shown = runtime.presets_for(avatar.expression_names, avatar.joint_names)
     count = round(SECONDS * FPS)
@@ -94,34 +95,34 @@ def _pictures(alive: Living) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         phase = 2 * np.pi * seconds / SECONDS
         yaw = 0.5 * (left + right) + 0.5 * (left - right) * np.sin(phase)
         faces = {name: value for name, value in _face(seconds).items() if name in shown}
-        rotation = _turned(avatar, yaw, _MOST_PITCH * np.sin(2 * phase))
+        rotation = turned_head(avatar, yaw, _MOST_PITCH * np.sin(2 * phase))
         yield to_bytes(avatar.render(avatar.pose(faces, head_rotation=rotation), alive.camera)[0])
 
 
-def _turned(avatar: runtime.Avatar, yaw: float, pitch: float) -> Float32[np.ndarray, " 3"]:
+def turned_head(avatar: runtime.Avatar, yaw: float, pitch: float) -> Float32[np.ndarray, " 3"]:
     """The rotation of the head that is turned from its rest, as an axis-angle vector in radians."""
     rest = matrix_from_axis_angle(avatar.portable.neutral.head_rotation)
     return axis_angle_from_matrix(rest @ matrix_from_axis_angle(np.array([pitch, yaw, 0.0]))).astype(np.float32)
 
 
-def _yaws(avatar: runtime.Avatar, reached: tuple[int, int] | None) -> tuple[float, float]:
+def yaws_of(avatar: runtime.Avatar, reached: tuple[int, int] | None) -> tuple[float, float]:
     """`Living.yaws` of a head that was filmed from so many degrees to its right to so many to its left."""
     if reached is None:
-        return -_MOST_YAW, _MOST_YAW
+        return -MOST_YAW, MOST_YAW
     camera, neutral = avatar.camera, avatar.portable.neutral
     eye = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
     # A head that turns to its left shows its right.
     at_rest = float(head_angles(neutral.head_rotation[None], neutral.head_translation[None], eye)[0, 0])
     right, left = np.radians(reached)
-    to_left, to_right = np.clip([right + at_rest, left - at_rest], _LEAST_YAW, _MOST_YAW)
+    to_left, to_right = np.clip([right + at_rest, left - at_rest], LEAST_YAW, MOST_YAW)
     return -float(to_right), float(to_left)
 
 
-def _near(avatar: runtime.Avatar, yaws: tuple[float, float]) -> runtime.Camera:
+def near_camera(avatar: runtime.Avatar, yaws: tuple[float, float]) -> runtime.Camera:
     """`Living.camera`. It is never further away than the view of the training."""
     camera = avatar.camera.square(SIDE)
     turned = [
-        avatar.pose(head_rotation=_turned(avatar, yaw, pitch))
+        avatar.pose(head_rotation=turned_head(avatar, yaw, pitch))
         for yaw in (*yaws, 0.0)
         for pitch in (-_MOST_PITCH, _MOST_PITCH)
     ]

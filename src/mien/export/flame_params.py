@@ -29,7 +29,7 @@ _POSES = {"neck_pose": ("neck",), "jaw_pose": ("jaw",), "eyes_pose": ("left_eye"
 _PER_FRAME = {"expr": None, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
 """Number of columns of the arrays with a row for each timestep; None for as many as there are."""
 _WANTED = (*_PER_FRAME, "shape", "static_offset", "dynamic_offset")
-_TEETH = (5023, 5143)
+TEETH = (5023, 5143)
 """Vertices of FLAME, without and with the teeth that GaussianAvatars adds. Trackings may lack offsets of the teeth."""
 _MAX_TIMESTEPS = 1_000_000
 _REMEDY = "give flame_param.npz as GaussianAvatars or `mien export` wrote it"
@@ -183,11 +183,11 @@ def _offsets(path: Path, values: np.ndarray | None, count: int) -> Float[Tensor,
     """Static offsets of all vertices, or None if all are zero."""
     if values is None:
         return None
-    if values.shape == (1, _TEETH[0], 3) and count == _TEETH[1]:
-        values = np.concatenate([values, np.zeros((1, count - _TEETH[0], 3), np.float32)], axis=1)
+    if values.shape == (1, TEETH[0], 3) and count == TEETH[1]:
+        values = np.concatenate([values, np.zeros((1, count - TEETH[0], 3), np.float32)], axis=1)
     if values.shape != (1, count, 3):
         told = f"{path}: 'static_offset' has the shape {list(values.shape)}, but the face model has {count:,} vertices"
-        if values.shape == (1, _TEETH[1], 3) and count == _TEETH[0]:
+        if values.shape == (1, TEETH[1], 3) and count == TEETH[0]:
             raise UserError(f"{told}: it lacks GaussianAvatars' teeth; add a FLAME model that has them "
                             "(docs/gaussian_avatars_folder.md)")  # fmt: skip
         raise UserError(f"{told}; import it with the face model that it was made with (--face-model)")

@@ -178,7 +178,7 @@ def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
 def _add_palette(pictures: dict[str, bytes], higher: np.ndarray, width: int) -> dict[str, Any]:
     """Add the coefficients of higher degrees to the pictures, and return their part of meta.json."""
     rows = higher.reshape(len(higher), 3 * higher.shape[1])
-    labels = _cells(rows, 1 << _PALETTE_BITS)
+    labels = cells_of(rows, 1 << _PALETTE_BITS)
     size = int(labels.max(initial=0)) + 1
     palette, _ = _means(rows, labels, size)
     codes, book = _coded(palette.reshape(size, *higher.shape[1:]))
@@ -192,7 +192,7 @@ def _add_palette(pictures: dict[str, bytes], higher: np.ndarray, width: int) -> 
     return {"count": size, "bands": _BANDS[higher.shape[1]], "codebook": book, "files": files}
 
 
-def _cells(rows: np.ndarray, most: int) -> np.ndarray:
+def cells_of(rows: np.ndarray, most: int) -> np.ndarray:
     """The number of a cell for each row. There are at most `most` cells, which medians cut from all rows."""
     if len(rows) <= most:
         return np.arange(len(rows))

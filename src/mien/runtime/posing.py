@@ -85,7 +85,7 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
         still = np.linalg.inv(face.T_world_head.astype(np.float64)) @ baked.still_pose
         transform = np.ascontiguousarray(still[:3], np.float32)
         _native.add_bone(shaped, _contiguous_row(baked.still_weights), transform, centers)
-    if _has_native_activations(baked):
+    if has_native_activations(baked):
         return _with_native_activations(baked, centers, face)
     raw = _raw_values(baked.attributes, baked.bases, baked.network, centers - baked.rig.template, face)
     if baked.scale_activation == "sigmoid":
@@ -96,7 +96,7 @@ def _pose_blend_skinned(baked: BlendSkinned, face: Face) -> Gaussians:
     return _contiguous(centers, raw["quats"], scales, sigmoid(raw["opacity_logits"]), sh, face.T_world_head)
 
 
-def _has_native_activations(baked: BlendSkinned) -> bool:
+def has_native_activations(baked: BlendSkinned) -> bool:
     """Whether all changes of attributes are those of one network of points, which the core activates."""
     network = baked.network
     return (

@@ -26,7 +26,7 @@ _NOTHING = "none"
 _LEAST_HEIGHT, _MOST_HEIGHT = 128, 1080
 _MOST_STILLS = 8
 """Number of browsers whose screenshots may wait."""
-_MOST_PARTS = 16
+MOST_PARTS = 16
 """Number of messages that a browser may not have taken yet when one more file is made for it. A file has a message for
 each MiB."""
 _FOLLOW_SECONDS = 0.25
@@ -57,7 +57,7 @@ class Panel:
         """
         self._server, self._session, self._view_of = server, session, view_of
         self._title = printable(Path(title).name) or "avatar"
-        self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
+        self.sliders: dict[str, viser.GuiSliderHandle[float]] = {}
         self._time: viser.GuiSliderHandle[int] | None = None
         self._report: viser.GuiMarkdownHandle | None = None
         self._followed_at, self._stopping = 0.0, False
@@ -106,7 +106,7 @@ class Panel:
         values = dict(zip(avatar.expression_names, face.expression.tolist(), strict=True))
         for name, angles in zip(avatar.joint_names, face.joints.tolist(), strict=True):
             values |= {f"{name}_{'xyz'[axis]}": angle for axis, angle in enumerate(angles)}
-        for name, slider in self._sliders.items():
+        for name, slider in self.sliders.items():
             slider.value = _rounded(values[name], slider.min, slider.max)
         if self._time is not None:
             self._time.value = self._session.timestep
@@ -251,7 +251,7 @@ class Panel:
             for title, names in groups.items():
                 found = [matches(search.value, name) for name in names]
                 for name, visible in zip(names, found, strict=True):
-                    self._sliders[name].visible = visible
+                    self.sliders[name].visible = visible
                 folders[title].visible = any(found)
 
     def _expression_setter(self, name: str) -> Callable[[float], None]:
@@ -275,7 +275,7 @@ class Panel:
         self, name: str, label: str, low: float, high: float, value: float, take: Callable[[float], None]
     ) -> None:
         slider = self._server.gui.add_slider(label, low, high, _STEP, _rounded(value, low, high))
-        self._sliders[name] = slider
+        self.sliders[name] = slider
 
         # These run in the order of the events. Functions in viser's threads could overtake each other.
         @slider.on_update
@@ -359,7 +359,7 @@ class Panel:
     def _can_send(self, client: viser.ClientHandle) -> bool:
         """Whether a client has taken the files before. What it has not taken yet stays in memory."""
         waiting = client._websock_connection.get_message_buffer().message_from_id
-        if len(waiting) > _MOST_PARTS:
+        if len(waiting) > MOST_PARTS:
             self._complain(client, "The last file is still on its way; wait for it.")
             return False
         return True

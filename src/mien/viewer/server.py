@@ -33,7 +33,7 @@ from mien.viewer.session import Session, center_of
 
 _MOVING_QUALITY, _STILL_QUALITY = 75, 92
 """JPEG qualities of pictures of half size and of full size, 1 to 100."""
-_MOST_BROWSERS = 32
+MOST_BROWSERS = 32
 """Number of browsers that may be connected at a time. Each costs memory, and time of the others."""
 _MOST_TOLD = 10
 """Number of failures that are told; a browser could cause the same one again and again."""
@@ -88,21 +88,21 @@ class Serving:
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
         with _quiet(), _guarded(door, gate):
-            self._server = viser.ViserServer(host=door.host, port=chosen, label="mien", verbose=False)
+            self.server = viser.ViserServer(host=door.host, port=chosen, label="mien", verbose=False)
         try:
-            self.port = self._server.get_port()
+            self.port = self.server.get_port()
             if port and self.port != port:
                 raise _taken(port)
             _check_guard(door.host, self.port)
             # viser could pass this server on through a machine of its makers.
-            self._server.request_share_url = lambda verbose=True: None
-            self._server.get_event_loop().set_exception_handler(self._task_failed)
-            self._session = session
+            self.server.request_share_url = lambda verbose=True: None
+            self.server.get_event_loop().set_exception_handler(self._task_failed)
+            self.session = session
             self._show(title)
-            gate.open(self._server.gui)
+            gate.open(self.server.gui)
         except BaseException:
             with _quiet():
-                self._server.stop()
+                self.server.stop()
             raise
         shown = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
         self.address = door.address(shown, self.port)
@@ -118,13 +118,13 @@ class Serving:
         """Close all connections, and end all threads."""
         # Connections that are still open are cut, which asyncio would report.
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
-        self._panel.stop()
+        self.panel.stop()
         self.loop.stop()
         with _quiet():
-            self._server.stop()
+            self.server.stop()
 
     def _show(self, title: str) -> None:
-        server, session = self._server, self._session
+        server, session = self.server, self.session
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         server.gui.main_panel.dock_right()
         position, target, up = filmed_from(session)
@@ -136,7 +136,7 @@ class Serving:
         server.initial_camera.fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
         self.loop = DrawingLoop(session.picture, session.advance, failed=self._failed)
         session.changed = self.loop.change
-        self._panel = Panel(server, session, title, view_of, self._failed, self._camera)
+        self.panel = Panel(server, session, title, view_of, self._failed, self._camera)
         self.loop.start()
         # A browser may leave while its picture is drawn; viser would warn about that.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
@@ -162,13 +162,13 @@ class Serving:
         def show(picture: Any, full: bool) -> None:
             quality = _STILL_QUALITY if full else _MOVING_QUALITY
             client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
-            seen = self._session.taken()
+            seen = self.session.taken()
             if seen is not None and self._camera is not None:
                 self._camera.shown(seen)
-            self._panel.follow()
-            if not self._session.playing:
+            self.panel.follow()
+            if not self.session.playing:
                 view = view_of(client.camera)
-                words.content = self._session.words(view)
+                words.content = self.session.words(view)
 
         async def look(camera: viser.CameraHandle) -> None:
             view = view_of(camera)
@@ -265,7 +265,7 @@ def _guarded(door: Door, gate: Gate) -> Iterator[None]:
             return response
 
         named |= {"create_connection": Connection, "max_size": MOST_BYTES, "close_timeout": _CLOSE_SECONDS}
-        return start(_at_most(_MOST_BROWSERS, handler), *arguments, process_request=process, **named)
+        return start(_at_most(MOST_BROWSERS, handler), *arguments, process_request=process, **named)
 
     module.serve = guarded
     try:

@@ -16,7 +16,7 @@ from mien.progress import say
 from mien.runtime import write_portable
 from mien.system import PARENT_VARIABLE, lower_priority
 
-_LEAST_SECONDS = 2.0
+LEAST_SECONDS = 2.0
 """Least time between two pictures of the state."""
 _SHARE = 1 / 40
 """Largest share of the time that training spends on showing itself. The viewer takes another one, at lower priority."""
@@ -52,9 +52,9 @@ class LiveView:
             self._due = math.inf
             return
         if self._viewer is None:
-            self._viewer = _start(file)
+            self._viewer = start_viewer(file)
         now = time.monotonic()
-        self._due = now + max(_LEAST_SECONDS, (now - began) / _SHARE)
+        self._due = now + max(LEAST_SECONDS, (now - began) / _SHARE)
 
     def close(self) -> None:
         """End the viewer, and delete what it read."""
@@ -69,7 +69,7 @@ class LiveView:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def _start(file: Path) -> "subprocess.Popen[bytes]":
+def start_viewer(file: Path) -> "subprocess.Popen[bytes]":
     """Start a viewer of a file, with one thread and lower priority. Its first line is the address to open."""
     environment = {**os.environ, PARENT_VARIABLE: str(os.getpid()), "MIEN_THREADS": "1"}
     command = [sys.executable, "-m", "mien.cli", "view", str(file), "--follow"]

@@ -83,7 +83,7 @@ def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Pl
         say(f"Open {address} in a browser; Ctrl-C ends the viewer")
 
     if follow:
-        threading.Thread(target=_follow, args=(session, avatar), daemon=True).start()
+        threading.Thread(target=follow_file, args=(session, avatar), daemon=True).start()
     try:
         serve(session, door, place.port, viewed.portable.about.name, ready, _camera_switch(session, viewed, place))
     except KeyboardInterrupt:
@@ -96,7 +96,7 @@ def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Pl
 def open_viewed(avatar: Path, run: str | None) -> Viewed:
     """Open a .mien file, or a run of a workspace."""
     if avatar.is_file():
-        return _of_file(avatar)
+        return viewed_file(avatar)
     from mien.commands.stages.viewing_motions import of_workspace
 
     return of_workspace(avatar, run)
@@ -108,7 +108,8 @@ def mesh_of(portable: PortableAvatar) -> Mesh | None:
     return Mesh(baked.rig, baked.faces, portable.confidence) if isinstance(baked, MeshBound) else None
 
 
-def _of_file(path: Path) -> Viewed:
+def viewed_file(path: Path) -> Viewed:
+    """Return what the viewer shows of a .mien file."""
     portable = read_portable(path)
 
     def person() -> "tuple[mien.face.FaceModel, mien.face.FaceParams]":
@@ -133,7 +134,7 @@ def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwit
     return switch_of_first_camera(session, viewed)
 
 
-def _follow(session: Session, path: Path) -> None:
+def follow_file(session: Session, path: Path) -> None:
     """Show the file whenever it changes. If a training started this viewer and is gone, end it."""
     parent, seen = os.environ.get(PARENT_VARIABLE), _changed_at(path)
     while True:
