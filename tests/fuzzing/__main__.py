@@ -46,11 +46,11 @@ def main() -> int:
             return int(result.outcome == "finding")
         missed = campaign.missed(folder / "self", material) if asked.self_check else []
         until = None if asked.minutes is None else time.monotonic() + 60 * asked.minutes
-        tally = campaign.run(
+        results = campaign.run(
             asked.seed, asked.cases, folder, material, asked.only, asked.workers, until, asked.findings
         )
-        print(tally.table(), *(f"missed by the fuzzers: {one}" for one in missed), sep="\n")
-        return int(bool(tally.findings or missed))
+        print(campaign.table_of(results), *(f"missed by the fuzzers: {one}" for one in missed), sep="\n")
+        return int(bool(missed) or any(result.outcome == "finding" for result in results))
     finally:
         if asked.keep:
             print(f"the files are in {folder}", file=sys.stderr)

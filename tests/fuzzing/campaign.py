@@ -13,10 +13,9 @@ import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,79 +37,46 @@ _GROWN = 400.0
 OUTCOMES = ("refused", "accepted", "finding")
 
 
-@dataclass
-class Row:
-    """Figures of a target."""
-
-    outcomes: Counter[str] = field(default_factory=Counter)
-    megabytes: float = 0.0
-    """Most memory that a case took, beyond what its process had, in megabytes."""
-    seconds: float = 0.0
-    """Longest time of a case, in seconds."""
-
-    def cells(self, name: str) -> str:
-        counts = (self.outcomes.total(), *(self.outcomes[one] for one in OUTCOMES))
-        figures = (*(f"{count:,}" for count in counts), f"{self.megabytes:,.0f} MB", f"{self.seconds:.1f} s")
-        return f"| {name} | {' | '.join(figures)} |"
-
-
-@dataclass
-class Tally:
-    """Figures by target, and findings by cause, of a campaign."""
-
-    rows: dict[str, Row] = field(default_factory=dict)
-    findings: dict[str, list[Result]] = field(default_factory=dict)
-
-    def add(self, result: Result) -> None:
-        for name in (result.case.rsplit(":", 2)[0], "all"):
-            row = self.rows.setdefault(name, Row())
-            row.outcomes[result.outcome] += 1
-            if result.outcome != "finding":
-                row.seconds, row.megabytes = max(row.seconds, result.seconds), max(row.megabytes, result.megabytes)
+def table_of(results: list[Result]) -> str:
+    """Return a table of results by target, then the causes of findings with a case of each."""
+    heads = ("target", "cases", *OUTCOMES, "most memory", "longest")
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for name in (*TARGETS, "all"):
+        own = [result for result in results if name in (result.case.rsplit(":", 2)[0], "all")]
+        counts = [len(own), *(sum(result.outcome == one for result in own) for one in OUTCOMES)]
+        memory, longest = (max((getattr(one, part) for one in own), default=0) for part in ("megabytes", "seconds"))
+        cells = (name, *(f"{count:,}" for count in counts), f"{memory:,.0f} MB", f"{longest:.1f} s")
+        lines += [f"| {' | '.join(cells)} |"] if own else []
+    causes: dict[str, list[Result]] = {}
+    for result in results:
         if result.outcome == "finding":
-            self.findings.setdefault(result.cause, []).append(result)
-
-    def table(self) -> str:
-        """Return a table of the figures by target, then the causes with a case of each."""
-        heads = ("target", "cases", *OUTCOMES[:-1], "findings", "most memory", "longest")
-        lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-        lines += [self.rows[name].cells(name) for name in (*TARGETS, "all") if name in self.rows]
-        lines += ["", f"{len(self.findings)} causes:"]
-        for cause, results in sorted(self.findings.items(), key=lambda item: -len(item[1])):
-            lines.append(f"{len(results):6} x {cause}    --replay {results[0].case!r}\n{results[0].message[:500]}")
-        return "\n".join(lines)
+            causes.setdefault(result.cause, []).append(result)
+    lines += ["", f"{len(causes)} causes:"]
+    for cause, found in sorted(causes.items(), key=lambda item: -len(item[1])):
+        lines.append(f"{len(found):6} x {cause}    --replay {found[0].case!r}\n{found[0].message[:500]}")
+    return "\n".join(lines)
 
 
 def run(
     seed: int, cases: int, folder: Path, material: Path, only: list[str] | None = None, workers: int = 1,
     until: float | None = None, log: Path | None = None,
-) -> Tally:  # fmt: skip
+) -> list[Result]:  # fmt: skip
     """Run cases over all targets, or over some, and further seeds until `until` (`time.monotonic`)."""
-    tally, began = Tally(), time.monotonic()
+    results, began = list[Result](), time.monotonic()
     while True:
         numbered = [case.format(seed=seed) for case in spread(cases, only or present(material))]
         jobs = [(numbered[index::workers], folder / f"worker{index}") for index in range(workers)]
-        results = _side_by_side(jobs, material, until) if workers > 1 else run_cases(*jobs[0], material, until)
-        for result in results:
-            tally.add(result)
+        for result in _side_by_side(jobs, material, until) if workers > 1 else run_cases(*jobs[0], material, until):
+            results.append(result)
             if result.outcome == "finding" and log is not None:
                 log.parent.mkdir(parents=True, exist_ok=True)
                 with log.open("a") as file:
                     file.write(json.dumps(asdict(result)) + "\n")
-            if tally.rows["all"].outcomes.total() % 500 == 0:
-                seconds = time.monotonic() - began
-                print(f"{tally.rows['all'].outcomes.total()} cases in {seconds:.0f} s", file=sys.stderr, flush=True)
+            if len(results) % 500 == 0:
+                print(f"{len(results)} cases in {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
         seed += 1
         if until is None or time.monotonic() >= until:
-            return tally
-
-
-def table_of(results: list[Result]) -> str:
-    """Return a table of results."""
-    tally = Tally()
-    for result in results:
-        tally.add(result)
-    return tally.table()
+            return results
 
 
 @contextmanager
