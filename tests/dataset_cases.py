@@ -96,7 +96,7 @@ def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _film_is_read(video: Path, out: Path, settings: CaptureSettings, name: str) -> None:
-    """Read a video in place of the capture, whose own fuzzer is `tests/test_fuzz.py`."""
+    """Read a video in place of the capture, whose own fuzzer is `tests/fuzzing`."""
     assert "canary" not in str(video.resolve()), "a link that leads out of the dataset"
     next(read_video_frames(video))
     out.mkdir(parents=True)
