@@ -62,18 +62,10 @@ def check_projection(
     sequence: TrackedSequence, timestep: int, vertices: np.ndarray, view: View, camera: int = 0, scale: float = 1.0,
     which: np.ndarray | slice = slice(None),
 ) -> None:  # fmt: skip
-    """Check the imported face and camera against the writer's vertices and camera.
+    """Check the imported face and camera against some of the writer's vertices, and the writer's camera.
 
     Where a moving camera became a moving head, what is compared is the motion from the writer's world to the camera.
-
-    Args:
-        sequence: The import.
-        timestep: Its timestep.
-        vertices: The writer's vertices in the writer's world.
-        view: The writer's intrinsics, rotation and translation.
-        camera: Index of the camera.
-        scale: Size of the writer's world in metres' units.
-        which: The vertices that are compared.
+    The writer's world is `scale` times as large.
     """
     K, rotation, translation = view
     found = sequence.tracking.cameras[camera]

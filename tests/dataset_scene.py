@@ -58,18 +58,14 @@ class Scene:
         return len(self.expr)
 
 
-def make_scene(anny: FaceModel, folder: Path, timesteps: int = 6) -> Scene:
-    """Return a head that turns about all axes, with a neck, a jaw and eyes that move, and a coloured cheek."""
-    arrays = flame_like(anny)
-    model = flame_face_model(read_flame(write_npz(folder / "flame.npz", arrays)), "flame")
-    return scene_of(arrays, replace(model, landmarks=exact_landmarks(anny)), timesteps)
-
-
 @cache
 def drawn_person(timesteps: int = 6) -> Scene:
-    """Return such a head, made once a process."""
+    """Return a head that turns about all axes, with a neck, a jaw and eyes that move, and a coloured cheek."""
+    anny = load_face_model("anny")
+    arrays = flame_like(anny)
     with tempfile.TemporaryDirectory() as folder:
-        return make_scene(load_face_model("anny"), Path(folder), timesteps)
+        model = flame_face_model(read_flame(write_npz(Path(folder) / "flame.npz", arrays)), "flame")
+    return scene_of(arrays, replace(model, landmarks=exact_landmarks(anny)), timesteps)
 
 
 def scene_of(arrays: dict[str, np.ndarray], model: FaceModel, timesteps: int, seed: int = 3) -> Scene:

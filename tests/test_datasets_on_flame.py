@@ -23,6 +23,10 @@ from mien.face.flame import flame_face_model, read_flame
 from mien.training import OwnSplit
 from mien.training.footage import clothes_mask
 
+CHECKED = ("insta", "imavatar", "vhap, one camera")
+"""One layout of each importer, whose calls are checked."""
+EACH = [*CHECKED, *(pytest.param(name, marks=pytest.mark.unchecked) for name in layouts.TRACKED if name not in CHECKED)]
+
 
 @pytest.fixture
 def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
@@ -37,7 +41,7 @@ def refused(folder: Path, scene: Scene, words: str, name: str = "insta") -> None
         checks.read(folder, name, scene.model)
 
 
-@pytest.mark.parametrize("name", layouts.TRACKED)
+@pytest.mark.parametrize("name", EACH)
 def test_what_was_written_comes_back(name: str, scene: Scene, tmp_path: Path) -> None:
     layout = layouts.TRACKED[name]
     folder = layout.write(tmp_path / "me", scene)
@@ -59,6 +63,7 @@ def check_retracked(folder: Path, name: str, scene: Scene) -> None:
         checks.check_pictures(sequence, timestep, draw(scene, layout.vertices(scene, timestep), *view, layout.size))
 
 
+@pytest.mark.unchecked
 def test_imavatar_keeps_the_masks_of_clothes(scene: Scene, tmp_path: Path) -> None:
     folder = writers.write_imavatar(tmp_path / "me", scene)
     assert checks.surveyed(folder).split == "the clip MVI_1812 is held out"
@@ -125,6 +130,7 @@ def matted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.nd
         yield asked
 
 
+@pytest.mark.unchecked
 def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path, matted: list[np.ndarray]) -> None:
     folder = layouts.write_tracker_output(tmp_path / "me", scene)
     found = checks.read(folder, "insta", scene.model)
@@ -151,6 +157,7 @@ def test_a_picture_without_opacity_or_mask_is_a_damaged_copy(scene: Scene, tmp_p
     refused(folder, scene, r"00002.png: has no opacity and no matte; copy")
 
 
+@pytest.mark.unchecked
 def test_larger_pictures_beside_images_are_told_and_in_their_place_used(scene: Scene, tmp_path: Path) -> None:
     folder = writers.write_insta(tmp_path / "me", scene)
     layouts.write_larger(tmp_path / "other", scene)
@@ -163,6 +170,7 @@ def test_larger_pictures_beside_images_are_told_and_in_their_place_used(scene: S
         checks.check_intrinsics(checks.filmed_camera(sequence), layouts.enlarged(writers.OFF_CENTRE, 2))
 
 
+@pytest.mark.unchecked
 def test_impossible_sizes_are_refused(scene: Scene, tmp_path: Path) -> None:
     folder = layouts.write_larger(tmp_path / "me", scene)
     for file in sorted((folder / "images.HQ").iterdir()):
@@ -184,6 +192,7 @@ def test_impossible_sizes_are_refused(scene: Scene, tmp_path: Path) -> None:
         refused(folder, scene, words)
 
 
+@pytest.mark.unchecked
 def test_the_last_frames_are_held_out(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A subject that is longer than the split of its authors has it; one as long as the split has none."""
     assert insta.TEST_FRAMES == {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
@@ -200,6 +209,7 @@ def test_the_last_frames_are_held_out(scene: Scene, tmp_path: Path, monkeypatch:
 # VHAP -----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.unchecked
 def test_a_union_reads_nothing_beside_its_exports(scene: Scene, tmp_path: Path) -> None:
     (tmp_path / "all").mkdir()
     union = layouts.write_union(tmp_path / "all/UNION", scene)
@@ -210,6 +220,7 @@ def test_a_union_reads_nothing_beside_its_exports(scene: Scene, tmp_path: Path) 
     refused(union, scene, "leads out of the dataset", "vhap")
 
 
+@pytest.mark.unchecked
 def test_vhap_with_teeth(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A model with teeth reads static offsets of as many vertices, and the model without them refuses these."""
     file = read_flame(write_npz(tmp_path / "flame.npz", scene.arrays))

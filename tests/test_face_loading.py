@@ -96,15 +96,11 @@ def test_list_of_models(bakes):
     assert {info.name: info.baked for info in available_face_models()}["small"]
 
 
-def test_unknown_name():
+def test_unknown_names_and_landmarks_of_another_mesh_are_refused():
     with pytest.raises(UserError, match="'flame2077'.*anny"):
         load_face_model("flame2077")
-
-
-def test_landmarks_of_another_mesh_are_refused():
-    model = make_small_face_model()
     with pytest.raises(UserError, match="another mesh"):
-        loading.read_landmarks("anny", model)
+        loading.read_landmarks("anny", make_small_face_model())
 
 
 def test_hashes_tell_what_changed():
@@ -127,41 +123,38 @@ def test_a_baked_model_loads_without_its_source(monkeypatch):
     assert importlib.import_module("mien.face").load_face_model("anny").name == "anny"
 
 
-@pytest.mark.parametrize("home", [None, "unwritable"])
-def test_without_a_home_folder_models_are_baked_for_this_process(home, bakes, monkeypatch, tmp_path, capsys):
-    for name in ("MIEN_CACHE", "XDG_CACHE_HOME", "HOME"):
+@pytest.fixture
+def homeless(monkeypatch, tmp_path):
+    """Let the home folder be one that cannot be written to."""
+    for name in ("MIEN_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
-    cache.temporary_folder.cache_clear()
+    monkeypatch.setenv("HOME", "/proc/nowhere")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    if home is None:
+    cache.temporary_folder.cache_clear()
+    yield
+    cache.temporary_folder.cache_clear()
 
-        def unknown(user):
-            raise KeyError(user)
 
-        monkeypatch.setattr("pwd.getpwuid", unknown)
-    else:
-        monkeypatch.setenv("HOME", "/proc/nowhere")
+@pytest.mark.parametrize("why", ["there is no home folder", "/proc/nowhere/.cache/mien cannot be written to"])
+def test_without_a_home_folder_models_are_baked_for_this_process(why, bakes, homeless, monkeypatch, tmp_path, capsys):
+    if why == "there is no home folder":
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
     assert load_face_model("small").content_hash == load_face_model("small").content_hash
     assert len(bakes) == 1
     said = capsys.readouterr().err
     assert said.count("set MIEN_CACHE to keep them") == 1
-    assert ("there is no home folder" if home is None else "/proc/nowhere/.cache/mien cannot be written to") in said
+    assert why in said
     (folder,) = tmp_path.glob("mien-cache-*")
     assert listing.is_baked("small", listing.SOURCES["small"])
     assert str(folder) in said
-    cache.temporary_folder.cache_clear()
 
 
-def test_without_a_home_folder_nothing_is_promised(monkeypatch, tmp_path, capsys):
+def test_without_a_home_folder_nothing_is_promised(homeless, monkeypatch, tmp_path, capsys):
     """A driver's tracking is not kept for the next time then, and a face model that is added would be lost."""
-    for name in ("MIEN_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    cache.temporary_folder.cache_clear()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(driving, "run_capture_stage", lambda *_: None)
     monkeypatch.setattr(driving, "run_tracking_stage", lambda *_, **__: {"clip": None})
     (tmp_path / "clip.mp4").write_bytes(b"a video")
-    monkeypatch.setenv("HOME", "/proc/nowhere")
     assert not cache.cache_is_kept()
     driving.tracked_video(tmp_path / "clip.mp4", "small")
     said = capsys.readouterr().err
@@ -174,4 +167,3 @@ def test_without_a_home_folder_nothing_is_promised(monkeypatch, tmp_path, capsys
     assert cache.cache_is_kept()
     driving.tracked_video(tmp_path / "clip.mp4", "small")
     assert "kept for the next time" in capsys.readouterr().err
-    cache.temporary_folder.cache_clear()

@@ -84,16 +84,6 @@ def test_poses_as_flame_does(moved, arrays, model):
     assert np.abs(model(face.to(torch.zeros(())))[0].numpy() - expected).max() < 5e-6
 
 
-def test_an_open_jaw_opens_the_lips_and_leaves_the_forehead(model):
-    face = model.neutral()
-    joints = face.joints.clone()
-    joints[0, model.free_joint_names.index("jaw"), 0] = 0.3
-    moved = (model(replace(face, joints=joints)) - model(face))[0]
-    marks = model.landmarks["mediapipe"].positions(moved, model.faces)
-    assert marks[14, 1] < -0.015  # the lower lip goes down
-    assert marks[[13, 10, 4], 1].abs().max() < 0.002
-
-
 def test_it_is_posed_by_number_on_the_command_line(model):
     face = model.neutral(2)
     posed = with_expression(face, model, ("jaw_x=0.3", "expression_003=-1.5"))

@@ -177,6 +177,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], TrainSetting
     return found
 
 
+@pytest.mark.unchecked
 def test_train_takes_the_split_by_name(
     first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -195,6 +196,7 @@ def test_train_takes_the_split_by_name(
     assert asked.pop() == (names, settings)
 
 
+@pytest.mark.unchecked
 def test_train_refuses_what_does_not_fit(
     first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,6 +214,7 @@ def test_train_refuses_what_does_not_fit(
     assert not asked
 
 
+@pytest.mark.unchecked
 def test_train_takes_the_benchmark_s_split_by_name(
     first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,6 +230,7 @@ def test_train_takes_the_benchmark_s_split_by_name(
     assert "needs several sequences" in capsys.readouterr().err
 
 
+@pytest.mark.unchecked
 def test_other_commands_and_splits_say_where_it_belongs(
     first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,6 +245,7 @@ def test_other_commands_and_splits_say_where_it_belongs(
         assert words in told
 
 
+@pytest.mark.unchecked
 def test_doubled_holding_out_is_told_before_training(
     first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -251,6 +256,7 @@ def test_doubled_holding_out_is_told_before_training(
     assert "warning" not in capsys.readouterr().err
 
 
+@pytest.mark.unchecked
 def test_free_drives_the_avatars_of_others(first: Path, tmp_path: Path) -> None:
     root = subject(first, tmp_path / "304", FOLDERS[8:])
     assert [folder.name for folder in driver_folders([root], driving_sequences)] == ["FREE"]

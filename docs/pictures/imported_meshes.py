@@ -64,7 +64,7 @@ def main() -> None:
         matrix[:2] *= ENLARGED
     columns = []
     with tempfile.TemporaryDirectory() as name:
-        scene = dataset_scene.make_scene(load_face_model("anny"), Path(name))
+        scene = dataset_scene.drawn_person()
         with (
             mock.patch.object(matting, "fill_mattes", not_white),
             mock.patch.object(sequences, "detected_landmarks", lambda images: writers.nerface_landmarks(scene, images)),
