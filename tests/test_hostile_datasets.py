@@ -1,7 +1,6 @@
 """Hostile files in datasets: pickles that would run code, archives that unpack to gigabytes, links, odd numbers."""
 
 import io
-import os
 import pickle
 import zipfile
 from pathlib import Path
@@ -11,21 +10,12 @@ import numpy as np
 import pytest
 
 from dataset_writers import npz, write_frame
+from fuzzing.dataset_faults import RunsCode
 from mien.datasets.arrays import read_npy, read_some_arrays
 from mien.datasets.content import inner, numbers, read_object
 from mien.datasets.metrical_tracker import read_tracker_frames
 from mien.errors import UserError
 from toy_scene import toy_face_model
-
-
-class RunsCode:
-    """A value whose pickle makes a folder when it is read."""
-
-    def __init__(self, place: Path) -> None:
-        self.place = place
-
-    def __reduce__(self) -> tuple:
-        return os.mkdir, (str(self.place),)
 
 
 def frame() -> dict[str, dict[str, np.ndarray]]:

@@ -23,7 +23,7 @@ from mien.inside import check_tree, inside, is_plain_name, open_new, remove_tree
 from mien.tracking import read_scoring, read_tracking
 from mien.training import read_run_config
 from mien.workspace import Workspace, check_new_workspace, open_workspace
-from toy_workspace import write_evaluated_workspace
+from shared_things import MadeOnce, evaluated_workspace
 
 COMMANDS = (
     "render W --out OUT/a.png --size 32",
@@ -58,9 +58,9 @@ FILES = (
 NOT_ONE_LINE = "a\nb"
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_evaluated_workspace(tmp_path_factory.mktemp("made") / "w")
+@pytest.fixture
+def made(made_once: MadeOnce) -> Path:
+    return evaluated_workspace(made_once)
 
 
 @pytest.fixture

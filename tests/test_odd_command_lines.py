@@ -15,17 +15,17 @@ from mien.commands.stages.names import doubled_videos
 from mien.errors import UserError
 from mien.tracking import TrackingSettings, read_tracking
 from mien.workspace import Workspace
-from toy_workspace import write_toy_workspace
+from shared_things import MadeOnce, toy_workspace
 
 CAMERA = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
 SKEWED = {**CAMERA, "viewmat": (2 * np.eye(4)).tolist()}
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory: pytest.TempPathFactory, made_once: MadeOnce) -> Path:
     """Return a folder with a space and an umlaut in its name, a workspace W, and odd files."""
     place = tmp_path_factory.mktemp("Köpfe und Leute")
-    write_toy_workspace(place / "W")
+    shutil.copytree(toy_workspace(made_once), place / "W")
     for name in ("empty.csv", "empty.json", "empty.mp4"):
         (place / name).write_bytes(b"")
     (place / "text.txt").write_text("Dear reader")
@@ -157,7 +157,7 @@ def test_a_current_tracking_is_said(
     monkeypatch.chdir(place)
     current = {"clip": read_tracking(place / "W/sequences/clip/tracking")}
     monkeypatch.setattr("mien.commands.stages.tracking._current_trackings", lambda *_, **__: current)
-    monkeypatch.setattr("mien.commands.stages.tracking._show_tracking", lambda *_: None)
+    monkeypatch.setattr("mien.commands.stages.tracking.show_tracking", lambda *_: None)
     assert main(["track", "W"]) == 0
     assert "clip: the tracking is current, nothing to do" in capsys.readouterr().err
 

@@ -55,7 +55,7 @@ SMALL_PICKLES = {
     "nested lists": b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b".",
     "a stack that is empty": b"0.",
     "a mark that is missing": b"t.",
-    "marks": b"(" * 10**6 + b".",
+    "marks": b"(" * 10**5 + b".",
     "a persistent name": b"Pname\n.",
     "an extension": b"\x82\x01.",
     "a cycle": b"}(X\x01\x00\x00\x00fca\nb\n)\x81q\x01}X\x01\x00\x00\x00xh\x01sbu.",

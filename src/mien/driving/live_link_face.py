@@ -51,7 +51,7 @@ _MAX_HEADER = 65_536
 """Largest number of characters of the first line that decide what separates the columns."""
 _MAX_LINE = 1 << 20
 """Most characters of a line."""
-_CELL_BYTES, _SHORT_CELL_BYTES, _MAX_CELLS_BYTES = 72, 8, 5 << 28
+_CELL_BYTES, _SHORT_CELL_BYTES, MAX_CELLS_BYTES = 72, 8, 5 << 28
 """Memory that the text of a value takes, also of one character, and most memory that all may take."""
 _SIDES = ("Left", "Right")
 _ANGLES = {name.lower() for name in (*HEAD, *EYES)}
@@ -158,7 +158,7 @@ def _bounded(rows: Iterable[list[str]]) -> Iterator[list[str]]:
     for row in rows:
         # Texts of one character take no memory of their own.
         taken += len(row) * (_CELL_BYTES if sum(map(len, row)) > len(row) else _SHORT_CELL_BYTES)
-        if taken > _MAX_CELLS_BYTES:
+        if taken > MAX_CELLS_BYTES:
             raise ValueError("it has too many values; cut it into shorter recordings")
         yield row
 
