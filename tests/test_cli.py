@@ -153,7 +153,6 @@ def test_wrong_arguments_are_told_in_one_line(
 
 
 def test_missing_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A missing video is named, and nothing is written."""
     message = complaint(capsys, "create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out"))
     assert "none.mp4" in message
     assert not (tmp_path / "out").exists()
@@ -188,7 +187,6 @@ def test_bad_driver_and_bad_colour_are_refused_before_any_work(
 
 
 def test_video_without_a_face(faceless_video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A video without a face is refused by name."""
     message = complaint(capsys, "create", str(faceless_video), "--out", str(tmp_path / "out"))
     assert "wall.mp4" in message
     assert "face" in message
@@ -203,7 +201,6 @@ def test_workspace_that_is_not_there(command: str, tmp_path: Path, capsys: pytes
 
 
 def test_damaged_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A damaged capture is named with the command that makes it again."""
     capture = tmp_path / "out" / "sequences" / "clip" / "capture"
     capture.mkdir(parents=True)
     (capture / "capture.json").write_text('{"format": "mien.capture", "ver')

@@ -67,7 +67,6 @@ def test_the_same_command_finds_everything_done(workspace: Path, fork_server: Fo
 
 
 def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
-    """The avatar can be exported, rendered and driven in every way."""
     avatar = str(workspace)
     assert main(["export", avatar, "--out", str(tmp_path / "open.ply"), "--set", "jawOpen=0.6"]) == 0
     assert len(read_ply(tmp_path / "open.ply")) > 1000
@@ -92,7 +91,6 @@ def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
 
 
 def test_bad_requests_to_an_avatar(workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Bad requests to an avatar are refused with the value, and nothing is written."""
     for arguments, part in (
         (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawopen=1"], "no expression 'jawopen'"),
         (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawOpen=wide"], "is not a number"),

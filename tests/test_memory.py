@@ -103,7 +103,6 @@ def test_few_pictures_stay_in_memory_and_many_are_the_same(tmp_path: Path, monke
 
 @pytest.mark.unchecked
 def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tracking reads a bounded number of frames at once, and finds the same result."""
     case = make_tracking_case(timesteps=24)
     model = make_small_face_model()
     expected = track(case.capture, model)

@@ -61,7 +61,6 @@ def plain(face_clip: Path | None, tmp_path_factory: pytest.TempPathFactory) -> d
 
 @pytest.mark.unchecked
 def test_the_same_bytes_in_odd_places(plain: dict[str, str], face_clip: Path | None, tmp_path: Path) -> None:
-    """A run and a capture have the same bytes in every odd place."""
     place = tmp_path / "Köpfe & Gemälde" / "a place"
     place.mkdir(parents=True)
     arguments = [work_anywhere.__file__, str(place), *([] if face_clip is None else [str(face_clip)])]
@@ -72,10 +71,7 @@ def test_the_same_bytes_in_odd_places(plain: dict[str, str], face_clip: Path | N
 
 
 def test_the_environment_starts_in_any_locale() -> None:
-    """The environment starts in any locale.
-
-    An absolute path with an umlaut in a .pth file would stop it under LC_ALL=C.
-    """
+    # An absolute path with an umlaut in a .pth file would stop it under LC_ALL=C.
     for path in Path(str(distribution("mien").locate_file(""))).glob("*mien*.pth"):
         assert path.read_bytes().isascii(), f"{path}: run `make setup`"
     assert run_python(["-c", "import mien; print(mien.__version__)"], {"LC_ALL": "C"}).strip() == mien.__version__

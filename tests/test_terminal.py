@@ -54,18 +54,17 @@ def test_messages_and_bars_are_harmless(
     assert out == "name: " + SHOWN.replace(r"\n", "\n") + "\n"
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["capture", NASTY, "--out", "out"],
-        [NASTY],
-        ["capture", "--out", NASTY, NASTY, "--bogus", NASTY],
-        ["capture", "a.mp4", "--out", "out", "--capture.turn", NASTY],
-        ["render", NASTY, "--out", NASTY],
-        ["face-models", "--bake", NASTY],
-    ],
-    ids=["missing", "command", "option", "choice", "workspace", "model"],
-)
+COMPLAINTS = {
+    "missing": ["capture", NASTY, "--out", "out"],
+    "command": [NASTY],
+    "option": ["capture", "--out", NASTY, NASTY, "--bogus", NASTY],
+    "choice": ["capture", "a.mp4", "--out", "out", "--capture.turn", NASTY],
+    "workspace": ["render", NASTY, "--out", NASTY],
+    "model": ["face-models", "--bake", NASTY],
+}
+
+
+@pytest.mark.parametrize("arguments", COMPLAINTS.values(), ids=COMPLAINTS)
 def test_complaints_are_one_harmless_line(
     arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -94,9 +93,6 @@ def test_a_bug_with_an_odd_name_is_written_down(
 def test_names_of_videos_become_names_of_folders() -> None:
     assert sequence_name(Path(NASTY.replace("/", "")), None) == "_[2J__[red]x[red][]:smile:___"
     assert sequence_name(Path("take:1.mp4"), None) == "take:1"
-
-
-# Outputs that are closed ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -161,9 +157,6 @@ def test_a_closed_output_is_not_taken_by_the_next_file(tmp_path: Path) -> None:
     done = subprocess.run(["bash", "-c", f"'{sys.executable}' -c \"{code}\" '{path}' >&- 2>&- <&-"], check=False)
     assert done.returncode == 0
     assert path.read_bytes() == b""
-
-
-# Threads --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_one_of_two_works_and_the_other_names_it_or_finds_all_done(
     of_analysis = ["--run", "alone", "--parts", "growth", "--out", str(out)]
     words, place, work = {
         "train": (["train", root, "--run", where, "--steps", "3", "--split", "tail", *RANK], where, "training: 3/3"),
-        "capture": (["capture", str(studio.video), *of_capture], "clip", "capture clip: 5/5"),
+        "capture": (["capture", str(studio.video), *of_capture], "clip", "find the face in pictures: 5/5"),
         "import": (["import", str(studio.avatar_folder), "--out", str(out)], "gaussian_avatars", "Gaussians on toy"),
         "analyze": (["analyze", "gaussian-avatars", root, *of_analysis], "out", "Look at"),
     }[kind]
