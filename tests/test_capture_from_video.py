@@ -121,7 +121,6 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
 
 
 def test_folder_of_images_in_natural_order(test_data, tmp_path):
-    """A folder of images is captured in natural order: 1, 2, 10."""
     folder = tmp_path / "pictures"
     folder.mkdir()
     face = cv2.resize(scan_texture(test_data), (128, 128), interpolation=cv2.INTER_AREA)
@@ -230,7 +229,6 @@ def test_detectors_say_nothing(face_clip, tmp_path, capfd):
 @pytest.mark.unchecked
 @pytest.mark.footage
 def test_real_clip(test_data, tmp_path):
-    """A real clip is captured with calm landmarks and a clean matte."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         capture = capture_video(
