@@ -8,8 +8,6 @@ import json
 import os
 import resource
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 from random import Random
@@ -21,8 +19,10 @@ from dataset_cases import LAYOUTS, Campaign, Outcome, make_quick
 from fuzzing.dataset_faults import KINDS, faulty_dataset
 from mien.errors import UserError
 
-CASES, FIRST = (int(os.environ.get(f"MIEN_DATASET_FUZZ{name}", default)) for name, default in (("", 60), ("_FROM", 0)))
-"""Number of cases of each layout, and the number of the first, to run some of them again."""
+pytestmark = pytest.mark.unchecked
+
+CASES, FIRST = (int(os.environ.get(f"MIEN_DATASET_FUZZ{name}", default)) for name, default in (("", 0), ("_FROM", 0)))
+"""Number of cases of each layout if it is not the usual one, and that of the first, to run some of them again."""
 _SHOWN = 20
 """Most findings that a failure lists."""
 
@@ -33,23 +33,24 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     make_quick(monkeypatch)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("cases", [6, pytest.param(60, marks=pytest.mark.long)])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_damage_is_told_in_one_line(
-    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    layout: str, cases: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     campaign, outcomes, start = Campaign(layout, tmp_path, capsys), {}, time.perf_counter()
-    for number in range(FIRST, FIRST + CASES):
+    cases = CASES or cases
+    for number in range(FIRST, FIRST + cases):
         outcomes[number] = campaign.run(number)
     findings = [f"{number} ({each.fault}): {each.wrong}" for number, each in outcomes.items() if each.wrong]
     _count(layout, list(outcomes.values()), len(findings), time.perf_counter() - start)
     again = "MIEN_DATASET_FUZZ=1 MIEN_DATASET_FUZZ_FROM=<number> repeats one"
-    assert not findings, "\n".join([f"{layout}: {len(findings)} of {CASES} ({again})", *findings[:_SHOWN]])
+    assert not findings, "\n".join([f"{layout}: {len(findings)} of {cases} ({again})", *findings[:_SHOWN]])
     refused = sum(bool(each.complaint) for each in outcomes.values())
-    assert CASES < 20 or refused > CASES / 5, "faults that nobody notices"
+    assert cases < 20 or refused > cases / 5, "faults that nobody notices"
 
 
 def _count(layout: str, outcomes: list[Outcome], findings: int, seconds: float) -> None:
@@ -69,35 +70,30 @@ def _count(layout: str, outcomes: list[Outcome], findings: int, seconds: float) 
         stream.write(json.dumps(line) + "\n")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("kind", KINDS)
 def test_the_command_refuses_each_kind_of_fault(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A process of its own says what the functions say, in one line, and ends with 2. Nothing is left."""
+    """The command says what the functions say, in one line, and ends with 2. Nothing is left."""
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
-    campaign, root, canary, out = Campaign("vhap", tmp_path, capsys), *(tmp_path / name for name in ("a", "b", "out"))
-    complaint, number = "", 0
-    while not complaint:  # some faults do no harm
-        for place in (root, tmp_path / "a-aside", canary):
-            shutil.rmtree(place, ignore_errors=True)
-        shutil.copytree(campaign.material, root)
-        canary.mkdir()
-        (canary / "file").write_text("a secret")
-        faulty_dataset(root, canary, Random(number), kind)
-        number += 1
-        try:
-            campaign.use(root, "tiny", tmp_path / f"out{number}", retrack=False)
-        except UserError as error:
-            complaint = str(error)
-    before = tree_bytes(canary)
-    line = ["-m", "mien.cli", "import", str(root), "--out", str(out), "--face-model", "tiny"]
-    done = subprocess.run([sys.executable, *line], capture_output=True, text=True, check=False)
-    assert done.returncode == 2, done.stderr
-    told = [each for each in done.stderr.splitlines() if each.startswith("mien: ")]
-    assert len(told) == 1, done.stderr
-    assert complaint == told[0].removeprefix("mien: ") or "is no dataset" in complaint
-    assert "Traceback" not in done.stderr
-    assert not list(out.glob("sequences/*"))
-    assert tree_bytes(canary) == before
+    campaign, root, canary = Campaign("vhap", tmp_path, capsys), tmp_path / "a", tmp_path / "b"
+    for kind in KINDS:
+        complaint, number = "", 0
+        while not complaint:  # some faults do no harm
+            for place in (root, tmp_path / "a-aside", canary):
+                shutil.rmtree(place, ignore_errors=True)
+            shutil.copytree(campaign.material, root)
+            canary.mkdir()
+            (canary / "file").write_text("a secret")
+            faulty_dataset(root, canary, Random(number), kind)
+            number += 1
+            try:
+                campaign.use(root, "tiny", tmp_path / f"{kind}{number}", retrack=False)
+            except UserError as error:
+                complaint = str(error)
+        before, out = tree_bytes(canary), tmp_path / f"{kind} by the command"
+        told = campaign.complaint_of(["import", str(root), "--out", str(out), "--face-model", "tiny"])
+        assert complaint == told or "is no dataset" in complaint
+        assert told
+        assert not list(out.glob("sequences/*"))
+        assert tree_bytes(canary) == before

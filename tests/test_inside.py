@@ -22,6 +22,7 @@ from plain_settings import plain_config, plain_gaussian_avatars, plain_run
 from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_face, toy_sequence
 
+pytestmark = pytest.mark.unchecked
 SETTINGS = plain_run(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)
 
 

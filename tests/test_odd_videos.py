@@ -24,6 +24,7 @@ from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from test_handed_in_pictures import png
 
+pytestmark = pytest.mark.unchecked
 NAMES = (
     "take:1.mp4", "http:x.mp4", "%03d.mp4", "-x.mp4", "a\nb.mp4", "q\"'.mp4", "ü.mp4", "\x1b[2J.mp4", "[red].mp4",
     "glob*?{1,2}.mp4", "concat:a.mp4", "pipe:0", "file:", os.fsdecode(b"bad\xff.mp4"),
