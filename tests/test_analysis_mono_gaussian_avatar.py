@@ -12,7 +12,6 @@ import torch
 import train_toy
 from mien.avatar import Avatar, load_avatar
 from mien.cli import main
-from mien.lab.analysis import ANALYSES
 from mien.lab.analysis.mono_gaussian_avatar import compared, times
 from mien.lab.analysis.mono_gaussian_avatar import convergence as parts_of_convergence
 from mien.lab.analysis.mono_gaussian_avatar.compared import scale_gain
@@ -23,6 +22,7 @@ from plain_settings import plain_mono_gaussian_avatar
 from toy_scene import toy_sequence
 from toy_workspace import write_toy_workspace
 
+pytestmark = pytest.mark.unchecked
 CONFIG = plain_mono_gaussian_avatar(points=60, max_points=120, epochs=10)
 
 
@@ -37,7 +37,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def workspace(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(times, "_SIDE", 16)
+    monkeypatch.setattr(times, "SIDE", 16)
     return Path(shutil.copytree(toy, tmp_path / "W"))
 
 
@@ -94,7 +94,7 @@ def test_convergence_trains_as_the_run_did(tmp_path: Path, monkeypatch: pytest.M
         seen.append({name: tensor.clone() for name, tensor in avatar.state_dict().items()})
         return torch.full((32, 32, 3), 0.5)
 
-    monkeypatch.setattr(parts_of_convergence, "_drawn", drawn)
+    monkeypatch.setattr(parts_of_convergence, "drawn", drawn)
     analyze(tmp_path / "W", "--parts", "convergence", "--steps", str(train_toy.SETTINGS.steps))
     trained = load_avatar(tmp_path / "W" / "runs" / "toy").state_dict()
     assert trained.keys() == seen[-1].keys()
@@ -147,8 +147,3 @@ def test_subsets_are_chosen_among_the_frames_of_the_training() -> None:
     assert mask.nonzero()[:, 0].tolist() == [0, 3]
     full = ranges(found, list(range(8)))
     assert full["expression_spread"] == pytest.approx(1)
-
-
-def test_parts_with_trainings_run_only_if_asked_for() -> None:
-    trainings = {part.name: part.trainings for part in ANALYSES["mono-gaussian-avatar"].parts}
-    assert trainings == {"times": 0, "convergence": 1, "resolutions": 2, "diversity": 3}

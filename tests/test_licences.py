@@ -63,13 +63,8 @@ def test_every_package_is_named_with_what_brings_it(capsys: pytest.CaptureFixtur
     parts = {each["name"]: each for each in listed["parts"]}
     assert parts["x264 and x265"]["licence"] == "GPL-2.0-or-later"
     assert "pip install --no-binary av av" in parts["x264 and x265"]["meaning"]
-
-
-def test_the_table_names_versions_licences_and_meanings(capsys: pytest.CaptureFixture[str]):
     assert main(["licenses"]) == 0
-    shown = capsys.readouterr().out
-    assert "GPL-2.0-or-later" in shown
-    assert "keep its notices when you pass it on" in shown
+    assert "keep its notices when you pass it on" in capsys.readouterr().out
 
 
 def test_the_list_is_that_of_pip_licenses(capsys: pytest.CaptureFixture[str]):

@@ -19,7 +19,7 @@ CHANNELS = {"lpips-alex": (64, 192, 384, 256, 256), "lpips-vgg": (64, 128, 256, 
 COMPARED = {"lpips-alex": (1, 4, 7, 9, 11), "lpips-vgg": (3, 8, 15, 22, 29)}
 """The layers of torchvision's networks whose maps LPIPS compares. Of VGG16 they are relu1_2, relu2_2, relu3_3, relu4_3
 and relu5_3."""
-TRUNKS = {trunk.backbone: trunk for trunk in lpips._TRUNKS}
+TRUNKS = {trunk.backbone: trunk for trunk in lpips.TRUNKS}
 
 
 def _trunk(backbone: str) -> nn.Sequential:
@@ -96,16 +96,16 @@ def test_other_files_are_refused(files: tuple[Path, Path], tmp_path: Path) -> No
     with pytest.raises(UserError, match="no such file"):
         lpips.load_lpips(tmp_path / "none.pth")
     with pytest.raises(UserError, match=r"damaged weights .*lpips==0\.1\.4"):
-        lpips.build_lpips(lpips._TRUNKS[1], *files)
+        lpips.build_lpips(lpips.TRUNKS[1], *files)
     (tmp_path / "bad.pth").write_bytes(b"no weights")
     with pytest.raises(UserError, match="damaged weights"):
-        lpips.build_lpips(lpips._TRUNKS[0], tmp_path / "bad.pth", files[1])
+        lpips.build_lpips(lpips.TRUNKS[0], tmp_path / "bad.pth", files[1])
 
 
 @pytest.fixture
 def exact(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
     """Take the random trunk for the published one."""
-    metric = lpips.build_lpips(lpips._TRUNKS[0], *files)
+    metric = lpips.build_lpips(lpips.TRUNKS[0], *files)
     monkeypatch.setattr(scoring, "load_lpips", lambda path: metric)
     return files[0]
 

@@ -88,13 +88,13 @@ def test_st_lpips_orders_small_shift_below_blur(test_data) -> None:
 def test_first_map_in_one_step_equals_two(size: tuple[int, int]) -> None:
     metric = load_perceptual()
     values = torch.randn(1, 3, *size, generator=torch.Generator().manual_seed(1))
-    two_steps = distance._halve(metric._convolve(0, values, padding=2))
-    torch.testing.assert_close(metric._first_map(values), two_steps, atol=2e-5, rtol=1e-4)
+    two_steps = distance.halve(metric.convolve(0, values, padding=2))
+    torch.testing.assert_close(metric.first_map(values), two_steps, atol=2e-5, rtol=1e-4)
 
 
 def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path) -> None:
     load_perceptual.cache_clear()
-    monkeypatch.setattr(weights, "_PACKAGE", "no_such_package_here")
+    monkeypatch.setattr(weights, "PACKAGE", "no_such_package_here")
     with pytest.raises(UserError, match="pip install stlpips-pytorch"):
         load_perceptual()
     path = tmp_path / "alex.pth"

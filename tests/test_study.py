@@ -23,6 +23,7 @@ from mien.training import read_sequence, train
 from toy_workspace import write_toy_workspace
 from web_case import browse, chromium, node, violations
 
+pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
 RUNS = ("headgas", "begun", "toy")
 SIDE = 64
 
@@ -293,7 +294,6 @@ SAVE = """(async () => {
 })()"""
 
 
-@pytest.mark.slow
 def test_a_participant_answers_in_a_real_browser(
     page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -332,7 +332,6 @@ def test_a_participant_answers_in_a_real_browser(
     assert runs["begun"]["expression"]["percent"] == 100
 
 
-@pytest.mark.slow
 def test_participants_see_different_orders(page: Path) -> None:
     node()
     chromium()
@@ -347,7 +346,6 @@ def test_participants_see_different_orders(page: Path) -> None:
 STARTED = 'document.getElementById("start").click();'
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("first", ["", STARTED])
 def test_everybody_can_take_part(page: Path, first: str) -> None:
     """axe-core finds no fault in the words before the study, nor beside a clip."""

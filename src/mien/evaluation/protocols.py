@@ -169,7 +169,7 @@ def evaluate_frames(
         return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
-        jobs = _drawn(experiment, [frame for frame in frames if frame not in done], subjects, baselines, fitted)
+        jobs = drawn_frames(experiment, [frame for frame in frames if frame not in done], subjects, baselines, fitted)
         for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:
@@ -187,7 +187,7 @@ def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
     return scores.keys() - {UNCLOTHED} == subjects and all(row.keys() >= _ALWAYS for row in scores.values())
 
 
-def _drawn(
+def drawn_frames(
     experiment: Experiment,
     frames: list[Frame],
     subjects: set[str],

@@ -46,11 +46,11 @@ class PerceptualDistance(nn.Module):
         assert min(image.shape[:2]) >= MIN_SIDE, f"{tuple(image.shape)} is too small to compare"
         values = ((image.permute(2, 0, 1)[None] * 2 - 1) - self.shift) / self.scale
         # Work in place if possible, because large new buffers cost as much as the arithmetic on them.
-        maps = [self._first_map(values).relu_()]
-        maps.append(self._convolve(1, _pool(maps[-1]), padding=2).relu_())
-        maps.append(self._convolve(2, _pool(maps[-1]), padding=1).relu_())
-        maps.append(self._convolve(3, maps[-1], padding=1).relu_())
-        maps.append(self._convolve(4, maps[-1], padding=1).relu_())
+        maps = [self.first_map(values).relu_()]
+        maps.append(self.convolve(1, _pool(maps[-1]), padding=2).relu_())
+        maps.append(self.convolve(2, _pool(maps[-1]), padding=1).relu_())
+        maps.append(self.convolve(3, maps[-1], padding=1).relu_())
+        maps.append(self.convolve(4, maps[-1], padding=1).relu_())
         return [m.div_(torch.linalg.vector_norm(m, dim=1, keepdim=True).add_(1e-10))[0] for m in maps]
 
     def between(self, first: list[Float[Tensor, "_ _ _"]], second: list[Float[Tensor, "_ _ _"]]) -> float:
@@ -66,15 +66,15 @@ class PerceptualDistance(nn.Module):
         """The distance between two images in 0..1."""
         return self.between(self.features(image), self.features(target))
 
-    def _first_map(self, values: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "1 c y x"]:
-        """`_halve` of the first convolution at a fifth of its cost: inside the picture, both are one convolution.
+    def first_map(self, values: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "1 c y x"]:
+        """`halve` of the first convolution at a fifth of its cost: inside the picture, both are one convolution.
 
         Mirroring at the border is not a convolution. At the top and left it repeats the next sample. At the bottom and
         right, the two steps are done one after the other on narrow strips.
         """
 
         def stepwise(strip: Tensor) -> Tensor:
-            return _halve(self._convolve(0, strip, padding=2))
+            return halve(self.convolve(0, strip, padding=2))
 
         weight = torch.nn.functional.conv2d(self.weight0.flatten(0, 1)[:, None], _BLUR.to(values), padding=2)
         weight = weight.reshape(*self.weight0.shape[:2], *weight.shape[-2:])
@@ -84,12 +84,13 @@ class PerceptualDistance(nn.Module):
         middle = torch.cat([inside[..., :1], inside, right], dim=3)
         return torch.cat([middle[:, :, :1], middle, stepwise(values[:, :, -height:])[:, :, -1:]], dim=2)
 
-    def _convolve(self, index: int, values: Tensor, padding: int) -> Tensor:
+    def convolve(self, index: int, values: Tensor, padding: int) -> Tensor:
+        """Apply a convolution of the network."""
         weight, bias = getattr(self, f"weight{index}"), getattr(self, f"bias{index}")
         return torch.nn.functional.conv2d(values, weight, bias, padding=padding)
 
 
-def _halve(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
+def halve(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
     """Blur by (1, 2, 1) / 4 in both directions and keep every second sample. The border is mirrored by two samples."""
     channels = values.shape[1]
     kernel = _BLUR.to(values).expand(channels, 1, 3, 3)
@@ -98,12 +99,12 @@ def _halve(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
 
 
 def _pool(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
-    """Anti-aliased pooling: the maximum over 3x3 at every pixel, then `_halve`."""
+    """Anti-aliased pooling: the maximum over 3x3 at every pixel, then `halve`."""
     # This is five times as fast as max_pool2d with stride 1 on a CPU.
     rows = torch.maximum(values[:, :, :-2], values[:, :, 1:-1])
     torch.maximum(rows, values[:, :, 2:], out=rows)
     largest = torch.maximum(rows[..., :-2], rows[..., 1:-1])
-    return _halve(torch.maximum(largest, rows[..., 2:], out=largest))
+    return halve(torch.maximum(largest, rows[..., 2:], out=largest))
 
 
 @lru_cache(maxsize=1)

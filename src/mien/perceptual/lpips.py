@@ -42,7 +42,7 @@ class _Trunk:
     """Side of the pooling between blocks, whose stride is 2."""
 
 
-_TRUNKS = (
+TRUNKS = (
     _Trunk(
         "lpips-alex", "alexnet-owt-7be5be79.pth", "7be5be79", "weights/v0.1/alex.pth",
         (((0, 4, 2),), ((3, 1, 2),), ((6, 1, 1),), ((8, 1, 1),), ((10, 1, 1),)), 3,
@@ -100,11 +100,11 @@ def load_lpips(path: Path) -> Lpips:
         UserError: the file is another one than torchvision published, so that figures would not be those of papers, or
             the package with the factors is not installed.
     """
-    known = " or ".join(trunk.file for trunk in _TRUNKS)
+    known = " or ".join(trunk.file for trunk in TRUNKS)
     if not path.is_file():
         raise UserError(f"--lpips-weights {path}: no such file; give torchvision's {known}")
     digest = file_digest(path)
-    trunk = next((each for each in _TRUNKS if digest.startswith(each.sha256)), None)
+    trunk = next((each for each in TRUNKS if digest.startswith(each.sha256)), None)
     if trunk is None:
         raise UserError(f"--lpips-weights {path}: is not the file that torchvision published; give {known}")
     return build_lpips(trunk, path, _heads(trunk))

@@ -18,7 +18,7 @@ _WEIGHTS = {
     "st-lpips-alex": "weights/vST0.0/alex_shift_tolerant.pth",
     "st-lpips-vgg": "weights/vST0.0/vgg_shift_tolerant.pth",
 }
-_PACKAGE = "stlpips_pytorch"
+PACKAGE = "stlpips_pytorch"
 Built = TypeVar("Built")
 
 
@@ -44,7 +44,7 @@ def weights_path(name: str) -> Path:
     Raises:
         UserError: the package is not installed.
     """
-    spec = importlib.util.find_spec(_PACKAGE)
+    spec = importlib.util.find_spec(PACKAGE)
     folders = spec.submodule_search_locations if spec is not None else None
     if not folders:
         raise UserError("no perceptual weights: install them with: pip install stlpips-pytorch==0.0.2")

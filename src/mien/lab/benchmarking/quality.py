@@ -65,7 +65,7 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
     placed = np.full((len(expected), expected.shape[2], 3), np.nan, np.float32)
     for timestep in timesteps:
         vertices = face_model(tracking.face[timestep])[0]
-        visible = _visible(truth, face_model, timestep)
+        visible = visible_vertices(truth, face_model, timestep)
         rigid = len(tracking.cameras) > 1
         vertex.append(aligned_distance(vertices[index].numpy()[visible], truth.vertices[timestep][visible], rigid))
         points = face_model.landmark_positions(vertices, "mediapipe")
@@ -107,7 +107,7 @@ def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray,
     return float(np.linalg.norm((1.0 if rigid else scale) * a @ rotation.T - b, axis=-1).mean())
 
 
-def _visible(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndarray, " n"]:
+def visible_vertices(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndarray, " n"]:
     """Mark the region's vertices that face any camera."""
     index, faces = truth.vertex_index, face_model.faces.numpy()
     place = np.full(len(face_model.template), -1)

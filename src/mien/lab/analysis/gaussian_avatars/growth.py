@@ -96,7 +96,7 @@ def _charts(
         (Series("single steps", steps, _without_outliers(times), "quiet"), _medians("median", steps, times)),
         Axes("step", "ms", from_zero=True),
     )
-    x, y = _binned(gaussians, times)
+    x, y = binned(gaussians, times)
     reach = max(10.0, float(gaussians.max()) / max(start[0], 1))
     line = np.array([1.0, reach])
     relative = Chart(
@@ -142,7 +142,7 @@ def _medians(label: str, x: np.ndarray, y: np.ndarray) -> Series:
     )
 
 
-def _binned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def binned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The medians of x and y in bins of x."""
     edges = np.linspace(x.min(), x.max(), _BINS + 1)
     bins = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _BINS - 1)

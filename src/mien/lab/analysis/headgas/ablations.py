@@ -31,7 +31,7 @@ PAPER: dict[str, tuple[str, int | None, float | None, float]] = {
     "full": ("full", 28_000, 4.0, 32.50),
 }
 """Variant -> its name, and Gaussians, milliseconds of a frame and PSNR in the paper, in the order of its Table 1."""
-_SIZE = 512
+SIZE = 512
 """Side of the pictures that are timed."""
 
 
@@ -62,7 +62,7 @@ def ablations(context: Context) -> PartResult:
         notes=(
             f"All trainings have the same data, settings, seed and {context.options.steps:,} steps, which shorten all "
             "schedules alike. The paper trains 50,000.",
-            f"A frame is posed at an expression in which no coefficient is 0 and drawn at {_SIZE}x{_SIZE}, at all "
+            f"A frame is posed at an expression in which no coefficient is 0 and drawn at {SIZE}x{SIZE}, at all "
             "threads, one variant after the other.",
             *notes,
         ),
@@ -81,7 +81,7 @@ def ablation_configs(config: HeadGasConfig) -> dict[str, HeadGasConfig]:
 
 
 def _row(context: Context, name: str, variant: Variant, metric: PerceptualDistance | None) -> dict[str, Any]:
-    camera, face = context.camera.fitted(_SIZE, _SIZE), busy_face(context)
+    camera, face = context.camera.fitted(SIZE, SIZE), busy_face(context)
     digest = file_digest(variant.run_dir / "avatar" / "avatar.safetensors")
     drawn = context.kept(
         f"ablation-{name.replace('_', '-')}",

@@ -107,13 +107,14 @@ def _snapshots(
             advance(state.step - before)
             progress = Progress(before, settings.steps, order.at(before)[1], data.extent, state.step - before)
             if progress.completes(steps):
-                pictures = [_drawn(state.avatar, experiment, frame, progress) for frame in frames]
+                pictures = [drawn(state.avatar, experiment, frame, progress) for frame in frames]
                 found.append((state.step, len(state.avatar.gaussian_store()), pictures))
     return found
 
 
 @torch.no_grad()
-def _drawn(avatar: Avatar, experiment: Experiment, frame: Frame, progress: Progress) -> torch.Tensor:
+def drawn(avatar: Avatar, experiment: Experiment, frame: Frame, progress: Progress) -> torch.Tensor:
+    """The avatar's picture of a frame, at this point of its training."""
     face = experiment.sequences[frame.sequence].tracking.face[frame.timestep]
     gaussians = avatar.pose(face, progress).gaussians.timestep(0)
     return rasterize(gaussians, experiment.camera(frame), torch.ones(3)).image

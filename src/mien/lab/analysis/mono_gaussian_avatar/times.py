@@ -15,13 +15,13 @@ PAPER = {
     "MonoGaussianAvatar": (9.0, 30.0),
 }
 """Hours of training and milliseconds of a frame on one GPU, in the paper's Table 4."""
-_SIDE = 512
+SIDE = 512
 
 
 def times(context: Context) -> PartResult:
     """Minutes of this run's training, and milliseconds of a frame with the networks and with the baked avatar."""
     machine, avatar = format_machine(measure_machine()), context.avatar
-    camera, digest = context.camera.fitted(_SIDE, _SIDE), file_digest(context.run_dir / "avatar" / "avatar.safetensors")
+    camera, digest = context.camera.fitted(SIDE, SIDE), file_digest(context.run_dir / "avatar" / "avatar.safetensors")
     rows = {}
     for name, training in (("networks", True), ("baked", False)):
         avatar.train(training)
@@ -56,7 +56,7 @@ def times(context: Context) -> PartResult:
         },
         (
             f"{count:,} Gaussians, {threads} of a CPU: training took {60 * hours:.1f} min, and a frame of the baked "
-            f"avatar takes {frames['baked']:.1f} ms at {_SIDE}x{_SIDE} (paper, on a GPU: 9 h and 30 ms).",
+            f"avatar takes {frames['baked']:.1f} ms at {SIDE}x{SIDE} (paper, on a GPU: 9 h and 30 ms).",
         ),
         (Table(("", "Training, h", "Frame, ms", "Posing, ms", "Drawing, ms"), tuple(cells), machine),),
         notes=(
