@@ -22,6 +22,8 @@ from mien.rotation import matrix_from_axis_angle
 from mien.tracking import write_tracking
 from plain_settings import plain_run
 
+pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
+
 
 def _face(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(478, 3)) * 50

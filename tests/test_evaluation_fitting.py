@@ -22,6 +22,7 @@ from mien.tracking import Scoring
 from plain_settings import plain_config
 from toy_workspace import write_toy_workspace
 
+pytestmark = pytest.mark.unchecked
 QUICK = EvaluationSettings(perceptual=False, video_frames=0, baselines=False, threads=1)
 FIT = replace(QUICK, fit_faces=True)
 
@@ -104,6 +105,7 @@ def test_the_third_figure_stands_beside_the_others_and_is_never_the_headline(tmp
     assert resumed.scores == scored.scores
 
 
+@pytest.mark.usefixtures("short_films")
 def test_the_command_adds_the_figure_only_if_it_is_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -123,10 +125,6 @@ def test_the_command_adds_the_figure_only_if_it_is_asked_for(
     assert [line for line in table.splitlines() if line.startswith("toy") and "fitted to the scored pictures" in line]
     assert main(command) == 0
     assert "fitted" not in (run_dir / "metrics.json").read_text()
-
-
-def test_wrong_numbers_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_toy_workspace(tmp_path / "W")
     for more, told in (
         (["--fit-faces", "--fit-steps", "0"], "--fit-steps 0: give a number from 1 to 10000"),
         (["--fit-faces", "--compare"], "--fit-faces: is for one run"),
@@ -134,17 +132,12 @@ def test_wrong_numbers_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert main(["evaluate", str(tmp_path / "W"), *more]) == 2
         assert told in capsys.readouterr().err
     with pytest.raises(UserError, match="--fit-steps 0: give a number from 1 to 10000"):
-        evaluate(tmp_path / "W/runs/toy", [tmp_path / "W/sequences/clip"], replace(FIT, fit_steps=0))
-
-
-def test_a_damaged_third_figure_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_toy_workspace(tmp_path / "W")
-    path = tmp_path / "W/runs/toy/metrics.json"
-    assert main(["evaluate", str(tmp_path / "W"), "--no-perceptual", "--fit-faces", "--fit-steps", "1"]) == 0
-    content = json.loads(path.read_text())
+        evaluate(run_dir, [tmp_path / "W/sequences/clip"], replace(FIT, fit_steps=0))
+    assert main([*command, "--fit-faces", "--fit-steps", "1"]) == 0
+    content = json.loads((run_dir / "metrics.json").read_text())
     del content["checksum"]
     next(iter(content["protocols"].values()))["fitted"]["psnr"] = "good"
-    path.write_text(json.dumps(content))
+    (run_dir / "metrics.json").write_text(json.dumps(content))
     capsys.readouterr()
     assert main(["evaluate", str(tmp_path / "W"), "--compare"]) == 2
     assert "metrics.json: incomplete or damaged" in capsys.readouterr().err
