@@ -112,6 +112,8 @@ class ForkServer:
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()
+        for stream in ("stdout", "stderr"):
+            (folder / stream).touch()
         request = {"function": function, "arguments": arguments, "cwd": str(cwd or Path.cwd()), "exits": exits}
         request |= {"env": {**os.environ, **(env or {})}, "folder": str(folder), "path": list(map(str, path))}
         assert self._server.stdin is not None

@@ -25,7 +25,7 @@ from mien.viewer import Session
 from shared_things import MadeOnce, toy_workspace
 from test_runtime import new_avatar
 from toy_scene import toy_camera, toy_sequence
-from web_case import told_by, until
+from web_case import until
 
 
 @pytest.fixture
@@ -150,7 +150,7 @@ def test_a_browser_can_watch_a_training(tmp_path: Path, fork_server: ForkServer)
     environment = {"TMPDIR": str(tmp_path)}
     process = fork_server.call("test_live_view:watched_training", str(tmp_path / "run"), env=environment)
     try:
-        until(lambda: "Open http" in told_by(process) or process.poll() is not None)
+        until(lambda: "Open http" in process.stderr or process.poll() is not None)
         address = next(word for word in process.stderr.split() if word.startswith("http"))
         browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
         assert browser.open(address, timeout=60).status == 200

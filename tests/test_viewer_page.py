@@ -34,7 +34,7 @@ from mien.viewer.panel import filmed_from
 from mien.viewer.server import Serving
 from mien.viewer.session import Session
 from test_viewer import clip_of
-from web_case import browse, drawn_head, told_by, until
+from web_case import browse, drawn_head, until
 
 PROTOCOL = f"viser-v{viser.__version__}"
 PATIENCE_SECONDS = 60.0
@@ -264,7 +264,7 @@ def test_signals_end_the_command(number: signal.Signals, code: int, tmp_path: Pa
     runtime.write_portable(tmp_path / "a.mien", drawn_head(100))
     process = fork_server.mien("view", tmp_path / "a.mien")
     try:
-        until(lambda: "\n" in told_by(process))
+        until(lambda: "\n" in process.stderr)
         assert process.stderr.startswith("Open http://127.0.0.1:")
         address = process.stderr.split()[1]
         port = int(address.split(":")[2].partition("/")[0])

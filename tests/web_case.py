@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 import torch
 
-from forked import Forked
 from mien import runtime
 from mien.avatar import GaussianAvatars, HeadGas, HeadGasConfig, make_portable
 from mien.face import load_face_model
@@ -176,14 +175,6 @@ def until(done: Callable[[], bool]) -> None:
     while not done():
         assert time.monotonic() < ends, "it never came"
         time.sleep(0.01)
-
-
-def told_by(process: Forked) -> str:
-    """Return what a forked process has complained until now, which is nothing before it has begun."""
-    try:
-        return process.stderr
-    except FileNotFoundError:
-        return ""
 
 
 class _Quiet(SimpleHTTPRequestHandler):
