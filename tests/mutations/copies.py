@@ -20,8 +20,8 @@ _LIMIT_SECONDS = 900
 """Time for the tests of one mutation. A mutation that makes them run longer is caught."""
 _LEFT_OUT = "not committed and not fresh"
 """Tests that compare committed builds with the sources: they would catch every mutation of web/, whatever it does."""
-_NO_TESTS, _USAGE = 5, 4
-"""Exit codes of pytest if no test was found or the call is wrong."""
+_NO_TESTS, _USAGE, _INTERRUPTED = 5, 4, 2
+"""Exit codes of pytest if no test was found, the call is wrong, or a file of tests cannot be imported."""
 
 
 class MutationError(Exception):
@@ -82,8 +82,8 @@ class Workshop:
             path.write_text(sound, encoding="utf-8")
             if is_native:
                 self._build()
-        if code in (_NO_TESTS, _USAGE):
-            raise MutationError(f"{case.file}: its tests {' '.join(case.tests)} are not there")
+        if code in (_NO_TESTS, _USAGE, _INTERRUPTED):
+            raise MutationError(f"{case.file}: its tests {' '.join(case.tests)} cannot be run: {by}")
         return Verdict(case, code != 0, by)
 
     def _test(self, case: Case) -> tuple[int, str]:
