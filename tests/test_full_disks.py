@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from mien.cli import main
+from mien.export import write_glb
 from needs import NO_MOUNT
 from shared_things import MadeOnce, toy_workspace
 from test_bad_input import small_disk
@@ -44,6 +45,11 @@ def given(made_once: MadeOnce) -> Path:
         assert main(["export", str(folder / "W"), "--out", str(folder / "me.mien")]) == 0
 
     return made_once("given_to_full_disks", make)
+
+
+@pytest.fixture(autouse=True)
+def _small_textures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(write_glb, "__defaults__", (128,))  # the usual size takes ten seconds
 
 
 def line_of(name: str, given: Path, disk: Path) -> list[str]:
