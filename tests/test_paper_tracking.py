@@ -41,11 +41,13 @@ def by_descent(case: PhotometricCase) -> Tracking:
     return track(case.capture, case.model, replace(LANDMARKS, schedule="paper", paper=QUICK))
 
 
+@pytest.mark.unchecked
 def test_pixels_calm_what_landmarks_leave(case, by_landmarks, by_descent):
     assert wobble(case, by_descent) < 0.25 * wobble(case, by_landmarks)
     assert turn_error(case, by_descent) < 0.3
 
 
+@pytest.mark.unchecked
 def test_all_of_it_from_landmarks(case, by_landmarks):
     """The schedule is also better than landmarks if it starts from them alone."""
     settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
@@ -63,8 +65,8 @@ def test_the_first_frame_has_turns_until_it_no_longer_gets_better(case, monkeypa
         costs.append(next(given))
         return costs[-1]
 
-    monkeypatch.setattr(frames, "_turn_of_first", turn)
-    frames._fit_first(descent, descent.targets(0, 0), first_of_all=True)
+    monkeypatch.setattr(frames, "turn_of_first", turn)
+    frames.fit_first(descent, descent.targets(0, 0), first_of_all=True)
     assert costs == [100.0, 90.0, 80.0, 79.5]
 
 
@@ -72,8 +74,8 @@ def test_a_turn_of_the_first_frame_lowers_its_cost(case):
     settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
     descent = _descent(case, settings)
     targets = descent.targets(0, 0)
-    first = frames._turn_of_first(descent, targets, 20, appearance_first=True)
-    assert frames._turn_of_first(descent, targets, 20, appearance_first=False) < first
+    first = frames.turn_of_first(descent, targets, 20, appearance_first=True)
+    assert frames.turn_of_first(descent, targets, 20, appearance_first=False) < first
 
 
 def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
@@ -85,8 +87,8 @@ def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
     away = replace(camera, viewmat=_turned_away(camera.viewmat))
     monkeypatch.setattr(type(descent.scene), "camera", lambda _, __, index, focals: camera if index == 0 else away)
     monkeypatch.setattr(frames, "guess_texture", lambda _, one, *__: used.append(one.camera))
-    monkeypatch.setattr(frames, "_turn_of_first", lambda *_, **__: 1.0)
-    frames._fit_first(descent, [behind, target], first_of_all=True)
+    monkeypatch.setattr(frames, "turn_of_first", lambda *_, **__: 1.0)
+    frames.fit_first(descent, [behind, target], first_of_all=True)
     assert used == [0]
 
 
@@ -129,7 +131,7 @@ def test_the_frame_pass_can_be_smooth_in_both_directions(case):
     descent = _descent(case, settings)
     rows, start = descent.state.frames[0], descent.start[0]
     rows[:4] = descent.within(rows[:4] + 0.01)
-    around = frames._expected_around(descent, 0, 3)
+    around = frames.expected_around(descent, 0, 3)
     torch.testing.assert_close(around[:4], rows[:4])
     torch.testing.assert_close(around[4:], descent.within(rows[3] + start[4:] - start[3]))
     target = descent.targets(0, 3)
@@ -147,7 +149,7 @@ def test_smoothness_in_the_frame_pass_is_a_setting(case):
         descent = _descent(case, replace(LANDMARKS, schedule="paper", paper=replace(QUICK, pass_smoothness=smoothness)))
         rows = descent.state.frames[0]
         rows[3] = descent.within(rows[3] + 0.02)
-        frames._fit_row(descent, descent.targets(0, 3), 10)
+        frames.fit_row(descent, descent.targets(0, 3), 10)
         ends[smoothness] = rows[3].clone()
     steady = (_descent(case, LANDMARKS).state.frames[0][[2, 4]]).mean(0)
     alone, smooth = (float((end - steady)[:3].norm()) for end in ends.values())
@@ -167,6 +169,7 @@ def test_the_neck_has_no_column_of_its_own(case):
     assert not any("neck" in name for name in columns)
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize("size", [1024, 2048])
 def test_textures_may_be_as_large_as_those_of_published_trackers(case, size: int):
     settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, texture_size=size))
@@ -197,12 +200,14 @@ def _descent(case: PhotometricCase, settings: TrackingSettings) -> Descent:
     return descent
 
 
+@pytest.mark.unchecked
 def test_it_says_how_it_was_made(by_descent):
     assert by_descent.settings["schedule"] == "paper"
     assert by_descent.face.vertex_offsets is not None
     assert by_descent.face.vertex_offsets.norm(dim=1).max() < 0.005
 
 
+@pytest.mark.unchecked
 def test_the_same_with_any_number_of_threads(case, monkeypatch):
     """The number of threads does not change a bit."""
     several_frames = replace(TRACKING.descent, most_batches=2)
@@ -253,6 +258,7 @@ def test_adam_is_that_of_torch():
     torch.testing.assert_close(values, expected.detach(), atol=1e-6, rtol=0)
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize(("start", "interrupted_at"), [("landmarks", 3), ("fast", 2)])
 def test_an_interrupted_fit_goes_on(
     case, tmp_path, monkeypatch, start: Literal["fast", "landmarks"], interrupted_at: int
@@ -261,7 +267,7 @@ def test_an_interrupted_fit_goes_on(
     short = replace(QUICK, start=start, first_steps=10, steps=3, epochs=3)
     settings = replace(LANDMARKS, schedule="paper", paper=short)
     expected = track_subject([case.capture], case.model, settings)[0]
-    monkeypatch.setattr(resume, "_INTERVAL_SECONDS", 0.0)
+    monkeypatch.setattr(resume, "INTERVAL_SECONDS", 0.0)
     offer, offers = StageCache.offer, []
 
     def offer_then_stop(self: StageCache, name: str, make: Callable) -> None:

@@ -20,6 +20,8 @@ from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import PhotometricCase, assert_alike, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
 
+pytestmark = pytest.mark.unchecked
+
 LANDMARKS = TrackingSettings(schedule="landmarks")
 """Settings with an unknown focal length, because the held-out sequence must not decide it."""
 FAST = replace(
@@ -160,7 +162,7 @@ def test_an_interrupted_tracking_goes_on(
     case, shaping, apart, tracked, tmp_path, monkeypatch, capsys, pieces: int, last: str
 ):
     expected = [tracked("fast").shaping, tracked("fast").apart]
-    write, names = StageCache._write, []
+    write, names = StageCache.write, []
 
     def write_then_stop(self: StageCache, name: str, tensors: dict) -> None:
         write(self, name, tensors)
@@ -170,7 +172,7 @@ def test_an_interrupted_tracking_goes_on(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(StageCache, "_write", write_then_stop)
+        patched.setattr(StageCache, "write", write_then_stop)
         with pytest.raises(KeyboardInterrupt):
             track_subject([shaping], case.model, FAST, tmp_path / "kept", held_out=[apart.capture])
     assert names[-1] == last

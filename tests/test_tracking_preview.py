@@ -18,22 +18,24 @@ from mien.tracking.report import Preview, preview
 from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import FOCAL, assert_alike, make_photometric_case
 
+pytestmark = pytest.mark.unchecked
+
 FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1))
 
 
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
     """Collect stage, progress and height of every picture that is written."""
-    monkeypatch.setattr(preview, "_INTERVAL_SECONDS", 0.0)
-    monkeypatch.setattr(preview, "_MAX_SHARE", 1e9)
-    shown, with_header = [], Preview._with_header
+    monkeypatch.setattr(preview, "INTERVAL_SECONDS", 0.0)
+    monkeypatch.setattr(preview, "MAX_SHARE", 1e9)
+    shown, with_header = [], Preview.with_header
 
     def record(self: Preview, stage: str, progress: float) -> np.ndarray:
         picture = with_header(self, stage, progress)
         shown.append((stage, progress, len(picture)))
         return picture
 
-    monkeypatch.setattr(Preview, "_with_header", record)
+    monkeypatch.setattr(Preview, "with_header", record)
     return shown
 
 
@@ -81,8 +83,8 @@ def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
         drawn.append(fit)
         return np.zeros((10, 960, 3), np.uint8)
 
-    monkeypatch.setattr(Preview, "_draw", draw)
-    monkeypatch.setattr(Preview, "_write", lambda self, picture, last: written.append((now[0], last)))
+    monkeypatch.setattr(Preview, "draw", draw)
+    monkeypatch.setattr(Preview, "write", lambda self, picture, last: written.append((now[0], last)))
     case = make_photometric_case(timesteps=3)
     watch = watch_of(tmp_path, case.capture, case.model)
     for second in range(40):

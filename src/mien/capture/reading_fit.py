@@ -13,7 +13,7 @@ from mien.capture.readings import Reading
 _POINTS = (1, 4, 6, 168, 33, 133, 263, 362, 61, 291, 0, 17, 98, 327, 70, 300, 468, 473)
 """Landmarks that slide little along the face if it turns: nose, corners of eyes and mouth, lips, brows, irises."""
 _NOSE, _AROUND = 1, (33, 263, 61, 291)
-_INSIDE_OUT = -0.1
+INSIDE_OUT = -0.1
 """Height of the nose over the corners of eyes and mouth, in distances of the eyes, below which a face is concave. Two
 cameras nearly agree on such a face if they are read as mirrored in depth."""
 _MOST_TIMESTEPS = 24
@@ -95,7 +95,7 @@ def _fit(landmarks: Float[np.ndarray, "t c l 2"], boxes: Float[np.ndarray, "t c 
     distances = np.linalg.norm(missed[agrees], axis=-1)
     distances[~np.isfinite(distances)] = np.inf
     sides = np.sqrt(np.prod(boxes[..., 2:] - boxes[..., :2], axis=-1))[agrees]
-    if _height(around, agrees, cameras) < _INSIDE_OUT:
+    if _height(around, agrees, cameras) < INSIDE_OUT:
         return Ranked(reading, np.inf, np.inf)
     return Ranked(reading, float(np.median(distances)), float(np.median(distances / sides[:, None])))
 

@@ -121,10 +121,10 @@ class Command:
             frames = [sum(frames)]  # the cameras of one sequence
         scored = count_scored(frames, names, settings)
         several = self.calibration is not None
-        alignment = self.alignment if self._aligns(several) else None
+        alignment = self.alignment if self.aligns(several) else None
         return Overall(expected_pieces(frames, scored, self.tracking, settings, self.overlay, alignment))
 
-    def _aligns(self, several_cameras: bool) -> bool:
+    def aligns(self, several_cameras: bool) -> bool:
         """Whether new trackings are aligned."""
         auto = not several_cameras and not PRESETS[self.options.preset].published
         auto = auto and not self._too_short_to_align(self.options.settings().steps)
@@ -171,7 +171,7 @@ class Command:
                 f"{self.alignment.template_steps:,}; `--alignment.when always` aligns them"
             )
         # A run that goes on keeps its tracking.
-        if self._aligns(not one) and not is_trained_on(workspace, run, together):
+        if self.aligns(not one) and not is_trained_on(workspace, run, together):
             run_alignment_stage(workspace, together, self.alignment, settings, keep=True)
         show_trackings(workspace, list(trackings), self.overlay)
         run_training_stage(workspace, together, run, method, settings, self.view)

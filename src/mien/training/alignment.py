@@ -135,7 +135,7 @@ def align_faces(
 ) -> list[FaceParams]:
     """Return the face parameters of each sequence with which a fixed avatar looks most like the pictures.
 
-    Each timestep descends on its own on L1 and SSIM, for the same number of steps (`_Descent`). Timesteps in which
+    Each timestep descends on its own on L1 and SSIM, for the same number of steps (`FaceDescent`). Timesteps in which
     nothing was found, or in which a hand covers the face, get corrections from their neighbours.
 
     Args:
@@ -156,7 +156,7 @@ def align_faces(
     trained = {frame[:2] for frame in known}
     judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, TRAINING.aligned_judged)
     with one_torch_thread(), frozen(avatar):
-        descent = _Descent(_sizes([_Batch.of(part, track, targets) for part in _batches(judged)], avatar, track))
+        descent = FaceDescent(_sizes([_Batch.of(part, track, targets) for part in _batches(judged)], avatar, track))
         indices = [track.index_of(*timestep[:2]) for timestep in timesteps]
         done = _take_up(folder, track, indices)
         with progress("aligning frames", len(timesteps), done) as advance:
@@ -263,7 +263,7 @@ class _Batch:
 
 
 @dataclass(frozen=True, eq=False)
-class _Descent:
+class FaceDescent:
     """Steps along the gradient with momentum, in units of its usual size.
 
     Adam divides the gradient of a timestep by its own size, so that its first steps move every coefficient by the
@@ -287,7 +287,7 @@ class _Descent:
 
 
 def _sizes(batches: list[_Batch], avatar: Avatar, track: FaceTrack) -> dict[str, float]:
-    """`_Descent.sizes` at the present parameters of some batches."""
+    """`FaceDescent.sizes` at the present parameters of some batches."""
     found: dict[str, list[Tensor]] = {}
     for batch in batches:
         batch.find_gradients(avatar, track)

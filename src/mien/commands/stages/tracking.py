@@ -100,7 +100,7 @@ def run_tracking_stage(
         _write_masks(workspace, trackings, face_model, scoring)
         if show:
             for name, tracking in trackings.items():
-                _show_tracking(workspace.sequence_dir(name), tracking, face_model, overlay)
+                show_tracking(workspace.sequence_dir(name), tracking, face_model, overlay)
     return trackings
 
 
@@ -115,7 +115,7 @@ def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overla
     with hold(*lacking):
         for folder in lacking:
             tracking = read_tracking(folder / "tracking")
-            _show_tracking(folder, tracking, load_face_model(tracking.face_model), overlay)
+            show_tracking(folder, tracking, load_face_model(tracking.face_model), overlay)
 
 
 def check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
@@ -286,7 +286,7 @@ def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking])
         )
 
 
-def _show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, overlay: Overlay) -> None:
+def show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, overlay: Overlay) -> None:
     """Write the residual report and overlay.mp4, unless they are newer than the tracking."""
     reported, shown = _is_shown(folder, tracking, overlay)
     if reported and shown:

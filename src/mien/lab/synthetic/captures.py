@@ -135,7 +135,7 @@ def _is_current(folder: Path, inputs: str) -> bool:
 
 def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     (folder / _JSON).unlink(missing_ok=True)
-    store = _Pictures(folder / _WORK, scene.recipe, scene.timesteps)
+    store = Pictures(folder / _WORK, scene.recipe, scene.timesteps)
     store.resume(inputs)
     _draw_missing(scene, store, inputs)
     images, mattes = store.maps()
@@ -178,7 +178,7 @@ def _hash_content(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray)
 
 
 @dataclass(frozen=True)
-class _Pictures:
+class Pictures:
     """Raw frames and mattes of an unfinished drawing."""
 
     folder: Path
@@ -227,7 +227,7 @@ class _Pictures:
         return images, np.memmap(self.folder / "mattes.u8", np.uint8, "r", shape=self._shape)
 
 
-def _draw_missing(scene: SyntheticScene, store: _Pictures, inputs: str) -> None:
+def _draw_missing(scene: SyntheticScene, store: Pictures, inputs: str) -> None:
     total, done = scene.timesteps, store.done()
     with progress_bar(f"Drawing {scene.recipe.name}", total, done) as advance:
         drawn = scene.all_frames(range(done, total)) if done < total else iter(())

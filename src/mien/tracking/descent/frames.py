@@ -83,11 +83,11 @@ def fit_sequence(
     for row in range(max(descent.done - before, 0), len(rows)):
         targets = descent.targets(sequence, row)
         if row == 0 and not known_person:
-            _fit_first(descent, targets, first_of_all=sequence == 0)
+            fit_first(descent, targets, first_of_all=sequence == 0)
         else:
             if not known_person:
                 rows[row] = descent.within(rows[row - 1] + start[row] - start[row - 1])
-            _fit_row(descent, targets, descent.scene.settings.steps)
+            fit_row(descent, targets, descent.scene.settings.steps)
             if _is_lost(descent, targets[0]):
                 rows[row] = start[row]
                 descent.lost.append((sequence, row))
@@ -118,11 +118,11 @@ def _is_lost(descent: Descent, target: Target) -> bool:
     return now - then > TRACKING.descent.lost_landmarks**2 * weight
 
 
-def _fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -> None:
+def fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -> None:
     """Fit the first frame of a sequence. The very first one has turns until its cost no longer falls."""
     known, settings = TRACKING.descent, descent.scene.settings
     if not first_of_all:
-        _turn_of_first(descent, targets, settings.first_steps // known.further_start_divisor, appearance_first=True)
+        turn_of_first(descent, targets, settings.first_steps // known.further_start_divisor, appearance_first=True)
         return
     _, face = pose_vertices(descent.scene, descent.moving(targets[0], ())[0])
     cameras = [descent.scene.camera(one.sequence, one.camera, descent.state.log_focals) for one in targets]
@@ -130,13 +130,13 @@ def _fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) 
     guess_texture(descent.scene, frontal, descent.moving(frontal, ())[0], descent.state.texture)
     before = math.inf
     for turn in range(known.first_most_turns):
-        cost = _turn_of_first(descent, targets, settings.first_steps, appearance_first=turn == 0)
+        cost = turn_of_first(descent, targets, settings.first_steps, appearance_first=turn == 0)
         if cost > (1 - known.first_converged) * before:
             break
         before = cost
 
 
-def _turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appearance_first: bool) -> float:
+def turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appearance_first: bool) -> float:
     """Fit a first frame with texture and light, and return the mean cost of the last tenth of the steps."""
     scene, target, costs = descent.scene, targets[0], []
     appearance = {"texture": descent.state.texture, "light": descent.state.lights[target.sequence]}
@@ -159,11 +159,12 @@ def _turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appe
     return sum(last) / max(len(last), 1)
 
 
-def _fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
+def fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
+    """Fit the pose and expression of a frame, all else fixed."""
     sequence, row = targets[0].sequence, targets[0].row
     rate, smoothness = descent.scene.settings.rates.frame, descent.scene.settings.pass_smoothness
     stepper = descent.stepper(sequence, row, smoothness)
-    weights, even, around = descent.trusted(), list(targets), _expected_around(descent, sequence, row)
+    weights, even, around = descent.trusted(), list(targets), expected_around(descent, sequence, row)
     for step in range(steps):
         moving, leaves = descent.moving(targets[0], ("row",))
         if step % TRACKING.descent.light_every == 0:
@@ -173,7 +174,7 @@ def _fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
         stepper.step(gradient, rate * _fading(step, steps))
 
 
-def _expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, "t p"]:
+def expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, "t p"]:
     """The rows for a frame's smoothness: as fitted before it, and as its start says from the frame on.
 
     With the past alone, heads drifted by degrees.

@@ -12,7 +12,8 @@ from mien.inside import remove_tree
 from mien.progress import say
 from mien.storage import read_tensors, write_tensors
 
-_INTERVAL_SECONDS = 20.0
+INTERVAL_SECONDS = 20.0
+"""Least time between two versions of a piece that is replaced again and again."""
 _ENDING = ".safetensors"
 
 
@@ -33,13 +34,13 @@ class StageCache:
         if found is not None:
             return found
         made = _as_read(make())
-        self._write(name, made)
+        self.write(name, made)
         return made
 
     def offer(self, name: str, make: Callable[[], dict[str, Tensor]]) -> None:
         """Replace the kept piece by a newer version, unless that was done less than 20 seconds ago."""
-        if self.folder is not None and time.monotonic() - self.last >= _INTERVAL_SECONDS:
-            self._write(name, make())
+        if self.folder is not None and time.monotonic() - self.last >= INTERVAL_SECONDS:
+            self.write(name, make())
             self.last = time.monotonic()
 
     def read(self, name: str) -> dict[str, Tensor] | None:
@@ -71,7 +72,8 @@ class StageCache:
     def _path(self, name: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{name}{_ENDING}"
 
-    def _write(self, name: str, tensors: dict[str, Tensor]) -> None:
+    def write(self, name: str, tensors: dict[str, Tensor]) -> None:
+        """Write a piece, if there is a folder."""
         path = self._path(name)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)

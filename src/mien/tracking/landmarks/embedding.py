@@ -77,7 +77,7 @@ def embed_landmarks(
     on_eyes, on_face = (_allowed(model, regions, seen) for regions in (_EYE_REGIONS, _FACE_REGIONS))
     for landmark in track_progress(range(LANDMARKS), "Placing landmarks", LANDMARKS):
         allowed = on_eyes if landmark in LEFT_IRIS + RIGHT_IRIS else on_face
-        faces[landmark], barycentric[landmark], errors[landmark] = _best_point(
+        faces[landmark], barycentric[landmark], errors[landmark] = best_point(
             views, model.faces, allowed, landmark, settings.clamp
         )
     mediapipe = Landmarks(faces, barycentric)
@@ -197,7 +197,7 @@ def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]
     return mask & (seen >= TRACKING.embedding.least_seen)
 
 
-def _best_point(
+def best_point(
     views: DetectedViews, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""

@@ -43,7 +43,7 @@ from mien.tracking.pixels.texture import (
 )
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 
-_FRAMES_AT_ONCE = 256
+FRAMES_AT_ONCE = 256
 """Number of timesteps whose equations are stored as one piece: a few seconds of work, about 10 MB."""
 _SHARED_COST, _APPEARANCE_COST, _LIDS_PART = 100, 40, 4
 """Costs for the progress bar. The first two are the durations of a step of identity and an estimate of the
@@ -327,7 +327,7 @@ def _equations(
     v, p = own.state.shape
     whole = {"cost": own.state.new_empty(v), "gradient": own.state.new_empty(v, p),
              "hessian": own.state.new_empty(v, p, p)}  # fmt: skip
-    for index, rows in enumerate(torch.arange(v).split(_FRAMES_AT_ONCE)):
+    for index, rows in enumerate(torch.arange(v).split(FRAMES_AT_ONCE)):
         for key, part in cache.get_or_compute(f"{name}-equations-{index}", partial(made, rows)).items():
             whole[key][rows] = part
         advance(len(rows))

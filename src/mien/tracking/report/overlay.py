@@ -66,7 +66,7 @@ class OverlayPainter:
     def picture(self, timestep: int, camera_index: int = 0) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The panels joined into one picture: two side by side, or four in a square."""
         panels = self.panels(timestep, camera_index)
-        write_text(panels[0], self._caption(timestep, camera_index), (8, 20))
+        write_text(panels[0], self.caption(timestep, camera_index), (8, 20))
         for panel, name in zip(panels[2:], ("model", "difference"), strict=False):
             write_text(panel, name, (8, 20))
         if len(panels) > 2:
@@ -115,13 +115,14 @@ class OverlayPainter:
             seen = visible_landmarks(self._face_model, vertices, camera).numpy()
             detected, marks = detected[seen], marks[seen]
         if np.isfinite(detected).all():
-            _draw_points(picture, detected, _GREEN)
-        _draw_points(picture, marks, _RED)
+            draw_points(picture, detected, _GREEN)
+        draw_points(picture, marks, _RED)
         cut = fit_neck_cut(self._neck, vertices, tracking.face.T_world_head[timestep, :3, 1])
         _draw_edge(picture, above_neck_cut(cut, camera))
         return picture
 
-    def _caption(self, timestep: int, camera_index: int) -> str:
+    def caption(self, timestep: int, camera_index: int) -> str:
+        """What is written above a picture: camera, timestep and residual."""
         tracking = self._tracking
         residual = float(tracking.residuals[timestep, camera_index])
         missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
@@ -196,7 +197,8 @@ def _pictures(
     yield from track_progress(pictures, "Overlay", len(timesteps))
 
 
-def _draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l 2"], color: tuple) -> None:
+def draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l 2"], color: tuple) -> None:
+    """Draw landmarks as discs."""
     for x, y in _fixed_point(points):
         cv2.circle(image, (int(x), int(y)), 1 << _SUBPIXEL_BITS, color, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
 

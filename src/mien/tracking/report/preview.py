@@ -26,8 +26,9 @@ from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
 
 DONE = "done"
-_INTERVAL_SECONDS = 3.0
-_MAX_SHARE = 0.1
+INTERVAL_SECONDS = 3.0
+"""Least time between two pictures."""
+MAX_SHARE = 0.1
 """Largest share of the time that the preview may take."""
 _CURVE_FRAMES, _STRIPS = 48, 3
 """Number of frames, over all sequences, with residuals in the curves, and number of frames shown as pictures."""
@@ -69,12 +70,13 @@ class Preview:
             return
         if self._current is not None:
             with torch.no_grad():
-                self._body, self._current = self._draw(self._current()), None
-        self._write(self._with_header(stage, progress), last=stage == DONE)
+                self._body, self._current = self.draw(self._current()), None
+        self.write(self.with_header(stage, progress), last=stage == DONE)
         now = time.monotonic()
-        self._due = now + max(_INTERVAL_SECONDS, (now - start) / _MAX_SHARE)
+        self._due = now + max(INTERVAL_SECONDS, (now - start) / MAX_SHARE)
 
-    def _draw(self, fit: object) -> UInt8[np.ndarray, "h w 3"]:
+    def draw(self, fit: object) -> UInt8[np.ndarray, "h w 3"]:
+        """Draw a fit of any stage: its mesh over frames, and curves."""
         assert isinstance(fit, Fit | PhotometricFit)
         refined = fit if isinstance(fit, PhotometricFit) else None
         own_fit = fit if isinstance(fit, Fit) else fit.fit
@@ -99,7 +101,8 @@ class Preview:
         self._before = curves
         return np.concatenate([_widen(part) for part in parts])
 
-    def _with_header(self, stage: str, progress: float) -> UInt8[np.ndarray, "h w 3"]:
+    def with_header(self, stage: str, progress: float) -> UInt8[np.ndarray, "h w 3"]:
+        """The drawn fit below a line with stage, progress and time."""
         header = np.full((_HEADER, _WIDTH, 3), 40, np.uint8)
         names = ", ".join(sample.shot.capture.name for sample in self._samples)
         seconds = time.monotonic() - self._began
@@ -109,11 +112,12 @@ class Preview:
         header[32:38, 10 : 10 + round(940 * min(max(progress, 0.0), 1.0))] = (90, 200, 120)
         return header if self._body is None else np.concatenate([header, self._body])
 
-    def _write(self, picture: UInt8[np.ndarray, "h w 3"], last: bool) -> None:
+    def write(self, picture: UInt8[np.ndarray, "h w 3"], last: bool) -> None:
+        """Write picture and page. The last page is not renewed."""
         png = encode_picture(picture)
         page = render(
             "tracking/report/templates/preview.html",
-            refresh=None if last else f"{_INTERVAL_SECONDS:.0f}",
+            refresh=None if last else f"{INTERVAL_SECONDS:.0f}",
             picture=data_uri("image/png", png),
         )
         write_atomically(self._path.with_suffix(".png"), lambda path: path.write_bytes(png))
