@@ -59,6 +59,7 @@ def drawing(size: int = 8) -> Rendering:
     return Rendering(image, alpha, torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize("right", ["first", "mean"])
 def test_the_gains_are_learned_and_the_background_stays(rig, right: str):
     settings = replace(SETTINGS, camera_colors=right, camera_color_rate=0.02)
@@ -109,6 +110,7 @@ def test_one_camera_is_refused_before_anything_is_written(rig, tmp_path: Path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.unchecked
 def test_a_stopped_run_resumes_with_its_colors(rig, tmp_path: Path):
     """The same bytes result with and without a stop, and the colours have moved."""
     face_model, sequence = rig

@@ -19,6 +19,8 @@ from mien.training.footage.frames import held_out, training_frames
 from mien.training.footage.sequence import Sequence
 from occlusion_case import with_hand, with_slab
 
+pytestmark = pytest.mark.unchecked
+
 RECIPE = SyntheticRecipe(
     name="hand", width=160, height=160, seconds=1.6, hair="none", glasses=False, brows_and_lashes=False,
     texture_size=512, rotation=(15.0, 8.0, 5.0),

@@ -13,6 +13,8 @@ from mien.tracking.eyelids.placing import weigh_positions
 from mien.tracking.fitting import CameraBatch, Views, layout_of
 from small_face_model import make_small_face_model
 
+pytestmark = pytest.mark.unchecked
+
 TIMESTEPS = 24
 POSITIONS = np.linspace(-0.4, 1.2, 13)
 

@@ -13,6 +13,8 @@ from mien.tracking.pixels.shared import move_like_keyframes
 from mien.tracking.pixels.surface import surface_model
 from photometric_case import SIZE, PhotometricCase, make_photometric_case
 
+pytestmark = pytest.mark.unchecked
+
 
 @pytest.fixture(scope="module")
 def case() -> PhotometricCase:

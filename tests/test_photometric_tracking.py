@@ -14,6 +14,8 @@ from mien.tracking.settings import PhotometricSettings
 from photometric_case import FOCAL, PhotometricCase, make_photometric_case, make_textured_model
 from tracking_case import make_tracking_case
 
+pytestmark = pytest.mark.unchecked
+
 LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
 FAST = replace(
     LANDMARKS, schedule="fast",

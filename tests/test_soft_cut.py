@@ -99,6 +99,7 @@ def test_what_stands_off_the_skin_goes_just_above_the_cut_alone(model: FaceModel
     assert off_skin[1] == on_skin[1] == 1
 
 
+@pytest.mark.unchecked
 def test_pages_and_files_have_the_soft_cut_unless_it_is_declined(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,6 +25,7 @@ def tracked():
     return case, track(case.capture, make_small_face_model(), KNOWN_FOCAL)
 
 
+@pytest.mark.unchecked
 def test_recovers_the_truth(tracked):
     case, tracking = tracked
     face = tracking.face.to(case.pixels)
@@ -41,6 +42,7 @@ def test_recovers_the_truth(tracked):
     assert (depth.mean() - 1).abs() < 0.02
 
 
+@pytest.mark.unchecked
 def test_a_few_landmarks_will_do():
     """A few landmarks are enough: 300-W's without their contour, and the irises."""
     case = make_tracking_case(timesteps=20)
@@ -58,6 +60,7 @@ def test_a_few_landmarks_will_do():
     assert (few.face.expression - same.face.expression).abs().median() < 0.01
 
 
+@pytest.mark.unchecked
 def test_says_what_it_is(tracked):
     case, tracking = tracked
     assert tracking.face_model == "small"
@@ -70,6 +73,7 @@ def test_says_what_it_is(tracked):
     assert 0.3 < tracking.residuals.nanmedian() < 0.45
 
 
+@pytest.mark.unchecked
 def test_missing_frames_are_marked_and_interpolated(tracked):
     _, tracking = tracked
     assert tracking.valid.logical_not().nonzero()[:, 0].tolist() == [20, 21]
@@ -79,6 +83,7 @@ def test_missing_frames_are_marked_and_interpolated(tracked):
         torch.testing.assert_close(field[20], between)
 
 
+@pytest.mark.unchecked
 def test_is_deterministic(tracked):
     case, tracking = tracked
     again = track(case.capture, make_small_face_model(), KNOWN_FOCAL)
@@ -119,6 +124,7 @@ def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Te
     return yaw, tracking.face.head_rotation[:, 1], model.landmark_positions(model(tracking.face), "mediapipe")
 
 
+@pytest.mark.unchecked
 def test_fast_turns_neither_lag_nor_shrink():
     yaw, tracked_yaw, _ = _still_then_turn(noise=0.0)
     tracked_yaw = tracked_yaw.double()
@@ -132,6 +138,7 @@ def test_fast_turns_neither_lag_nor_shrink():
     assert (tracked_yaw.diff().max() / yaw.diff().max()) > 0.85
 
 
+@pytest.mark.unchecked
 def test_smoothing_calms_a_still_head():
     _, _, marks = _still_then_turn(noise=0.3)
     still = marks[2:26]
@@ -172,6 +179,7 @@ def test_a_model_without_landmarks_is_refused():
         track(case.capture, replace(make_small_face_model(), landmarks={}))
 
 
+@pytest.mark.unchecked
 def test_report(tracked):
     """The report has the residuals, lost frames and jitter of the tracking."""
     case, tracking = tracked
@@ -183,6 +191,7 @@ def test_report(tracked):
     assert report["flagged_frames"] == []
 
 
+@pytest.mark.unchecked
 def test_report_flags_a_bad_frame(tracked):
     case, tracking = tracked
     residuals = tracking.residuals.clone()

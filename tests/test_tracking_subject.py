@@ -78,6 +78,7 @@ def two_sequences():
     return captures, truth, track_subject(captures, make_small_face_model(), FEW)
 
 
+@pytest.mark.unchecked
 @pytest.mark.slow
 def test_sequences_of_a_subject_have_one_identity(two_sequences):
     captures, truth, together = two_sequences
@@ -89,12 +90,14 @@ def test_sequences_of_a_subject_have_one_identity(two_sequences):
     assert _shape_error(truth, together[0]) < 0.8 * min(_shape_error(truth, tracking) for tracking in alone)
 
 
+@pytest.mark.unchecked
 def test_every_sequence_has_its_own_motion(two_sequences):
     _, _, (ahead, aside) = two_sequences
     assert ahead.face.head_rotation[:, 1].abs().max() < 0.2
     assert aside.face.head_rotation[:, 1].min() > 0.4
 
 
+@pytest.mark.unchecked
 @pytest.mark.slow
 def test_the_order_of_sequences_does_not_matter(two_sequences):
     captures, _, (first, _) = two_sequences
@@ -102,6 +105,7 @@ def test_the_order_of_sequences_does_not_matter(two_sequences):
     torch.testing.assert_close(again.face.identity, first.face.identity, atol=1e-4, rtol=0)
 
 
+@pytest.mark.unchecked
 def test_focal_lengths_are_shared_only_if_asked(two_sequences):
     captures, _, apart = two_sequences
     alike = track_subject(captures, make_small_face_model(), replace(FEW, same_camera=True))
@@ -193,6 +197,7 @@ def _pose_errors(face: FaceParams, tracking: Tracking) -> tuple[float, float]:
     return float(angle.median()), 1000 * float(distance.median())
 
 
+@pytest.mark.unchecked
 def test_cameras_tell_pose_and_metric_scale(ring):
     face, capture, tracking = ring
     single = track(_one_camera(capture), _model_with_sizes(), FEW)
@@ -204,6 +209,7 @@ def test_cameras_tell_pose_and_metric_scale(ring):
     assert abs(float(single.face.identity[-1]) - 1.2) > 0.5
 
 
+@pytest.mark.unchecked
 def test_cameras_from_the_side_are_believed_less(ring):
     """Cameras from the side count less, since a detector errs in other ways on a face from the side."""
     face, capture, _ = ring
@@ -259,6 +265,7 @@ def test_report_of_several_cameras(ring):
     assert report["depth_m"]["median"] == pytest.approx(0.9, abs=0.05)
 
 
+@pytest.mark.unchecked
 @pytest.mark.slow
 def test_rings_and_videos_share_an_identity(ring):
     face, capture, _ = ring
