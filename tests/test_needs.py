@@ -4,9 +4,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+import conftest
 from needs import IS_ROOT, NO_CHROMIUM, NO_GPU, NO_INSTRUCTIONS, NO_NODE, NO_TEST_DATA, skipped_lines, unexpected
 
 TESTS = Path(__file__).parent
@@ -35,17 +37,25 @@ def test_only_the_machine_excuses_a_skip() -> None:
     assert unexpected([NO_GPU, f"Skipped: {NO_CHROMIUM}", NO_CHROMIUM, "because"]) == ["because", NO_CHROMIUM]
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-@pytest.mark.parametrize(("reason", "strict", "code"), [(NO_NODE, "", 0), (NO_NODE, "1", 1), (NO_GPU, "1", 0)])
-def test_a_strict_run_fails_where_a_program_is_missing(
-    tmp_path: Path, reason: str, strict: str, code: int, workers: int
+@pytest.mark.parametrize(
+    ("reason", "strict", "fails"), [(NO_NODE, "", False), (NO_NODE, "1", True), (NO_GPU, "1", False)]
+)
+def test_a_skip_fails_a_strict_run_where_a_program_is_missing(
+    monkeypatch: pytest.MonkeyPatch, reason: str, strict: str, fails: bool
 ) -> None:
+    monkeypatch.setenv("MIEN_STRICT", strict)
+    reporter = SimpleNamespace(stats={"skipped": [SimpleNamespace(longrepr=("file", 1, f"Skipped: {reason}"))]})
+    config = SimpleNamespace(pluginmanager=SimpleNamespace(get_plugin=lambda name: reporter))
+    session = SimpleNamespace(config=config, exitstatus=pytest.ExitCode.OK)
+    conftest.pytest_sessionfinish(session)  # type: ignore[arg-type]
+    assert (session.exitstatus == pytest.ExitCode.TESTS_FAILED) == fails
+
+
+def test_a_strict_run_with_a_worker_fails(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text((TESTS / "conftest.py").read_text())
-    (tmp_path / "test_one.py").write_text(
-        f"import pytest\n\ndef test_skips():\n    pytest.skip({reason!r})\n\ndef test_passes():\n    pass\n"
-    )
-    environment = {**os.environ, "MIEN_STRICT": strict, "PYTHONPATH": str(TESTS)}
-    command = [sys.executable, "-m", "pytest", "-q", "-n", str(workers), "-p", "no:cacheprovider", str(tmp_path)]
+    (tmp_path / "test_one.py").write_text(f"import pytest\n\ndef test_skips():\n    pytest.skip({NO_NODE!r})\n")
+    environment = {**os.environ, "MIEN_STRICT": "1", "PYTHONPATH": str(TESTS)}
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "1", "-p", "no:cacheprovider", str(tmp_path)]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == code, done.stdout + done.stderr
-    assert ("MIEN_STRICT is set" in done.stdout) == bool(code)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "MIEN_STRICT is set" in done.stdout
