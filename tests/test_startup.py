@@ -8,13 +8,16 @@ from pathlib import Path
 
 import pytest
 
+from mien import runtime
 from mien.cli import COMMANDS
+from web_case import drawn_head
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
 LAZY_ROOMS = [
-    "avatar", "capture", "datasets", "driving", "export", "lab.analysis", "tracking", "training", "training.footage",
-    "training.whole_head", "viewer",
+    "avatar", "capture", "datasets", "driving", "export", "face", "lab.analysis", "tracking", "training",
+    "training.footage", "training.whole_head", "viewer",
 ]  # fmt: skip
+WITHOUT_TORCH = ("licenses", "plugins", "face-models")
 SCRIPT = """
 import json, os, sys
 from mien.cli import main
@@ -25,6 +28,8 @@ for line in json.loads(sys.argv[1]):
     except SystemExit as stop:
         code = stop.code
     found.append([code, sorted(sys.modules)])
+import torch
+found.append([torch.get_num_threads(), []])
 print(json.dumps(found), file=sys.__stdout__)
 """
 WRONG_VALUES = """
@@ -52,15 +57,18 @@ study tally gone.json gone.json; demo --seconds 9999; demo --out a.csv
 
 
 def modules_after(lines: list[list[str]], folder: Path) -> list[tuple[int, set[str]]]:
-    """Return exit code and imported modules after each of some command lines, run in turn in a new process."""
+    """Return exit code and imported modules after each of some command lines, run in turn in a new process.
+
+    The last entry has the number of torch's threads.
+    """
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, json.dumps(lines)], capture_output=True, text=True, check=True, cwd=folder
     )
     return [(code, set(modules)) for code, modules in json.loads(done.stdout.splitlines()[-1])]
 
 
-def test_help_and_mistakes_import_nothing_heavy(tmp_path: Path) -> None:
-    """Help, wrong options, values and paths import nothing heavy, even if everything before the mistake is right."""
+def test_nothing_heavy_is_imported_before_it_is_needed(tmp_path: Path) -> None:
+    """Help and mistakes import nothing heavy, even if all before a mistake is right; what needs no torch has none."""
     for name in ("w/sequences/s/capture/capture.json", "w/sequences/s/tracking/tracking.json", "w/runs/r/config.json"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_text("{}")
@@ -71,8 +79,14 @@ def test_help_and_mistakes_import_nothing_heavy(tmp_path: Path) -> None:
         *([name, "--no-such-option"] for name in ("create", "view", "batch")),
         *map(str.split, WRONG_VALUES.split(";")),
     ]
-    ended = modules_after([*help_of, *wrong], tmp_path)
-    for line, (code, modules) in zip([*help_of, *wrong], ended, strict=True):
+    runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
+    light = [["render", "me.mien", "--out", "me.png", "--size", "32"], *([name] for name in WITHOUT_TORCH)]
+    *ended, (threads, _) = modules_after([*help_of, *wrong, *light], tmp_path)
+    assert threads == 1
+    for line, (code, modules) in zip(light, ended[-len(light) :], strict=True):
+        assert code == 0, line
+        assert not modules & {"torch", "anny", "mediapipe"}, line
+    for line, (code, modules) in zip([*help_of, *wrong], ended, strict=False):
         assert code == (0 if line in help_of else 2), f"mien {' '.join(line)}: exit code {code}"
         assert not modules & HEAVY, f"mien {' '.join(line)} imports {sorted(modules & HEAVY)}"
 
