@@ -18,12 +18,15 @@ from mien.tracking.descent.terms import landmark_terms, prior_term, read_target
 from mien.tracking.fitting import Fit, SequenceFit, StageCache, layout_of, lenses_of, resume, shot_of, widen
 from mien.tracking.landmarks import all_landmarks, quiet_landmarks, reduce_face_model
 from mien.tracking.landmarks.term import unknown_subject
-from mien.tracking.settings import PaperSettings
+from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import FOCAL, PhotometricCase, assert_alike, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
 
-LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
-QUICK = PaperSettings(texture_size=128, first_steps=150, epochs=3)
+PIXELS = PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1)
+LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks", photometric=PIXELS)
+QUICK = PaperSettings(texture_size=64, first_steps=60, steps=15, epochs=3)
+PAPER = replace(LANDMARKS, schedule="paper", paper=QUICK)
+ALONE = replace(PAPER, paper=replace(QUICK, start="landmarks"))
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +41,7 @@ def by_landmarks(case: PhotometricCase) -> Tracking:
 
 @pytest.fixture(scope="module")
 def by_descent(case: PhotometricCase) -> Tracking:
-    return track(case.capture, case.model, replace(LANDMARKS, schedule="paper", paper=QUICK))
+    return track(case.capture, case.model, PAPER)
 
 
 @pytest.mark.unchecked
@@ -50,16 +53,13 @@ def test_pixels_calm_what_landmarks_leave(case, by_landmarks, by_descent):
 @pytest.mark.unchecked
 def test_all_of_it_from_landmarks(case, by_landmarks):
     """The schedule is also better than landmarks if it starts from them alone."""
-    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
-    alone = track(case.capture, case.model, settings)
+    alone = track(case.capture, case.model, ALONE)
     assert wobble(case, alone) < 0.25 * wobble(case, by_landmarks)
     assert turn_error(case, alone) < 0.9 * turn_error(case, by_landmarks)
 
 
 def test_the_first_frame_has_turns_until_it_no_longer_gets_better(case, monkeypatch):
-    """The first frame is fitted to convergence: turns end when the cost falls by less than a hundredth."""
-    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks", first_steps=4))
-    descent, costs, given = _descent(case, settings), [], iter((100.0, 90.0, 80.0, 79.5, 1.0))
+    descent, costs, given = _descent(case, ALONE), [], iter((100.0, 90.0, 80.0, 79.5, 1.0))
 
     def turn(*_: object, **__: object) -> float:
         costs.append(next(given))
@@ -71,8 +71,7 @@ def test_the_first_frame_has_turns_until_it_no_longer_gets_better(case, monkeypa
 
 
 def test_a_turn_of_the_first_frame_lowers_its_cost(case):
-    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
-    descent = _descent(case, settings)
+    descent = _descent(case, ALONE)
     targets = descent.targets(0, 0)
     first = frames.turn_of_first(descent, targets, 20, appearance_first=True)
     assert frames.turn_of_first(descent, targets, 20, appearance_first=False) < first
@@ -80,8 +79,7 @@ def test_a_turn_of_the_first_frame_lowers_its_cost(case):
 
 def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
     """The first camera may see a head from behind."""
-    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, start="landmarks"))
-    descent, used = _descent(case, settings), []
+    descent, used = _descent(case, ALONE), []
     (target,) = descent.targets(0, 0)
     behind, camera = replace(target, camera=1), descent.scene.camera(0, 0, descent.state.log_focals)
     away = replace(camera, viewmat=_turned_away(camera.viewmat))
@@ -94,8 +92,7 @@ def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
 
 def test_every_camera_of_a_timestep_counts_in_every_step(case):
     """Colours are the mean over the pictures, so that a step of two cameras weighs as one of a single camera."""
-    settings = replace(LANDMARKS, schedule="paper", paper=QUICK)
-    descent = _descent(case, settings)
+    descent = _descent(case, PAPER)
     (target,) = descent.targets(0, 3)
     dark = replace(target, image=0 * target.image)
     moving, weights = descent.moving(target, ())[0], descent.scene.used
@@ -106,7 +103,7 @@ def test_every_camera_of_a_timestep_counts_in_every_step(case):
 
 
 def test_every_step_of_pass_and_epochs_has_all_cameras(case, monkeypatch):
-    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, first_steps=2, steps=1, texture_steps=1))
+    settings = replace(PAPER, paper=replace(QUICK, first_steps=2, steps=1, texture_steps=1))
     descent, counts = _descent(case, settings), []
     frame_cost = Descent.frame_cost
 
@@ -127,8 +124,7 @@ def test_every_step_of_pass_and_epochs_has_all_cameras(case, monkeypatch):
 
 def test_the_frame_pass_can_be_smooth_in_both_directions(case):
     """A frame's neighbours are those before it, as fitted, and those after it, as they are expected."""
-    settings = replace(LANDMARKS, schedule="paper", paper=QUICK)
-    descent = _descent(case, settings)
+    descent = _descent(case, PAPER)
     rows, start = descent.state.frames[0], descent.start[0]
     rows[:4] = descent.within(rows[:4] + 0.01)
     around = frames.expected_around(descent, 0, 3)
@@ -146,7 +142,7 @@ def test_smoothness_in_the_frame_pass_is_a_setting(case):
     """A frame with its share of the temporal term ends nearer to the motion around it."""
     ends = {}
     for smoothness in (0.0, 1.0):
-        descent = _descent(case, replace(LANDMARKS, schedule="paper", paper=replace(QUICK, pass_smoothness=smoothness)))
+        descent = _descent(case, replace(PAPER, paper=replace(QUICK, pass_smoothness=smoothness)))
         rows = descent.state.frames[0]
         rows[3] = descent.within(rows[3] + 0.02)
         frames.fit_row(descent, descent.targets(0, 3), 10)
@@ -170,9 +166,9 @@ def test_the_neck_has_no_column_of_its_own(case):
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize("size", [1024, 2048])
-def test_textures_may_be_as_large_as_those_of_published_trackers(case, size: int):
-    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, texture_size=size))
+def test_textures_may_be_as_large_as_those_of_published_trackers(case):
+    size = 2048
+    settings = replace(PAPER, paper=replace(QUICK, texture_size=size))
     settings.check()
     descent = _descent(case, settings)
     assert descent.state.texture.shape[:2] == (size, size)
@@ -208,14 +204,13 @@ def test_it_says_how_it_was_made(by_descent):
 
 
 @pytest.mark.unchecked
-def test_the_same_with_any_number_of_threads(case, monkeypatch):
-    """The number of threads does not change a bit."""
-    several_frames = replace(TRACKING.descent, most_batches=2)
+def test_the_same_with_any_number_of_threads(monkeypatch):
+    several_frames, case = replace(TRACKING.descent, most_batches=2), make_photometric_case(timesteps=5)
     monkeypatch.setattr(epochs, "TRACKING", replace(TRACKING, descent=several_frames))
-    short, runs = replace(QUICK, epochs=1), []
+    settings, runs = replace(ALONE, paper=replace(ALONE.paper, first_steps=10, steps=3, epochs=2)), []
     for threads in ("1", "2"):
         monkeypatch.setenv("MIEN_THREADS", threads)
-        runs.append(track(case.capture, case.model, replace(LANDMARKS, schedule="paper", paper=short)))
+        runs.append(track(case.capture, case.model, settings))
     assert_alike(*runs)
 
 
@@ -224,7 +219,7 @@ def test_landmarks_cost_what_they_cost_other_schedules(case):
 
     The detector's whole response counts, with turns and expressions.
     """
-    settings = replace(LANDMARKS, schedule="paper", paper=replace(QUICK, gap_weight=0.0))
+    settings = replace(PAPER, paper=replace(QUICK, gap_weight=0.0))
     shot, layout = shot_of(case.capture, settings), layout_of(case.model)
     model = reduce_face_model(case.model, layout)
     random = torch.Generator().manual_seed(0)
@@ -259,28 +254,37 @@ def test_adam_is_that_of_torch():
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize(("start", "interrupted_at"), [("landmarks", 3), ("fast", 2)])
+@pytest.mark.parametrize(("start", "stops"), [("landmarks", (3, 4)), ("fast", (2,))])
 def test_an_interrupted_fit_goes_on(
-    case, tmp_path, monkeypatch, start: Literal["fast", "landmarks"], interrupted_at: int
-):
-    """An interrupted fit continues to the same numbers, whether it stopped in the frames or in the epochs."""
-    short = replace(QUICK, start=start, first_steps=10, steps=3, epochs=3)
-    settings = replace(LANDMARKS, schedule="paper", paper=short)
+    tmp_path, monkeypatch, start: Literal["fast", "landmarks"], stops: tuple[int, ...]
+) -> None:
+    """It ends with the same numbers, whether it stopped in the frames, in the epochs or in both."""
+    case, keep = make_photometric_case(timesteps=5), tmp_path / "kept"
+    settings = replace(PAPER, paper=replace(QUICK, start=start, first_steps=10, steps=3, epochs=3))
     expected = track_subject([case.capture], case.model, settings)[0]
     monkeypatch.setattr(resume, "INTERVAL_SECONDS", 0.0)
-    offer, offers = StageCache.offer, []
+    offer, resumed, dones = StageCache.offer, Descent.resume, []
+    for stop in stops:
+        offers = []
 
-    def offer_then_stop(self: StageCache, name: str, make: Callable) -> None:
-        offer(self, name, make)
-        offers.append(None)
-        if len(offers) == interrupted_at:
-            raise KeyboardInterrupt
+        def offer_then_stop(self: StageCache, name: str, make: Callable) -> None:
+            offer(self, name, make)
+            offers.append(name)  # noqa: B023
+            if len(offers) == stop:  # noqa: B023
+                raise KeyboardInterrupt
 
-    monkeypatch.setattr(StageCache, "offer", offer_then_stop)
-    keep = tmp_path / "kept"
-    with pytest.raises(KeyboardInterrupt):
-        track_subject([case.capture], case.model, settings, keep)
-    assert (keep / "descent.safetensors").is_file()
-    resumed = track_subject([case.capture], case.model, settings, keep)[0]
+        with monkeypatch.context() as patched:
+            patched.setattr(StageCache, "offer", offer_then_stop)
+            with pytest.raises(KeyboardInterrupt):
+                track_subject([case.capture], case.model, settings, keep)
+        assert (keep / "descent.safetensors").is_file()
+
+    def resume_and_tell(self: Descent, cache: StageCache) -> None:
+        resumed(self, cache)
+        dones.append(self.done)
+
+    monkeypatch.setattr(Descent, "resume", resume_and_tell)
+    found = track_subject([case.capture], case.model, settings, keep)[0]
+    assert dones == [3 * 5], "two epochs after the pass are done"
     assert not keep.exists()
-    assert_alike(expected, resumed)
+    assert_alike(expected, found)
