@@ -122,7 +122,7 @@ fuzz-native: setup
 	$(BIN)/cmake -S . -B $(SANITIZED) -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja) -DCMAKE_BUILD_TYPE=Debug -DMIEN_SANITIZE=ON \
 	  -DPython_EXECUTABLE=$(abspath $(BIN)/python) -Dnanobind_DIR=$$($(BIN)/python -m nanobind --cmake_dir) > /dev/null
 	$(BIN)/ninja --quiet -C $(SANITIZED)
-	$(BIN)/python tests/fuzzing/native_calls.py $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
+	PYTHONPATH=tests $(BIN)/python -m fuzzing.native_calls $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
 
 # Faults in files of every format and odd command lines, for MINUTES, messages to a viewer, native calls; findings go to out/fuzz/findings.jsonl.
 MINUTES ?= 10

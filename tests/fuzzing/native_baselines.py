@@ -1,374 +1,360 @@
-"""Make a valid call of every native function, small and random, for `native_calls.py` to mutate."""
+"""Make a valid call of every native function, small and random. `native_calls.py` mutates it, and tests break it.
 
+Arrays are given by words: `"n 3"` is of normal numbers, `"+n 3"` of positive ones, `"%n 3"` of numbers from 0 to 1,
+`"=n 3"` of zeros to be filled, and `"<v n 3"` of integers below v. `"?n 3"` is None half the time, and `:i4` gives a
+type. A letter is a length that holds for the whole call. `h^` is rounded up to 16, and `3?` is left out at times.
+"""
+
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from native_mesh_baselines import (
-    F32,
-    I32,
-    MESHES,
-    U8,
-    Arguments,
-    Baseline,
-    Rng,
-    below,
-    camera,
-    empty,
-    few,
-    normal,
-    picture,
-)
+
+Rng = np.random.Generator
+Arguments = list[Any]
+F32 = np.float32
+FEW = (1, 2, 5, 16, 17, 40)
+SIZES = {
+    "H": (1, 3, 8, 33, 64), "G": (1, 3, 8, 33, 64), "W": (6, 7, 16, 31, 65), "U": (6, 7, 16, 31, 65),
+    "v": (3, 15, 16, 50), "V": (3, 4, 7, 18, 19, 42), "g": (0, 1, 5, 17, 300), "q": (1, 4, 9, 16), "3?": (0, 3),
+    **{name: range(0, 4) for name in ("j", "B", "u")}, "k": range(0, 5), "e": range(0, 6),
+    "a": range(1, 3), "b": range(1, 4), "d": range(1, 4), "c": range(1, 5), "p": range(1, 6), "K": range(1, 7),
+    "r": range(1, 9), **{name: range(1, 20) for name in ("f", "x", "h")}, "o": range(0, 19),
+}  # fmt: skip
+"""Lengths by letter; others are of FEW."""
 
 
-def of(*arrays: str) -> Baseline:
-    """Return a baseline of arrays, such as "n 3" of random numbers, or "=n 3" to be filled; letters are lengths."""
+class Call:
+    """What the arguments of one call are made of. Named tuples and classes of the core take words for their arrays."""
 
-    def make(native: Any, rng: Rng) -> Arguments:
-        lengths: dict[str, int] = {}
+    def __init__(self, native: Any, rng: Rng) -> None:
+        self.native, self.rng = native, rng
+        self.sizes: dict[str, int] = {}
 
-        def length(name: str) -> int:
-            if name.isdigit():
-                return int(name)
-            own = {"k": int(rng.integers(0, 5)), "r": int(rng.integers(1, 9))}
-            return lengths.setdefault(name, own.get(name, few(rng)))
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return lambda *given: getattr(self.native, name)(*self.given(*given))
 
-        shapes = [(array[0] == "=", [length(name) for name in array.removeprefix("=").split()]) for array in arrays]
-        return [empty(*shape) if filled else normal(rng, *shape) for filled, shape in shapes]
+    def given(self, *given: Any) -> Arguments:
+        """Return values, with arrays in the place of words."""
+        return [self.array(one) if isinstance(one, str) else one for one in given]
 
-    return make
+    def size(self, word: str) -> int:
+        """Return a length."""
+        if word[-1] == "^":
+            return -(-self.size(word[:-1]) // 16) * 16
+        for sign, join in (("+", sum), ("*", math.prod)):
+            if sign in word:
+                return join(map(self.size, word.split(sign)))
+        if word.isdigit():
+            return int(word)
+        if word not in self.sizes:
+            self.sizes[word] = int(self.rng.choice(SIZES.get(word, FEW)))
+        return self.sizes[word]
 
+    def array(self, text: str) -> Any:
+        """Return the array that words describe."""
+        if text[0] == "?":
+            return self.maybe(self.array(text[1:]))
+        kind = text[0] if text[0] in "=+%<" else ""
+        words, _, dtype = text.removeprefix(kind).partition(":")
+        first, *others = words.split()
+        names = others if kind == "<" else [first, *others]
+        shape = [self.size(word) for word in names if word != "3?" or self.size(word)]
+        if kind == "=":
+            return np.zeros(shape, dtype or F32)
+        if kind == "<":
+            return self.rng.integers(0, self.size(first), shape).astype(dtype or np.int64)
+        numbers = self.rng.random(shape) if kind == "%" else self.rng.standard_normal(shape)
+        return (np.abs(numbers) if kind == "+" else numbers).astype(F32)
 
-# Changes with the expression
+    def flag(self, share: float = 0.5) -> bool:
+        return bool(self.rng.random() < share)
 
+    def maybe(self, value: Any, share: float = 0.5) -> Any:
+        """Return the value, or None."""
+        return value if self.flag(share) else None
 
-def expression_change(native: Any, rng: Rng) -> Arguments:
-    shape, r = (few(rng), *([3] if rng.random() < 0.5 else [])), int(rng.integers(1, 9))
-    return [normal(rng, *shape, r), normal(rng, r), empty(*shape)]
+    def picture(self) -> tuple[int, int]:
+        return self.size("H"), self.size("W")
 
+    def box(self) -> list[int]:
+        """Return left, top, width and height of a part of the picture."""
+        h, w = self.picture()
+        left, top = int(self.rng.integers(0, w)), int(self.rng.integers(0, h))
+        return [left, top, int(self.rng.integers(0, w - left + 1)), int(self.rng.integers(0, h - top + 1))]
 
-def expression_change_backward(native: Any, rng: Rng) -> Arguments:
-    shape, r = (few(rng), *([3] if rng.random() < 0.5 else [])), int(rng.integers(1, 9))
-    return [normal(rng, *shape, r), normal(rng, r), normal(rng, *shape), empty(*shape, r), empty(r)]
-
-
-# Blended features
-
-
-def network_of(native: Any, rng: Rng) -> tuple[Any, list[Any], tuple[int, ...]]:
-    """Return a network, bases in both orders, and the numbers of Gaussians, features, hidden values and outputs."""
-    n, f, x, h, o = few(rng), *(int(rng.integers(1, 20)) for _ in range(4))
-    layers = normal(rng, h, f + x), normal(rng, h), normal(rng, o, h), normal(rng, o)
-    k, j = int(rng.integers(0, 5)), int(rng.integers(0, 4))
-    bases = [
-        native.FeatureBases(normal(rng, n, k, f), normal(rng, k), False),
-        native.FeatureBases(normal(rng, j, n, f), normal(rng, j), True),
-    ]
-    return native.FeatureNetwork(normal(rng, n, f), normal(rng, n, x), *layers), bases, (n, f, h, o)
-
-
-def feature_network(native: Any, rng: Rng) -> Arguments:
-    network, bases, (n, f, h, o) = network_of(native, rng)
-    kept = native.FeatureKept(empty(n, f), empty(n, -(-h // 16) * 16)) if rng.random() < 0.5 else None
-    return [network, bases, kept, empty(n, o - 1), empty(n)]
-
-
-def feature_network_backward(native: Any, rng: Rng) -> Arguments:
-    network, bases, (n, f, h, o) = network_of(native, rng)
-    kept = native.FeatureKept(normal(rng, n, f), normal(rng, n, -(-h // 16) * 16))
-    by_layers = [np.empty_like(array) for array in network[2:]]
-    by_inputs = empty(sum(len(one.inputs) for one in bases))
-    by_own = np.empty_like(network.own) if rng.random() < 0.5 else empty(0, 0)
-    gradients = native.FeatureGradients(
-        normal(rng, n, o - 1), normal(rng, n), empty(n, f), *by_layers, by_inputs, by_own
-    )
-    return [network, bases, kept, gradients]
-
-
-def factored_update(native: Any, rng: Rng) -> Arguments:
-    n, k, f, terms = few(rng), int(rng.integers(0, 5)), int(rng.integers(1, 20)), int(rng.integers(0, 4))
-    moments = np.abs(normal(rng, n, f)), np.abs(normal(rng, n))
-    rows, columns = ([normal(rng, *shape) for _ in range(terms)] for shape in ((n, f), (k,)))
-    return [normal(rng, n, k, f), rows, columns, *moments, 0.01]
+    def camera(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return K and viewmat of a camera 3 units in front of the origin."""
+        h, w = self.picture()
+        viewmat = np.diag([1, -1, -1, 1]).astype(F32)
+        viewmat[2, 3] = 3
+        return np.array([[w, 0, w / 2], [0, w, h / 2], [0, 0, 1]], F32), viewmat
 
 
-def point_layers(native: Any, rng: Rng) -> tuple[list[Any], Any, int]:
-    n, widths, layers = few(rng), [int(rng.integers(1, 20))], []
-    for index in range(int(rng.integers(1, 5))):
-        extra = int(rng.integers(-1, index)) if index > 0 else -1
+# Blended features and points
+
+
+def network(c: Call) -> Arguments:
+    bases = [c.FeatureBases("n k f", "k", False), c.FeatureBases("j n f", "j", True)]
+    return [c.FeatureNetwork("n f", "n x", "h f+x", "h", "o+1 h", "o+1"), bases]
+
+
+def feature_network_backward(c: Call) -> Arguments:
+    layers = "=h f+x", "=h", "=o+1 h", "=o+1"
+    gradients = c.FeatureGradients("n o", "n", "=n f", *layers, "=k+j", "=n x" if c.flag() else "=0 0")
+    return [*network(c), c.FeatureKept("n f", "n h^"), gradients]
+
+
+def factored(c: Call, *others: Any) -> Arguments:
+    terms = range(c.size("u"))
+    return c.given("n k f", [c.array("n f") for _ in terms], [c.array("k") for _ in terms], *others, 0.01)
+
+
+def point_layers(c: Call) -> Arguments:
+    """Return the layers and their inputs. Letters of lengths: `i` inputs, `l` outputs, `y` what is kept."""
+    widths, layers = [int(c.rng.integers(1, 20))], []
+    for index in range(int(c.rng.integers(1, 5))):
+        extra = int(c.rng.integers(-1, index)) if index > 0 else -1
         reads = widths[-1] + (widths[extra] if extra >= 0 else 0)
-        widths.append(int(rng.integers(1, 40)))
-        layers.append([normal(rng, widths[-1], reads), normal(rng, widths[-1]), int(rng.integers(0, 3)), extra])
+        widths.append(int(c.rng.integers(1, 40)))
+        shapes = f"{widths[-1]} {reads}", f"{widths[-1]}"
+        layers.append([*c.given(*shapes), int(c.rng.integers(0, 3)), extra])
     layers[-1][2] = 0
-    kept = sum(-(-width // 16) * 16 for width in widths[1:-1])
-    return [native.PointLayer(*layer) for layer in layers], normal(rng, n, widths[0]), kept
+    c.sizes |= {"i": widths[0], "l": widths[-1], "y": sum(-(-width // 16) * 16 for width in widths[1:-1])}
+    return [[c.PointLayer(*layer) for layer in layers], c.array("n i")]
 
 
-def point_network(native: Any, rng: Rng) -> Arguments:
-    layers, inputs, kept = point_layers(native, rng)
-    room = empty(len(inputs), kept) if rng.random() < 0.5 else None
-    return [layers, inputs, room, empty(len(inputs), len(layers[-1].bias))]
+def point_network_backward(c: Call) -> Arguments:
+    layers, inputs = point_layers(c)
+    gradients = [c.PointLayerGradients(*(np.zeros_like(array) for array in layer[:2])) for layer in layers]
+    return c.given(layers, inputs, "n y", "n l", gradients, "?=n i")
 
 
-def point_network_backward(native: Any, rng: Rng) -> Arguments:
-    layers, inputs, kept = point_layers(native, rng)
-    gradients = [native.PointLayerGradients(*(np.empty_like(array) for array in layer[:2])) for layer in layers]
-    by_inputs = np.empty_like(inputs) if rng.random() < 0.5 else None
-    by_outputs = normal(rng, len(inputs), len(layers[-1].bias))
-    return [layers, inputs, normal(rng, len(inputs), kept), by_outputs, gradients, by_inputs]
+def skinned(c: Call) -> Any:
+    return c.SkinPoints("n 3", "B n 3", "n K", "K 3 4", "B K 3 4")
 
 
-def activate_points(native: Any, rng: Rng) -> Arguments:
-    n = few(rng)
-    raw = native.RawPoints(normal(rng, n, 11), normal(rng, n, 3), normal(rng, n, 4), normal(rng, n), normal(rng, n, 3))
-    out = native.ActivatedPoints(empty(n, 3), empty(n, 4), empty(n), empty(n, 1, 3))
-    return [raw, 0.5, 0.1, out]
+# Faces and rigs
 
 
-def skin_arrays(native: Any, rng: Rng) -> tuple[Any, tuple[int, int, int]]:
-    n, b, k = few(rng), int(rng.integers(0, 4)), int(rng.integers(1, 7))
-    points = normal(rng, n, 3), normal(rng, b, n, 3), normal(rng, n, k), normal(rng, k, 3, 4), normal(rng, b, k, 3, 4)
-    return native.SkinPoints(*points), (n, b, k)
+def make_face_model(c: Call) -> Arguments:
+    """Letters of lengths: `v` vertices, `e` expressions, `j` free joints (the first joint is not free)."""
+    joints = range(c.size("j+1"))
+    parents = [int(c.rng.integers(-1, joint)) if joint else -1 for joint in joints]
+    return c.given("e v 3", "?9*j v 3", "e j+1 3", "e j+1 3", "+v j+1", parents, [joint > 0 for joint in joints])
 
 
-def skin_points(native: Any, rng: Rng) -> Arguments:
-    points, (n, b, _) = skin_arrays(native, rng)
-    return [points, empty(b, n, 3)]
+def posing(c: Call) -> Arguments:
+    head = ("b 3", "b 3") if c.flag(0.7) else (None, None)
+    return [c.make_face_model(*make_face_model(c)), c.FaceArrays("v 3", "j+1 3", "b e", "b j 3", *head)]
 
 
-def skin_points_backward(native: Any, rng: Rng) -> Arguments:
-    points, (n, b, k) = skin_arrays(native, rng)
-    filled = empty(n, 3), empty(b, n, 3), empty(n, k), empty(b, k, 3, 4)
-    return [points, native.SkinPointsGradients(normal(rng, b, n, 3), *filled)]
+def pose_face_backward(c: Call) -> Arguments:
+    outputs = c.FaceArrays("=b v 3", "=b j+1 3", "=b e", "=b j 3", "=b 3", "=b 3")
+    return [*posing(c), *c.given("b v 3", "b v 3"), outputs]
 
 
-# Faces
-
-Sizes = tuple[int, int, int]
-
-
-def sizes_of_face(rng: Rng) -> Sizes:
-    """Return the numbers of vertices, expressions and free joints (the first joint is not free)."""
-    return int(rng.choice([3, 15, 16, 50])), int(rng.integers(0, 6)), int(rng.integers(0, 4))
+def rig_forward(c: Call) -> Arguments:
+    world = c.WorldShapes("=a n 3", "=a n 4", "=a n 3")
+    return c.given("a v 3", "<v t 3", "<t n", c.LocalShapes("n 3", "n 4", "n 3"), "=a t 20", world)
 
 
-def make_face_model(native: Any, rng: Rng, sizes: Sizes | None = None) -> Arguments:
-    v, e, j = sizes or sizes_of_face(rng)
-    pose_basis = normal(rng, 9 * j, v, 3) if rng.random() < 0.5 else None
-    bases = normal(rng, e, j + 1, 3), normal(rng, e, j + 1, 3)
-    weights = np.abs(normal(rng, v, j + 1))
-    parents = [int(rng.integers(-1, joint)) if joint else -1 for joint in range(j + 1)]
-    return [normal(rng, e, v, 3), pose_basis, *bases, weights, parents, [False] + [True] * j]
+def rig_backward(c: Call) -> Arguments:
+    vertices, faces, face_index, local, frames, posed = rig_forward(c)
+    c.native.rig_forward(vertices, faces, face_index, local, frames, posed)
+    topology = c.make_rig_topology(c.size("v"), faces, face_index)
+    outputs = c.LocalShapes("=n 3", "=n 4", "=n 3"), "=a v 3"
+    by_world = c.WorldShapes("a n 3", "a n 4", "a n 3")
+    return c.given(topology, vertices, local, frames, posed.scales, by_world, *outputs)
 
 
-def posing(native: Any, rng: Rng) -> tuple[Any, Any, Sizes, int]:
-    """Return a model, the inputs of one to three timesteps, and the sizes of both."""
-    sizes = v, e, j = sizes_of_face(rng)
-    b = int(rng.integers(1, 4))
-    head = [normal(rng, b, 3), normal(rng, b, 3)] if rng.random() < 0.7 else [None, None]
-    inputs = [normal(rng, v, 3), normal(rng, j + 1, 3), normal(rng, b, e), normal(rng, b, j, 3), *head]
-    return native.make_face_model(*make_face_model(native, rng, sizes)), native.FaceArrays(*inputs), sizes, b
+def ride(c: Call) -> Arguments:
+    topology = c.make_rig_topology(c.size("v"), "<v t 3", "<t n")
+    face = c.FaceArrays("v 3", "j+1 3", "1 e", "1 j 3", "1 3", "1 3")
+    posed = c.PosedGaussians("=1 n 3", "=1 n 4", "=1 n 3", "=n", "=1 4 4")
+    local = c.LocalGaussians("n 3", "n 4", "n 3", "n")
+    return [c.make_face_model(*make_face_model(c)), topology, c.flag(), face, local, posed]
 
 
-def pose_face(native: Any, rng: Rng) -> Arguments:
-    model, face, (v, _, _), b = posing(native, rng)
-    return [model, face, empty(b, v, 3), empty(b, v, 3)]
-
-
-def pose_face_backward(native: Any, rng: Rng) -> Arguments:
-    model, face, (v, e, j), b = posing(native, rng)
-    outputs = [empty(b, v, 3), empty(b, j + 1, 3), empty(b, e), empty(b, j, 3), empty(b, 3), empty(b, 3)]
-    return [model, face, normal(rng, b, v, 3), normal(rng, b, v, 3), native.FaceArrays(*outputs)]
-
-
-# Rigs
-
-FRAME = 20
-"""Number of floats in a triangle's frame (TRIANGLE_FRAME_FLOATS)."""
-
-
-def rig(rng: Rng, v: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return faces, face_index, and local means, quats and log_scales."""
-    f, n = few(rng), few(rng)
-    return below(rng, v, f, 3), below(rng, f, n), [normal(rng, n, 3), normal(rng, n, 4), normal(rng, n, 3)]
-
-
-def world(n: int, b: int) -> list[np.ndarray]:
-    return [empty(b, n, 3), empty(b, n, 4), empty(b, n, 3)]
-
-
-def rig_forward(native: Any, rng: Rng) -> Arguments:
-    b, v = int(rng.integers(1, 3)), few(rng) + 2
-    faces, face_index, local = rig(rng, v)
-    outputs = empty(b, len(faces), FRAME), native.WorldShapes(*world(len(face_index), b))
-    return [normal(rng, b, v, 3), faces, face_index, native.LocalShapes(*local), *outputs]
-
-
-def make_rig_topology(native: Any, rng: Rng) -> Arguments:
-    v = few(rng) + 2
-    faces, face_index, _ = rig(rng, v)
-    return [v, faces, face_index]
-
-
-def rig_backward(native: Any, rng: Rng) -> Arguments:
-    vertices, faces, face_index, local, frames, posed = rig_forward(native, rng)
-    native.rig_forward(vertices, faces, face_index, local, frames, posed)
-    topology = native.make_rig_topology(vertices.shape[1], faces, face_index)
-    by_world = native.WorldShapes(*(normal(rng, *array.shape) for array in posed))
-    outputs = native.LocalShapes(*(empty(*array.shape) for array in local)), empty(*vertices.shape)
-    return [topology, vertices, local, frames, posed.scales, by_world, *outputs]
-
-
-def ride(native: Any, rng: Rng) -> Arguments:
-    sizes = v, e, j = sizes_of_face(rng)
-    model = native.make_face_model(*make_face_model(native, rng, sizes))
-    faces, face_index, local = rig(rng, v)
-    topology, n = native.make_rig_topology(v, faces, face_index), len(face_index)
-    parameters = normal(rng, 1, e), normal(rng, 1, j, 3), normal(rng, 1, 3), normal(rng, 1, 3)
-    face = native.FaceArrays(normal(rng, v, 3), normal(rng, j + 1, 3), *parameters)
-    posed = native.PosedGaussians(*world(n, 1), empty(n), empty(1, 4, 4))
-    return [model, topology, bool(rng.random() < 0.5), face, native.LocalGaussians(*local, normal(rng, n)), posed]
-
-
-def ride_backward(native: Any, rng: Rng) -> Arguments:
-    model, topology, in_head, face, local, posed = ride(native, rng)
-    own = native.ride(model, topology, in_head, face, local, posed)
-    by_posed = native.PosedGaussians(*(normal(rng, *array.shape) for array in posed))
-    by_local = native.LocalGaussians(*(empty(*array.shape) for array in local))
-    by_face = native.FaceParameterGradients(*(empty(*array.shape) for array in face[2:]))
-    moved = by_face if rng.random() < 0.7 else None
+def ride_backward(c: Call) -> Arguments:
+    model, topology, in_head, face, local, posed = ride(c)
+    own = c.native.ride(model, topology, in_head, face, local, posed)
+    by_posed = c.PosedGaussians("1 n 3", "1 n 4", "1 n 3", "n", "1 4 4")
+    by_local = c.LocalGaussians("=n 3", "=n 4", "=n 3", "=n")
+    moved = c.maybe(c.FaceParameterGradients("=1 e", "=1 j 3", "=1 3", "=1 3"), 0.7)
     return [own, model, topology, face, local, posed.scales, posed.opacities, by_posed, by_local, moved]
 
 
 # Pictures of Gaussians
 
 
-def view(native: Any, rng: Rng, height: int, width: int) -> Any:
-    n, k = int(rng.choice([0, 1, 5, 17, 300])), int(rng.choice([1, 4, 9, 16]))
-    scales = np.exp(normal(rng, n, 3) - 3).astype(F32)
-    shapes = normal(rng, n, 3, scale=0.5), normal(rng, n, 4), scales
-    gaussians = native.GaussianArrays(*shapes, rng.random(n).astype(F32), normal(rng, n, k, 3))
-    K, viewmat = camera(rng, height, width)
-    out = empty(height, width, 3), empty(height, width), empty(n, dtype=I32)
-    return native.RasterizeView(gaussians, np.ones(3, F32), viewmat, K, *out)
+def view(c: Call) -> Any:
+    scales = np.exp(c.array("g 3") - 3).astype(F32)
+    gaussians = c.GaussianArrays(0.5 * c.array("g 3"), "g 4", scales, "%g", "g q 3")
+    K, viewmat = c.camera()
+    return c.RasterizeView(gaussians, np.ones(3, F32), viewmat, K, "=H W 3", "=H W", "=g:i4")
 
 
-def rasterize_views(native: Any, rng: Rng) -> Arguments:
-    views = [view(native, rng, *picture(rng)) for _ in range(int(rng.integers(1, 3)))]
-    return [views, bool(rng.random() < 0.7)]
+def rasterize_views(c: Call) -> Arguments:
+    return [[view(Call(c.native, c.rng)) for _ in range(c.size("a"))], c.flag(0.7)]
 
 
-def rasterize_views_backward(native: Any, rng: Rng) -> Arguments:
-    views, _ = rasterize_views(native, rng)
-    tasks = []
-    for own, frame in zip(views, native.rasterize_views(views, True), strict=True):
+def rasterize_views_backward(c: Call) -> Arguments:
+    views, tasks = rasterize_views(c)[0], []
+    for own, frame in zip(views, c.native.rasterize_views(views, True), strict=True):
+        c.sizes |= dict(zip("HW", own.alpha.shape, strict=True))
+        gradients = c.native.GaussianArrays(*(np.zeros_like(array) for array in own.gaussians))
+        of_view = f"={len(gradients.means)} 2", "=4 4", "=3 3"
         known = frame, own.gaussians, own.image, own.alpha
-        by_alpha = normal(rng, *own.alpha.shape) if rng.random() < 0.5 else None
-        gradients = native.GaussianArrays(*(empty(*array.shape) for array in own.gaussians))
-        of_view = empty(len(gradients.means), 2), empty(4, 4), empty(3, 3)
-        by_image = normal(rng, *own.image.shape)
-        tasks.append(native.RasterizeGradients(*known, by_image, by_alpha, gradients, *of_view))
+        tasks.append(c.RasterizeGradients(*known, "H W 3", "?H W", gradients, *of_view))
     return [tasks]
+
+
+# Meshes
+
+
+def rasterize_mesh(c: Call) -> Arguments:
+    return c.given("V 3", "<V t 3", *c.camera(), c.flag(), c.Fragments("=H W:i4", "=H W 3", "=H W"))
+
+
+def fragments(c: Call) -> Arguments:
+    """Return a drawn mesh, its image points and its faces."""
+    vertices, faces, K, viewmat, _, out = rasterize_mesh(c)
+    c.native.rasterize_mesh(vertices, faces, K, viewmat, False, out)
+    points = (vertices @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+    return [out, np.ascontiguousarray(points, F32), faces]
+
+
+def with_edges(c: Call) -> Arguments:
+    """Return a drawn mesh with all edges of all faces; half of the edges have a second triangle."""
+    out, points, faces = fragments(c)
+    vertices = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int32)
+    opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]]).astype(np.int32)
+    own = np.tile(np.arange(len(faces), dtype=np.int32), 3)
+    other = np.where(c.rng.random(len(own)) < 0.5, np.int32(-1), c.array("<t 3*t:i4"))
+    arrays = vertices, np.stack([own, other], 1), opposite
+    return [out, points, faces, c.native.MeshEdges(*(np.ascontiguousarray(array) for array in arrays))]
+
+
+def interpolated(c: Call, *others: str) -> Arguments:
+    (face_index, barycentric, _), _, faces = fragments(c)
+    return c.given(face_index, barycentric, "V c", faces, *others)
+
+
+def mesh_loss(c: Call) -> Arguments:
+    target = c.LossTarget("H W 3", "+H W", 0.1)
+    gradients = c.LossGradients("=V 3:f8", "=V 3", "=m n 3", "=9 3:f8")
+    surface = c.LitSurface("V 3", "t 3 2", "+t", "m n 3", "9 3")
+    return c.given(*with_edges(c), surface, target, "=H W 3", gradients)
+
+
+def align_surface(c: Call) -> Arguments:
+    return c.given("<V t 3", "%t 3 2", "<2 t:u1", "+G U 3", "+G U", 0.1, 3.0, 0.05)
+
+
+def sighting(c: Call, *others: Any) -> Arguments:
+    """Return a surface and a picture of it."""
+    seen = c.SightingArrays("V 3", "V 3", *c.camera(), "H W 3", np.ones(c.picture(), F32), "9 3")
+    return c.given(c.AlignSurface(*align_surface(c)), seen, *others)
+
+
+def align_mesh(c: Call) -> Arguments:
+    outputs = c.given(c.AlignDerivatives("V 3 p", "=p p", "=p"), "=H W 3", "=H W 3")
+    return sighting(c, int(c.rng.integers(0, 9)), *(c.maybe(one, 0.7) for one in outputs))
+
+
+def bake_texture(c: Call) -> Arguments:
+    sums = c.TextureSums("=G U", "=G U 3", "=G U 3", "=G U 3")
+    return sighting(c, c.array("<t+1 G U:i4") - np.int32(1), "G U 3", sums)
 
 
 # Training
 
 
-def photometric_loss(native: Any, rng: Rng) -> Arguments:
-    h, w = picture(rng)
-    left, top = int(rng.integers(0, w)), int(rng.integers(0, h))
-    box = (left, top, int(rng.integers(0, w - left + 1)), int(rng.integers(0, h - top + 1)))
-    target = below(rng, 256, h, w, 3, dtype=U8) if rng.random() < 0.5 else normal(rng, h, w, 3)
-    drawn = np.maximum(normal(rng, h, w), 0) if rng.random() < 0.5 else None
-    gradient = empty(h, w, 3) if rng.random() < 0.7 else None
-    return [box, (0.8, 0.2), normal(rng, h, w, 3), target, drawn, gradient, empty()]
+def photometric_loss(c: Call) -> Arguments:
+    target = "<256 H W 3:u1" if c.flag() else "H W 3"
+    return c.given(tuple(c.box()), (0.8, 0.2), "H W 3", target, "?+H W", "?=H W 3", np.zeros((), F32))
 
 
-def factored_adam_update(native: Any, rng: Rng) -> Arguments:
-    values, rows, columns, *_ = factored_update(native, rng)
-    first, second = normal(rng, *values.shape), np.abs(normal(rng, *values.shape))
-    return [values, rows, columns, first, second, np.array(rng.integers(0, 9), np.float32), 0.01]
-
-
-def adam_update(native: Any, rng: Rng) -> Arguments:
+def adam_update(c: Call) -> Arguments:
     def task() -> Any:
-        shape = few(rng), int(rng.integers(1, 4))
-        moments = normal(rng, *shape), np.abs(normal(rng, *shape)), np.array(rng.integers(0, 9), F32)
-        return native.AdamTask(normal(rng, *shape), normal(rng, *shape), *moments, 0.01)
+        own, steps = Call(c.native, c.rng), np.array(c.rng.integers(0, 9), F32)
+        return own.AdamTask("n d", "n d", "n d", "+n d", steps, 0.01)
 
-    return [[task() for _ in range(int(rng.integers(1, 3)))]]
-
-
-def triangle_penalties(native: Any, rng: Rng) -> Arguments:
-    n = few(rng)
-    inputs = normal(rng, n, 3), normal(rng, n, 3), below(rng, 3, n, dtype=I32)
-    return [(1.0, 0.6), (0.01, 1.0), *inputs, empty(n, 3), empty(n, 3), empty(), empty()]
+    return [[task() for _ in range(c.size("a"))]]
 
 
-def observe_view(native: Any, rng: Rng) -> Arguments:
-    n = few(rng)
-    inputs = normal(rng, n, 2), below(rng, 3, n, dtype=I32), normal(rng, n)
-    return [(2.0, 3.0), *inputs, empty(n), empty(n), empty(n, dtype=I32), empty(n)]
+def number() -> np.ndarray:
+    return np.zeros((), F32)
 
 
-def keep_on_surface(native: Any, rng: Rng) -> Arguments:
-    n, f = few(rng), int(rng.integers(1, 9))
-    pulls = normal(rng, f, 4) if rng.random() < 0.5 else None
-    shapes = normal(rng, n, 3), normal(rng, n, 4), normal(rng, n, 3)
-    return [below(rng, f, n, dtype=np.int64), normal(rng, f, 5), 1.6, *shapes, pulls, normal(rng, n, 3)]
-
-
-def clear_rows(native: Any, rng: Rng) -> Arguments:
-    n = few(rng)
-    return [below(rng, 2, n, dtype=U8), [normal(rng, n), normal(rng, n, 3), normal(rng, n, 2, 4)]]
-
-
-def mean_squared_difference(native: Any, rng: Rng) -> Arguments:
-    size = *picture(rng), 3
-    return [normal(rng, *size), below(rng, 256, *size, dtype=U8)]
-
-
-def absolute_difference(native: Any, rng: Rng) -> Arguments:
-    size = picture(rng)
-    return [normal(rng, *size), below(rng, 256, *size, dtype=U8), 0.5, empty(*size), empty()]
-
-
-def box_of_nonzero(native: Any, rng: Rng) -> Arguments:
-    return [np.maximum(normal(rng, *picture(rng)) - 2, 0).astype(F32)]
-
-
-def composite(native: Any, rng: Rng) -> Arguments:
-    height, width = picture(rng)
-    image, matte = below(rng, 256, height, width, 3, dtype=U8), below(rng, 256, height, width, dtype=U8)
-    left, top = int(rng.integers(0, width)), int(rng.integers(0, height))
-    box = [left, top, int(rng.integers(0, width - left + 1)), int(rng.integers(0, height - top + 1))]
-    return [image, matte, [1, 2, 255], box, empty(height, width, 3, dtype=U8)]
-
-
-BASELINES: dict[str, Baseline] = {
-    one.__name__: one
-    for one in (
-        expression_change, expression_change_backward, feature_network, feature_network_backward, factored_update,
-        point_network, point_network_backward, skin_points, skin_points_backward, activate_points, make_face_model,
-        pose_face, pose_face_backward, rig_forward, make_rig_topology, rig_backward, ride, ride_backward,
-        rasterize_views, rasterize_views_backward, photometric_loss, adam_update, factored_adam_update,
-        triangle_penalties, observe_view, keep_on_surface, clear_rows, mean_squared_difference, absolute_difference,
-        box_of_nonzero, composite,
-    )
-} | {
-    **MESHES,
-    "sigmoid": of("n m", "=n m"),
-    "sigmoid_backward": of("n", "n", "=n"),
-    "expression_activations": of("i", "i", "i r", "k r", "=r"),
-    "expression_activations_backward": of("i", "i", "i r", "k r", "r", "=i"),
-    "add_bone": of("n 3", "n", "3 4", "n 3"),
-    "head_poses": of("b 3", "b 3", "=b 4 4"),
-    "head_poses_backward": of("b 3", "b 4 4", "=b 3"),
-    "compose_rigid": of("4 4", "4 4", "=4 4"),
-    "compose_rigid_backward": of("4 4", "4 4", "4 4", "=4 4", "=4 4"),
-    "recycled": lambda native, rng: [[few(rng), few(rng)]],
-    "thread_count": lambda native, rng: [],
-    "set_thread_count": lambda native, rng: [int(rng.integers(1, 4))],
-    "rasterize_isa": lambda native, rng: [],
-    "set_rasterize_isa": lambda native, rng: [str(rng.choice(["avx512", "avx2", "sse4", "baseline", ""]))],
+MAKERS: dict[str, Callable[[Call], Arguments]] = {
+    "AlignSurface": align_surface,
+    "absolute_difference": lambda c: c.given("H W", "<256 H W:u1", 0.5, "=H W", number()),
+    "activate_points": lambda c: [
+        c.RawPoints("n 11", "n 3", "n 4", "n", "n 3"), 0.5, 0.1, c.ActivatedPoints("=n 3", "=n 4", "=n", "=n 1 3")],
+    "adam_update": adam_update,
+    "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),
+    "align_mesh": align_mesh,
+    "antialias": lambda c: c.given(*with_edges(c), "H W d", "=H W d"),
+    "antialias_backward": lambda c: c.given(*with_edges(c), "H W d", "H W d", "=H W d", "=V 3:f8"),
+    "bake_texture": bake_texture,
+    "barycentric_backward": lambda c: c.given(*fragments(c), "H W 3", "=V 3:f8"),
+    "box_of_nonzero": lambda c: [np.maximum(c.array("H W") - 2, 0)],
+    "clear_rows": lambda c: [c.array("<2 n:u1"), c.given("n", "n 3", "n 2 4")],
+    "compose_rigid": lambda c: c.given("4 4", "4 4", "=4 4"),
+    "compose_rigid_backward": lambda c: c.given("4 4", "4 4", "4 4", "=4 4", "=4 4"),
+    "composite": lambda c: c.given("<256 H W 3:u1", "<256 H W:u1", [1, 2, 255], c.box(), "=H W 3:u1"),
+    "expression_activations": lambda c: c.given("i", "i", "i r", "k r", "=r"),
+    "expression_activations_backward": lambda c: c.given("i", "i", "i r", "k r", "r", "=i"),
+    "expression_change": lambda c: c.given("n 3? r", "r", "=n 3?"),
+    "expression_change_backward": lambda c: c.given("n 3? r", "r", "n 3?", "=n 3? r", "=r"),
+    "factored_adam_update": lambda c: factored(c, "n k f", "+n k f", np.array(c.rng.integers(0, 9), F32)),
+    "factored_update": lambda c: factored(c, "+n f", "+n"),
+    "feature_network": lambda c: c.given(*network(c), c.maybe(c.FeatureKept("=n f", "=n h^")), "=n o", "=n"),
+    "feature_network_backward": feature_network_backward,
+    "head_poses": lambda c: c.given("n 3", "n 3", "=n 4 4"),
+    "head_poses_backward": lambda c: c.given("n 3", "n 4 4", "=n 3"),
+    "interpolate_mesh": lambda c: interpolated(c, "=H W c"),
+    "interpolate_mesh_backward": lambda c: interpolated(c, "H W c", "=V c", "=H W 3"),
+    "keep_on_surface": lambda c: c.given("<r n", "r 5", 1.6, "n 3", "n 4", "n 3", "?r 4", "n 3"),
+    "light_equations": lambda c: sighting(c, "=3 9 9:f8", "=3 9:f8"),
+    "make_face_model": make_face_model,
+    "make_rig_topology": lambda c: c.given(c.size("v"), "<v t 3", "<t n"),
+    "mean_squared_difference": lambda c: c.given("H W 3", "<256 H W 3:u1"),
+    "mesh_loss": mesh_loss,
+    "observe_view": lambda c: c.given((2.0, 3.0), "n 2", "<3 n:i4", "n", "=n", "=n", "=n:i4", "=n"),
+    "photometric_loss": photometric_loss,
+    "point_network": lambda c: c.given(*point_layers(c), "?=n y", "=n l"),
+    "point_network_backward": point_network_backward,
+    "pose_face": lambda c: c.given(*posing(c), "=b v 3", "=b v 3"),
+    "pose_face_backward": pose_face_backward,
+    "rasterize_isa": lambda c: [],
+    "rasterize_mesh": rasterize_mesh,
+    "rasterize_views": rasterize_views,
+    "rasterize_views_backward": rasterize_views_backward,
+    "recycled": lambda c: [[c.size("n"), c.size("m")]],
+    "ride": ride,
+    "ride_backward": ride_backward,
+    "rig_backward": rig_backward,
+    "rig_forward": rig_forward,
+    "sample_texture": lambda c: c.given("H W d", "n 2", "=n d"),
+    "sample_texture_backward": lambda c: c.given("H W d", "n 2", "n d", "=H W d", "=n 2"),
+    "set_rasterize_isa": lambda c: [str(c.rng.choice(["avx512", "avx2", "sse4", "baseline", ""]))],
+    "set_thread_count": lambda c: [c.size("b")],
+    "sigmoid": lambda c: c.given("n m", "=n m"),
+    "sigmoid_backward": lambda c: c.given("n", "n", "=n"),
+    "skin_points": lambda c: c.given(skinned(c), "=B n 3"),
+    "skin_points_backward": lambda c: [
+        skinned(c), c.SkinPointsGradients("B n 3", "=n 3", "=B n 3", "=n K", "=B K 3 4")],
+    "thread_count": lambda c: [],
+    "triangle_penalties": lambda c: c.given(
+        (1.0, 0.6), (0.01, 1.0), "n 3", "n 3", "<3 n:i4", "=n 3", "=n 3", number(), number()),
 }  # fmt: skip
-"""Functions that make the positional arguments of a valid call, by the name of the native function."""
+"""What makes the arguments of a valid call, by the name of the native function."""
+
+
+def arguments_of(name: str, native: Any, rng: Rng) -> Arguments:
+    """Return the positional arguments of a valid call."""
+    return MAKERS[name](Call(native, rng))

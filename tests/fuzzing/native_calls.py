@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from native_baselines import BASELINES
-from native_mesh_baselines import Rng
+
+from fuzzing.native_baselines import MAKERS, Rng, arguments_of
 
 REFUSALS = (TypeError, ValueError, IndexError, OverflowError, MemoryError, BufferError)
 SECONDS_A_CALL = 20
@@ -218,7 +218,7 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
             new = at(arguments, paths[int(rng.integers(0, len(paths)))])
         elif kind < 0.95:  # the same type, but from another call
             value: Any = at(arguments, path)
-            stranger = BASELINES[str(rng.choice(STRANGERS))](native, rng)
+            stranger = arguments_of(str(rng.choice(STRANGERS)), native, rng)
             alike = [own for own in places(stranger) if isinstance(at(stranger, own), type(value))]
             new = at(stranger, alike[int(rng.integers(0, len(alike)))]) if alike else None
             if not alike or rng.random() < 0.1:
@@ -233,9 +233,9 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
 
 def run_call(native: Any, seed: int, number: int) -> tuple[str, str]:
     """Make one call, and return the function's name and the outcome."""
-    names = sorted(BASELINES)
+    names = sorted(MAKERS)
     name, rng = names[number % len(names)], np.random.default_rng((seed, number))
-    arguments = BASELINES[name](native, rng)
+    arguments = arguments_of(name, native, rng)
     valid = rng.random() < 0.05
     if not valid:
         arguments = mutate(native, rng, arguments)
@@ -252,7 +252,7 @@ def child(path: str, seed: int, first: int, last: int, log: Path) -> None:
     """Run the calls from `first` to `last` - 1. If a call ends the process, the last line of the log is incomplete."""
     warnings.simplefilter("ignore")  # numpy warns of objects that were never made
     native = load(path)
-    assert bound_names(native) == set(BASELINES), bound_names(native) ^ set(BASELINES)
+    assert bound_names(native) == set(MAKERS), bound_names(native) ^ set(MAKERS)
     assert native.TRIANGLE_FRAME_FLOATS == 20
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -294,7 +294,7 @@ def main() -> int:
         first, last, log = options.child
         child(library, options.seed, int(first), int(last), Path(log))
         return 0
-    here = [sys.executable, __file__, str(options.build), "--seed", str(options.seed)]
+    here = [sys.executable, "-m", "fuzzing.native_calls", str(options.build), "--seed", str(options.seed)]
     next_call, end = (0, options.calls) if options.call is None else (options.call, options.call + 1)
     findings, results = 0, collections.Counter[tuple[str, str]]()
     with tempfile.TemporaryDirectory() as folder:
