@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from blink_case import SKIN, BlinkCase
+from blink_case import SKIN, WHITE, BlinkCase
 from mien.tracking.eyelids import place_lids
 from mien.tracking.eyelids.eyes import eyes_of
 from mien.tracking.eyelids.placing import weigh_positions
-from mien.tracking.fitting import CameraBatch, Views, layout_of
+from mien.tracking.fitting import CameraBatch, Shot, Views, layout_of
 from small_face_model import make_small_face_model
-
-pytestmark = pytest.mark.unchecked
 
 TIMESTEPS = 24
 POSITIONS = np.linspace(-0.4, 1.2, 13)
@@ -36,49 +34,50 @@ def blinks() -> np.ndarray:
     return lids
 
 
-def test_blinks_that_landmarks_missed_are_found_in_pictures(case):
+@pytest.fixture(scope="module")
+def blinking(case) -> Shot:
+    return case.shot(blinks())
+
+
+def place(case: BlinkCase, shot: Shot, tracked: np.ndarray) -> np.ndarray:
+    """Return the lids that are placed, after a look that nothing but lids has moved."""
+    before = case.fit(tracked)
+    after = place_lids(case.reduced, [shot], before, 1.0)
+    others = torch.ones(case.reduced.layout.size, dtype=torch.bool)
+    others[case.columns] = False
+    assert torch.equal(after.sequences[0].state[:, others], before.sequences[0].state[:, others])
+    return case.lids_of(after)
+
+
+def test_blinks_that_landmarks_missed_are_found_in_pictures(case, blinking):
     true = blinks()
-    tracked = 0.1 + 0.4 * (true - 0.1)
-    found = case.lids_of(place_lids(case.reduced, [case.shot(true)], case.fit(tracked), 1.0))
+    found = place(case, blinking, 0.1 + 0.4 * (true - 0.1))
     np.testing.assert_allclose(found[true > 0.5], true[true > 0.5], atol=0.15)
     # A wink closes only one eye, and open eyes stay open.
     np.testing.assert_allclose(found[true < 0.5], 0.1, atol=0.05)
 
 
-def test_blinks_that_never_were_are_opened(case):
-    false = still()
+@pytest.mark.unchecked
+def test_blinks_that_never_were_are_opened_and_nobody_blinks_where_nobody_does(case):
+    shot, false = case.shot(still()), still()
     false[11] = 0.7
-    found = case.lids_of(place_lids(case.reduced, [case.shot(still())], case.fit(false), 1.0))
-    np.testing.assert_allclose(found, 0.1, atol=0.1)
-
-
-def test_nobody_blinks_where_nobody_does(case):
+    np.testing.assert_allclose(place(case, shot, false), 0.1, atol=0.1)
     tracked = still() + 0.03 * np.random.default_rng(0).standard_normal((TIMESTEPS, 2))
-    found = case.lids_of(place_lids(case.reduced, [case.shot(still())], case.fit(tracked), 1.0))
-    assert np.abs(found - 0.1).max() < np.abs(tracked - 0.1).max() + 0.01
+    assert np.abs(place(case, shot, tracked) - 0.1).max() < np.abs(tracked - 0.1).max() + 0.01
 
 
-def test_only_lids_move(case):
-    true = blinks()
-    before = case.fit(still())
-    after = place_lids(case.reduced, [case.shot(true)], before, 1.0)
-    others = torch.ones(case.reduced.layout.size, dtype=torch.bool)
-    others[case.columns] = False
-    assert torch.equal(after.sequences[0].state[:, others], before.sequences[0].state[:, others])
-
-
+@pytest.mark.unchecked
 @pytest.mark.parametrize("what", ["no weight", "too small", "eyes like skin"])
-def test_what_pictures_do_not_show_stays_as_tracked(case, what):
+def test_what_pictures_do_not_show_stays_as_tracked(case, blinking, what):
     size = 40 if what == "too small" else 192
-    true, tracked = blinks(), still()
-    shot = case.shot(true, size, **({"white": SKIN} if what == "eyes like skin" else {}))
-    found = place_lids(case.reduced, [shot], case.fit(tracked, size), 0.0 if what == "no weight" else 1.0)
-    np.testing.assert_allclose(case.lids_of(found), tracked, atol=0.05 if what == "eyes like skin" else 0)
+    shot = blinking if what == "no weight" else case.shot(blinks(), size, white=WHITE if what == "too small" else SKIN)
+    found = place_lids(case.reduced, [shot], case.fit(still(), size), 0.0 if what == "no weight" else 1.0)
+    np.testing.assert_allclose(case.lids_of(found), still(), atol=0.05 if what == "eyes like skin" else 0)
 
 
-def test_of_several_cameras_the_one_that_an_eye_faces_tells(case):
-    true = blinks()
-    front, tracked = case.shot(true), case.fit(still())
+@pytest.mark.unchecked
+def test_of_several_cameras_the_one_that_an_eye_faces_tells(case, blinking):
+    true, front, tracked = blinks(), blinking, case.fit(still())
     cameras = tracked.sequences[0].cameras
     side = cameras.viewmat[0].clone()
     side[:3, 3] += torch.tensor([0.5, 0.0, 0.0])  # sees the head from 35 degrees to the side
@@ -97,11 +96,12 @@ def test_of_several_cameras_the_one_that_an_eye_faces_tells(case):
     np.testing.assert_allclose(case.lids_of(found), true, atol=0.2)
 
 
-def test_is_the_same_with_any_number_of_threads(case, monkeypatch):
-    shot, found = case.shot(blinks()), []
+@pytest.mark.unchecked
+def test_is_the_same_with_any_number_of_threads(case, blinking, monkeypatch):
+    found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("MIEN_THREADS", threads)
-        found.append(place_lids(case.reduced, [shot], case.fit(still()), 1.0).sequences[0].state)
+        found.append(place_lids(case.reduced, [blinking], case.fit(still()), 1.0).sequences[0].state)
     assert torch.equal(*found)
 
 
@@ -121,41 +121,29 @@ def test_models_that_cannot_close_an_eye_have_none(case):
     assert eyes_of(blind, layout_of(blind)) == []
 
 
-def bowls(at: np.ndarray, depth: float = 400.0) -> np.ndarray:
-    return depth * (POSITIONS - at[:, None]) ** 2
+def at(places: dict[int, float], otherwise: float = 0.1) -> np.ndarray:
+    """Return fifty positions of a lid that are alike but at some frames."""
+    positions = np.full(50, otherwise)
+    positions[list(places)] = list(places.values())
+    return positions
 
 
-def test_colors_that_agree_change_little():
-    tracked = 0.1 + 0.02 * np.random.default_rng(0).standard_normal(50)
-    np.testing.assert_allclose(weigh_positions(bowls(tracked), tracked, 1.0), tracked, atol=0.02)
+TREMBLING = 0.1 + 0.02 * np.random.default_rng(0).standard_normal(50)
+ANYWHERE = np.random.default_rng(0).uniform(0.0, 1.0, 50)
+SHUT, OPENER = {30: 1.0}, {10: -2.0}
+BLINK = {20: 0.5, 21: 1.0, 22: 0.5}
 
 
-def test_a_few_frames_that_disagree_follow_the_colors():
-    tracked = np.full(50, 0.1)
-    seen = tracked.copy()
-    seen[20:23] = (0.5, 1.0, 0.5)
-    np.testing.assert_allclose(weigh_positions(bowls(seen), tracked, 1.0), seen, atol=0.05)
-
-
-def test_colors_that_contradict_every_frame_count_for_nothing():
-    random = np.random.default_rng(0)
-    tracked = np.full(50, 0.1)
-    found = weigh_positions(bowls(random.uniform(0.0, 1.0, 50)), tracked, 1.0)
-    np.testing.assert_allclose(found, tracked, atol=0.05)
-
-
-def test_what_colors_find_too_open_throughout_is_corrected_but_where_lids_meet():
-    tracked = np.full(50, 0.2)
-    tracked[30] = 0.5
-    seen = np.full(50, 0.1)
-    seen[30] = 1.0
-    found = weigh_positions(bowls(seen), tracked, 1.0)
-    np.testing.assert_allclose(np.delete(found, 30), 0.2, atol=0.02)
-    assert found[30] == pytest.approx(1.0, abs=0.05)
-
-
-def test_frames_whose_lids_would_be_opener_than_any_are_left_alone():
-    tracked = np.full(50, 0.1)
-    seen = tracked.copy()
-    seen[10] = -2.0
-    assert weigh_positions(bowls(seen), tracked, 1.0)[10] == pytest.approx(0.1, abs=0.01)
+@pytest.mark.parametrize(
+    ("tracked", "seen", "expected", "tolerance"),
+    [
+        pytest.param(TREMBLING, TREMBLING, TREMBLING, 0.02, id="colours that agree change little"),
+        pytest.param(at({}), at(BLINK), at(BLINK), 0.05, id="a few frames that disagree follow the colours"),
+        pytest.param(at({}), ANYWHERE, at({}), 0.05, id="colours that contradict every frame count for nothing"),
+        pytest.param(at({30: 0.5}, 0.2), at(SHUT), at(SHUT, 0.2), 0.05, id="too open throughout, but where lids meet"),
+        pytest.param(at({}), at(OPENER), at({}), 0.01, id="opener than any is left alone"),
+    ],
+)
+def test_positions_are_weighed(tracked: np.ndarray, seen: np.ndarray, expected: np.ndarray, tolerance: float):
+    bowls = 400.0 * (POSITIONS - seen[:, None]) ** 2
+    np.testing.assert_allclose(weigh_positions(bowls, tracked, 1.0), expected, atol=tolerance)

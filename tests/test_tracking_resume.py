@@ -76,8 +76,9 @@ def track_until_killed(piece: str, *words: str) -> None:
 def test_killed_tracking_goes_on(tmp_path, monkeypatch, capsys, fork_server):
     """A tracking that was killed, not asked to stop, ends with the same file after the same command."""
     monkeypatch.setattr(stage, "face_model_of", lambda choice: make_textured_model())
-    command = ["--overlay", "none", "--tracking.photometric.texture-size", "64"]
-    capture = replace(make_photometric_case(timesteps=4).capture, name="clip")
+    pixels = {"texture-size": 64, "keyframes": 3, "shared-steps": 1}
+    command = ["--overlay", "none", *(f"--tracking.photometric.{name}={value}" for name, value in pixels.items())]
+    capture = replace(make_photometric_case(timesteps=3).capture, name="clip")
     for name in ("killed", "undisturbed"):
         write_capture(tmp_path / name / "sequences/clip/capture", capture)
     assert main(["track", str(tmp_path / "undisturbed"), *command]) == 0
