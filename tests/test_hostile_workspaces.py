@@ -20,13 +20,12 @@ from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate
 from mien.face.loading import read_landmarks
-from mien.storage import file_digest, read_arrays, read_json, read_tensors, write_json, write_tensors
+from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import TrackingSettings, pipeline, read_scoring, read_tracking, track_subject
 from mien.training import read_sequence
 from shared_things import MadeOnce, evaluated_workspace
 from toy_scene import toy_face_model
 
-NOT_ONE_LINE = "a\nb"
 HUGE = 10**400
 
 
@@ -94,37 +93,6 @@ def test_parts_of_a_sequence_have_to_be_of_the_same_pictures(workspace: Path) ->
     read_tracking(clip / "tracking")
     with pytest.raises(UserError, match="other pictures than the capture"):
         read_sequence(clip)
-
-
-@pytest.mark.parametrize(
-    ("header", "message"),
-    [
-        (b'{"__metadata__": [1]}', "metadata is not an object"),
-        (b'{"__metadata__": "x"}', "metadata is not an object"),
-        (b"[]", "metadata is not an object"),
-        (b"[" * 3000, "too deep"),
-        (b'{"a": ' + b"9" * 400 + b"}", "400 digits"),
-        (b'{"a": {"dtype": "F32", "shape": [1000000000000], "data_offsets": [0, 4000000000000]}}', "damaged"),
-        (b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}, "b": {"dtype": "F32", "shape": [1], '
-         b'"data_offsets": [0, 4]}}', "damaged"),
-        (b'{"a": {"dtype": "BF16", "shape": [2], "data_offsets": [0, 4]}}', "damaged"),
-    ],
-)  # fmt: skip
-def test_safetensors_headers_that_cannot_be(header: bytes, message: str, tmp_path: Path) -> None:
-    """Impossible safetensors headers are refused."""
-    path = tmp_path / "a.safetensors"
-    path.write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
-    with pytest.raises(UserError, match=message):
-        read_arrays(path)
-
-
-def test_a_huge_safetensors_file_is_not_read(tmp_path: Path) -> None:
-    path, header = tmp_path / "a.safetensors", b"{}"
-    path.write_bytes(len(header).to_bytes(8, "little") + header)
-    with path.open("r+b") as file:
-        file.truncate(1 << 40)
-    with pytest.raises(UserError, match="bytes, and at most"):
-        read_arrays(path)
 
 
 def test_a_chosen_number_of_parts_is_not_counted_to(
