@@ -19,7 +19,7 @@ from mien.cli import main
 from mien.gaussians import Gaussians
 from mien.lab.analysis import AnalysisOptions
 from mien.lab.analysis.context import Context
-from mien.lab.analysis.headgas import ablations, beyond, layers, sizes
+from mien.lab.analysis.headgas import ablations, basis, beyond, layers, sizes
 from mien.lab.analysis.headgas.basis import start_of_bases
 from mien.lab.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
 from mien.lab.analysis.views import head_camera, labeled, mouth_camera
@@ -51,6 +51,8 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _small_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sizes, "PAPER", {16: 4.0, 32: 8.0})
     monkeypatch.setattr(ablations, "SIZE", 16)
+    for part in (basis, beyond, layers):
+        monkeypatch.setattr(part, "SIDE", 32)
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from mien.commands.stages.comparing import Budget, CompareSettings
 from mien.face import add_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
 from mien.training import PRESETS, read_run_config, read_training_summary, trainer
-from mien.training.settings import Preset
 from mien.workspace import Workspace
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
@@ -50,34 +48,22 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return seen
 
 
-@pytest.fixture
-def few_lessons(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let methods that learn before the first picture take few lessons, with few points."""
-    original = Preset.config
-
-    def small(self: Preset, method: str) -> Any:
-        config = original(self, method)
-        return replace(config, pretraining=5, points=400, max_points=800) if hasattr(config, "pretraining") else config
-
-    monkeypatch.setattr(Preset, "config", small)
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("short_films", "few_lessons")
+@pytest.mark.usefixtures("short_films")
 def test_methods_get_the_same_frames_and_steps(
     workspace: Path, tmp_path: Path, trained: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert Compare().methods == tuple(METHODS)
-    methods = ("gaussian_avatars", "mono_gaussian_avatar", "textured_mesh")
-    command = ["bench", "compare", str(workspace), "--steps", "6", "--split", "tail", "--out", str(tmp_path)]
+    methods = ("gaussian_avatars", "textured_mesh")
+    command = ["bench", "compare", str(workspace), "--steps", "3", "--split", "tail", "--out", str(tmp_path)]
     assert main([*command, "--methods", "gaussian_avatars"]) == 0
     command += ["--methods", *methods]
     assert main([*command, "--json"]) == 0
-    assert [folder.name for folder in trained] == [f"compare-{method}-6-tail" for method in methods]
+    assert [folder.name for folder in trained] == [f"compare-{method}-3-tail" for method in methods]
     content = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert content["format"] == "mien.bench_compare"
     rows = content["rows"]
-    assert [(row["capture"], row["method"], row["steps"]) for row in rows] == [("anna", m, 6) for m in methods]
+    assert [(row["capture"], row["method"], row["steps"]) for row in rows] == [("anna", m, 3) for m in methods]
     stored = json.loads((tmp_path / "compare.json").read_text())
     assert stored["rows"] == rows
     scored_on = []

@@ -55,7 +55,6 @@ def test_head_pose_size_and_identity_do_not_count_as_expression() -> None:
 
 
 def test_figures_of_perfect_still_and_opposite_avatars() -> None:
-    """A perfect avatar has no error, and a still and an opposite one have known errors."""
     at_rest = _face()
     motions = []
     for step in range(6):
@@ -93,30 +92,29 @@ class _MadeUpReader:
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return a run, and a sequence of another workspace with two cameras."""
     root = tmp_path_factory.mktemp("cross")
-    experiment = make_experiment(timesteps=20)
+    experiment = make_experiment(timesteps=10)
     own = write_sequence(root / "anna", experiment, experiment.sequences[0])
     settings = plain_run(steps=5, checkpoint_every=5, split="none")
     write_run(root / "anna" / "runs" / "first", experiment, [own], settings)
-    other = make_experiment(timesteps=20, seed=1)
+    other = make_experiment(timesteps=10, seed=1)
     return own, write_sequence(root / "bert", other, two_cameras(other, "talk"))
 
 
 def test_protocol_from_folders(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Cross-reenactment from folders writes its figures into metrics.json."""
     monkeypatch.setattr(cross, "FaceReader", _MadeUpReader)
     own, driver = folders
     anna, bert = own.parent.parent, driver.parent.parent
     assert main(["evaluate", str(anna), "--no-perceptual", "--drivers", str(bert), str(own)]) == 0
-    assert "cross_reenactment (2 drivers, 40 frames): expression error" in capsys.readouterr().err
+    assert "cross_reenactment (2 drivers, 20 frames): expression error" in capsys.readouterr().err
     entry = json.loads((anna / "runs/first/metrics.json").read_text())["protocols"]["cross_reenactment"]
     assert [one["driver"] for one in entry["drivers"]] == ["bert_talk", "anna_clip"]
     assert entry["faces_found"] == 1.0
     assert entry["head_rotation_error_degrees"] == pytest.approx(
         np.mean([one["head_rotation_error_degrees"] for one in entry["drivers"]])
     )
-    assert probe_video(anna / "runs/first/videos/cross_reenactment_bert_talk.mp4").frames == 20
+    assert probe_video(anna / "runs/first/videos/cross_reenactment_bert_talk.mp4").frames == 10
     page = (anna / "runs/first/report.html").read_text()
     assert "Cross-reenactment" in page
     assert page.count("<video") == 2
@@ -125,7 +123,7 @@ def test_protocol_from_folders(
 def test_driven_avatar_keeps_its_identity_and_moves_from_its_own_neutral(folders: tuple[Path, Path]) -> None:
     own, driver = folders
     driven = load_driven(own.parent.parent / "runs" / "first", own, driver)
-    assert len(driven.faces) == 20
+    assert len(driven.faces) == 10
     torch.testing.assert_close(driven.faces.identity, driven.avatar.subject.identity)
     assert driven.driver_camera == 0, "the front camera looks at the face"
     rest = driven.by_rest[0]
@@ -137,9 +135,8 @@ def test_driven_avatar_keeps_its_identity_and_moves_from_its_own_neutral(folders
 
 
 def test_driver_of_another_face_model(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """A driver with another face model is refused."""
     own, driver = folders
-    experiment = make_experiment(timesteps=20)
+    experiment = make_experiment(timesteps=10)
     tracking = replace(experiment.sequences[0].tracking, face_model_hash="other")
     write_tracking(tmp_path / "sequences" / "x" / "tracking", tracking)
     with pytest.raises(UserError, match="track the driver with the avatar's"):
@@ -147,7 +144,6 @@ def test_driver_of_another_face_model(folders: tuple[Path, Path], tmp_path: Path
 
 
 def test_no_face_in_the_drivers_pictures(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A driver without a face in its pictures is refused."""
     monkeypatch.setattr(cross, "FaceReader", _MadeUpReader)
     monkeypatch.setattr(cross.Driven, "driver_picture", lambda self, timestep: np.full((8, 8, 3), 255, np.uint8))
     own, driver = folders

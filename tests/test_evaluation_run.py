@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ STEPS = 5
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return a sequence, and a run that was trained on it for a few steps."""
     root = tmp_path_factory.mktemp("workspace")
     folder, run_dir = root / "sequences" / "clip", root / "runs" / "first"
@@ -42,9 +43,21 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder, run_dir
 
 
-def test_evaluate_writes_metrics_and_report(workspace: tuple[Path, Path]) -> None:
-    folder, run_dir = workspace
-    returned = evaluate(run_dir, [folder])
+@pytest.fixture(scope="module")
+def evaluated(made: tuple[Path, Path]) -> dict[str, Any]:
+    """Return all figures of the run."""
+    return evaluate(made[1], [made[0]])
+
+
+@pytest.fixture
+def workspace(made: tuple[Path, Path], evaluated: dict[str, Any], tmp_path: Path) -> tuple[Path, Path]:
+    """Return a copy of sequence and evaluated run for one test."""
+    folder, run_dir = (Path(shutil.copytree(path, tmp_path / path.name)) for path in made)
+    return folder, run_dir
+
+
+def test_evaluate_writes_metrics_and_report(made: tuple[Path, Path], evaluated: dict[str, Any]) -> None:
+    run_dir, returned = made[1], evaluated
     stored = json.loads((run_dir / "metrics.json").read_text())
     assert (stored["format"], stored["version"]) == ("mien.metrics", 1)
     assert read_metrics(run_dir) == json.loads(json.dumps(returned))
@@ -64,19 +77,9 @@ def test_evaluate_writes_metrics_and_report(workspace: tuple[Path, Path]) -> Non
 
 
 @pytest.mark.unchecked
-def test_what_is_scored_is_known_to_be(workspace: tuple[Path, Path]) -> None:
+def test_what_is_scored_is_known_to_be(workspace: tuple[Path, Path], evaluated: dict[str, Any]) -> None:
     folder, run_dir = workspace
-    quick = EvaluationSettings(perceptual=False, video_frames=0)
-    (run_dir / "metrics.json").unlink(missing_ok=True)
-    assert not is_evaluated(run_dir, [folder], quick)
-    evaluate(run_dir, [folder], quick)
-    assert is_evaluated(run_dir, [folder], quick)
-    assert not is_evaluated(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))
-    assert not is_evaluated(run_dir, [folder], replace(quick, edges="filmed"))
-    (run_dir / "report.html").unlink()
-    assert not is_evaluated(run_dir, [folder], quick)
-    whole = evaluate(run_dir, [folder])["protocols"]["self_reenactment"]
-    short = EvaluationSettings(perceptual_of="avatar")
+    whole, short = evaluated["protocols"]["self_reenactment"], EvaluationSettings(perceptual_of="avatar")
     assert is_evaluated(run_dir, [folder], short)  # It has all figures of the short scoring, and more.
     entry = evaluate(run_dir, [folder], short)["protocols"]["self_reenactment"]
     assert entry["perceptual"] == whole["perceptual"]
@@ -84,17 +87,26 @@ def test_what_is_scored_is_known_to_be(workspace: tuple[Path, Path]) -> None:
     assert entry["baselines"]["mesh"]["perceptual"] is None
     assert whole["baselines"]["mesh"]["perceptual"] is not None
     assert not is_evaluated(run_dir, [folder])
-    evaluate(run_dir, [folder])
+    quick = EvaluationSettings(perceptual=False, video_frames=0)
+    (run_dir / "metrics.json").unlink()
+    assert not is_evaluated(run_dir, [folder], quick)
+    evaluate(run_dir, [folder], quick)
+    assert is_evaluated(run_dir, [folder], quick)
+    assert not is_evaluated(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))
+    assert not is_evaluated(run_dir, [folder], replace(quick, edges="filmed"))
+    (run_dir / "report.html").unlink()
+    assert not is_evaluated(run_dir, [folder], quick)
 
 
 @pytest.mark.unchecked
-def test_figures_of_other_scoring_masks_are_not_kept(workspace: tuple[Path, Path], tmp_path: Path) -> None:
-    """The masks of a sequence are written anew, and larger."""
-    folder, run_dir = tmp_path / "clip", tmp_path / "run"
-    shutil.copytree(workspace[0], folder)
-    shutil.copytree(workspace[1], run_dir)
+def test_figures_of_other_scoring_masks_are_not_kept(workspace: tuple[Path, Path]) -> None:
+    """The masks of a sequence are written anew, and larger. Neither perceptual metric nor baselines are asked for."""
+    folder, run_dir = workspace
     quick = EvaluationSettings(perceptual=False, baselines=False, video_frames=0)
     before = evaluate(run_dir, [folder], quick)
+    entry = before["protocols"]["self_reenactment"]
+    assert (entry["perceptual"], entry["baselines"]) == (None, {})
+    assert "This evaluation did not score the baselines" in (run_dir / "report.html").read_text()
     shutil.rmtree(folder / "scoring")
     scoring = make_experiment(20).scorings[0]
     white = replace(scoring, masks=np.full_like(scoring.masks, 255))
@@ -106,30 +118,24 @@ def test_figures_of_other_scoring_masks_are_not_kept(workspace: tuple[Path, Path
     assert all(first != second for first, second in zip(old, new, strict=True))
 
 
-def test_held_out_frames_are_those_training_left_out(workspace: tuple[Path, Path]) -> None:
-    experiment = load_experiments(workspace[1], [workspace[0]])["self_reenactment"]
+def test_held_out_frames_are_those_training_left_out_and_said_to_be_corrected(workspace: tuple[Path, Path]) -> None:
+    folder, run_dir = workspace
+    experiment = load_experiments(run_dir, [folder])["self_reenactment"]
     assert [frame.timestep for frame in experiment.held_out_frames] == list(range(16, 20))
     assert [frame.timestep for frame in experiment.training_frames] == list(range(16))
-
-
-def test_corrected_held_out_frames_are_said_to_be_so(workspace: tuple[Path, Path]) -> None:
-    folder, run_dir = workspace
     path = run_dir / "face_track.safetensors"
-    before = read_tensors(path)
-    try:
-        for timestep, wanted in ((3, "as_tracked"), (17, "corrected")):
-            changed = {name: tensor.clone() for name, tensor in before.items()}
-            changed["expression"][timestep] += 0.1
-            write_tensors(path, changed)
-            experiment = load_experiments(run_dir, [folder])["self_reenactment"]
-            assert experiment.face_source == wanted
-            torch.testing.assert_close(experiment.faces[0].expression, changed["expression"])
-    finally:
-        write_tensors(path, before)
+    before = {name: tensor.clone() for name, tensor in read_tensors(path).items()}
+    for timestep, wanted in ((3, "as_tracked"), (17, "corrected")):
+        changed = {name: tensor.clone() for name, tensor in before.items()}
+        changed["expression"][timestep] += 0.1
+        write_tensors(path, changed)
+        experiment = load_experiments(run_dir, [folder])["self_reenactment"]
+        assert experiment.face_source == wanted
+        torch.testing.assert_close(experiment.faces[0].expression, changed["expression"])
 
 
-def test_wrong_sequences_and_unfinished_runs(workspace: tuple[Path, Path], tmp_path: Path) -> None:
-    folder, run_dir = workspace
+def test_wrong_sequences_and_unfinished_runs(made: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, run_dir = made
     with pytest.raises(UserError, match="was trained on clip"):
         evaluate(run_dir, [folder.with_name("other")])
     with pytest.raises(UserError, match="missing"):
@@ -141,20 +147,10 @@ def test_wrong_sequences_and_unfinished_runs(workspace: tuple[Path, Path], tmp_p
         evaluate(tmp_path, [folder])
 
 
-def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path], tmp_path: Path) -> None:
-    folder, run_dir = tmp_path / "clip", workspace[1]
-    shutil.copytree(workspace[0], folder)
+def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path]) -> None:
+    folder, run_dir = workspace
     shutil.rmtree(folder / "scoring")
     write_scoring(folder / "scoring", make_experiment(20).scorings[0], capture_hash="of another capture")
     for read in (lambda: evaluate(run_dir, [folder]), lambda: read_sequence(folder)):
         with pytest.raises(UserError, match=r"scoring: its masks belong to other pictures .* run `mien track` again"):
             read()
-
-
-def test_without_perceptual_metric_and_baselines(workspace: tuple[Path, Path]) -> None:
-    """An evaluation without perceptual metric and baselines says that they were not scored."""
-    folder, run_dir = workspace
-    entry = evaluate(run_dir, [folder], EvaluationSettings(perceptual=False, baselines=False))["protocols"]
-    assert entry["self_reenactment"]["perceptual"] is None
-    assert entry["self_reenactment"]["baselines"] == {}
-    assert "This evaluation did not score the baselines" in (run_dir / "report.html").read_text()

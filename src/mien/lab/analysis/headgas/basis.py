@@ -19,7 +19,7 @@ from mien.progress import track_progress
 
 _SHOWN, _COLUMNS = 12, 3
 """Number of expressions that are shown, and of those in a row."""
-_SIDE = 224
+SIDE = 224
 """Width and height of a picture, in pixels."""
 _FRAMES, _FPS = 16, 25
 """Frames of the film for each expression, and frames per second."""
@@ -34,7 +34,7 @@ def basis(context: Context) -> PartResult:
     start, added = start_of_bases(avatar.subject, model)
     values = model.expression_bounds[:, 1].clamp(0, 1)
     highest = trained_range(context).highest
-    camera = head_camera(model, start, context.camera, _SIDE)
+    camera = head_camera(model, start, context.camera, SIDE)
     first, mesh = draw_avatar(avatar, start, camera).astype(np.float32), model(start)[0]
     rows = []
     names = model.expression_names
@@ -97,7 +97,7 @@ def start_of_bases(subject: FaceParams, model: FaceModel) -> tuple[FaceParams, i
 
 def _film(context: Context, start: FaceParams, shown: list[int], added: int) -> Iterator[np.ndarray]:
     avatar, model = context.avatar, context.avatar.face_model
-    camera = head_camera(model, start, context.camera, _SIDE)
+    camera = head_camera(model, start, context.camera, SIDE)
     for index in shown:
         top = min(1.0, float(model.expression_bounds[index, 1]))
         for frame in range(_FRAMES):

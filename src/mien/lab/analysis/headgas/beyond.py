@@ -21,7 +21,7 @@ _REACH = 1.4
 _FACTORS = (0.0, 0.5, 1.0, 1.1, 1.2, 1.3, 1.4)
 _FARTHER = (30.0, 15.0)
 """How far pictures go beyond the training views on each side, in degrees."""
-_SIDE = 224
+SIDE = 224
 """Width and height of a picture, in pixels."""
 _FRAMES, _FPS = 60, 25
 
@@ -97,7 +97,7 @@ def shown_yaws(trained: Trained) -> list[float]:
 
 def _pair(context: Context, index: int, value: float) -> tuple[np.ndarray, np.ndarray]:
     avatar, model = context.avatar, context.avatar.face_model
-    camera = head_camera(model, avatar.subject, context.camera, _SIDE)
+    camera = head_camera(model, avatar.subject, context.camera, SIDE)
     face = with_expression(avatar.subject, index, value)
     return draw_avatar(avatar, face, camera), draw_mesh(model, face, camera)
 
@@ -112,7 +112,7 @@ def _changes(context: Context, index: int, most: float) -> tuple[np.ndarray, np.
 def view_from(context: Context, trained: Trained, yaw: float) -> Camera:
     """The camera, moved around the person at rest until the head sees it at this yaw, in radians."""
     avatar = context.avatar
-    camera = head_camera(avatar.face_model, avatar.subject, context.camera, _SIDE)
+    camera = head_camera(avatar.face_model, avatar.subject, context.camera, SIDE)
     return turned_camera(camera, avatar.subject.head_translation[0], yaw - trained.yaw_at_rest, 0.0)
 
 

@@ -17,7 +17,7 @@ from mien.pictures import side_by_side
 
 _SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 """Shares of the Gaussians in view that pictures lack."""
-_SIDE = 224
+SIDE = 224
 """Width and height of a picture, in pixels."""
 _FRAMES, _FPS = 75, 25
 _FAINT = 1 / 255
@@ -30,8 +30,8 @@ def layers(context: Context) -> PartResult:
     with torch.no_grad():
         gaussians = avatar.pose(avatar.subject).gaussians.timestep(0)
     views = {
-        "head": head_camera(model, avatar.subject, context.camera, _SIDE),
-        "mouth": mouth_camera(model, avatar.subject, context.camera, _SIDE),
+        "head": head_camera(model, avatar.subject, context.camera, SIDE),
+        "mouth": mouth_camera(model, avatar.subject, context.camera, SIDE),
     }
     orders = {name: near_to_far(gaussians, camera) for name, camera in views.items()}
     pictures, values = [], {"gaussians": len(gaussians), "faint": int((gaussians.opacities < _FAINT).sum())}
