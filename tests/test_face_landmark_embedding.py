@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from mien.camera import camera_from_fov
 from mien.face import load_face_model, loading
 from mien.rotation import matrix_from_axis_angle, rigid_transform
-from mien.tracking.landmarks import LEFT_EYELIDS, RIGHT_EYELIDS, EmbeddingSettings, embed_landmarks
+from mien.tracking.landmarks import LEFT_EYELIDS, RIGHT_EYELIDS, EmbeddingSettings, embed_landmarks, embedding
 from mien.tracking.landmarks.embedding import DetectedViews, best_point
 from mien.tracking.landmarks.groups import IBUG68
 from small_face_model import make_small_face_model
@@ -50,30 +51,40 @@ def test_ibug_indices():
     assert (IBUG68[36], IBUG68[45]) == (33, 263)
 
 
+PLACED = sorted({*LEFT_EYELIDS, *RIGHT_EYELIDS, *IBUG68[::4], *range(0, 478, 12)})
+"""Landmarks that are placed. Each takes a search of its own, so some of them tell as much as all."""
+
+
 @pytest.fixture(scope="module")
 def few():
-    model = load_face_model("anny")
-    return model, *embed_landmarks(model, EmbeddingSettings(pictures=16, seed=3))
+    model, place = load_face_model("anny"), embedding.best_point
+    shipped = model.landmarks["mediapipe"]
+
+    def place_some(views: DetectedViews, faces: Tensor, allowed: Tensor, landmark: int, clamp: float) -> tuple:
+        if landmark in PLACED:
+            return place(views, faces, allowed, landmark, clamp)
+        return shipped.faces[landmark], shipped.barycentric[landmark], torch.tensor(0.0)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(embedding, "best_point", place_some)
+        return model, *embed_landmarks(model, EmbeddingSettings(pictures=8, seed=3))
 
 
 @pytest.mark.unchecked
 def test_few_pictures_agree_with_the_shipped_landmarks(few):
     model, landmarks, errors = few
     # 512 pixels show 0.34 m: 3 px are 2 mm.
-    assert errors.median() < 3.5
+    assert errors[PLACED].median() < 3.5
     shipped = model.landmark_positions(model.template, "mediapipe")
     again = landmarks["mediapipe"].positions(model.template, model.faces)
-    distance = (shipped - again).norm(dim=1)
+    distance = (shipped - again).norm(dim=1)[PLACED]
     assert distance.median() < 0.0015
     assert distance.quantile(0.95) < 0.005
 
 
 @pytest.mark.unchecked
 def test_landmarks_of_lids_are_not_inside_the_eyeballs(few):
-    """Landmarks of the lids are not inside the eyeballs.
-
-    A picture alone cannot tell, since a hidden point looks as near.
-    """
+    """A picture alone cannot tell, since a hidden point looks as near."""
     model, landmarks, _ = few
     points = landmarks["mediapipe"].positions(model.template, model.faces)
     for name, lids in (("left_eye", LEFT_EYELIDS), ("right_eye", RIGHT_EYELIDS)):
