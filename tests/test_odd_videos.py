@@ -14,6 +14,7 @@ import pytest
 from av.stream import Disposition
 
 from capture_helpers import write_gradient_video
+from fuzzing.edges import playlists
 from mien.capture.display import Display
 from mien.capture.source import FrameSelection, open_source
 from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
@@ -33,7 +34,6 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_any_name_is_a_file(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Any name is a file, also relative to the folder it is in."""
     monkeypatch.chdir(tmp_path)
     path = Path(name)
     pictures = write_gradient_video(Path("clip.mp4"), frames=3)
@@ -82,29 +82,21 @@ def test_a_codec_that_nobody_knows_is_named(tmp_path: Path, capsys: pytest.Captu
     assert "\x1b" not in told[0]
 
 
-SEGMENT = "segment.ts"
 LISTS = {
-    "a.m3u8": ("#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\n{segment}\n#EXT-X-ENDLIST\n", "is a playlist"),
-    "a.mp4": ("ffconcat version 1.0\nfile {segment}\n", "is a list of files for FFmpeg"),
-    "a.mpd": ("<?xml version='1.0'?>\n<MPD type='static'><BaseURL>{segment}</BaseURL></MPD>", "is a DASH manifest"),
-    "a.sdp": (
-        "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=x\r\nt=0 0\r\nm=video 5004 RTP/AVP 96\r\n",
-        "description of a stream",
-    ),
-    "a.ass": ("[Script Info]\nTitle: x\n", "of a kind that mien does not open"),
-    "a.asx": ("<asx version='3.0'><entry><ref href='{segment}'/></entry></asx>", "a link or a playlist"),
-}
+    ".m3u8": "is a playlist", ".ffconcat": "is a list of files for FFmpeg", ".mpd": "is a DASH manifest",
+    ".sdp": "description of a stream", ".ass": "of a kind that mien does not open", ".asx": "a link or a playlist",
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LISTS)
-def test_files_that_name_other_files_are_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", LISTS)
+def test_files_that_name_other_files_are_refused(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    encode(Path(SEGMENT), format_name="mpegts")
-    text, words = LISTS[name]
-    Path(name).write_text(text.format(segment=SEGMENT))
-    with pytest.raises(UserError, match=words) as error:
-        probe_video(Path(name))
-    assert str(error.value).startswith(f"{name}: is ")
+    encode(Path("segment.ts"), format_name="mpegts")
+    for name in (f"a{kind}", "a.mp4"):
+        Path(name).write_text(playlists("segment.ts")[kind])
+        with pytest.raises(UserError, match=LISTS[kind]) as error:
+            probe_video(Path(name))
+        assert str(error.value).startswith(f"{name}: is ")
 
 
 def test_no_connection_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +117,7 @@ def test_no_connection_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     thread.start()
     try:
         address = f"http://127.0.0.1:{server.server_port}/x.ts"
-        Path("a.m3u8").write_text(LISTS["a.m3u8"][0].format(segment=address))
+        Path("a.m3u8").write_text(playlists(address)[".m3u8"])
         for path in (Path("a.m3u8"), Path(address)):
             with pytest.raises(UserError):
                 probe_video(path)
@@ -202,10 +194,7 @@ def test_ordinary_oddities_are_read(kind: str, tmp_path: Path) -> None:
 
 
 def test_frames_that_an_edit_list_leaves_out_are_not_counted(tmp_path: Path) -> None:
-    """Frames that an edit list leaves out, as telephones trim, are not counted.
-
-    Mattes are counted against what is shown.
-    """
+    """Telephones trim by such lists, and mattes are counted against what is shown."""
     encode(tmp_path / "a.mp4", ticks=(-50, -10, 0, 10, 30))
     assert count_frames(tmp_path / "a.mp4") == len(list(read_video_frames(tmp_path / "a.mp4"))) == 3
 
@@ -261,7 +250,7 @@ def test_a_video_that_announces_huge_pictures_is_refused(tmp_path: Path) -> None
 
 
 def test_huge_pictures_inside_of_a_video_are_not_decoded(tmp_path: Path) -> None:
-    """Huge pictures inside of a video are not decoded: the container says 64x48, but they unpack to 300 megapixels."""
+    """The container says 64x48, but they unpack to 300 megapixels."""
     bomb = png(20_000, 15_000, 2_000)
     path = tmp_path / "a.mov"
     with av.open(str(path), "w") as container:
@@ -283,7 +272,6 @@ def test_huge_pictures_inside_of_a_video_are_not_decoded(tmp_path: Path) -> None
 
 
 def test_a_gif_that_announces_a_huge_screen(tmp_path: Path) -> None:
-    """A gif that announces a huge screen is refused without taking its memory."""
     path = tmp_path / "a.gif"
     encode(path, codec="gif", pixels="rgb8")
     data = bytearray(path.read_bytes())
@@ -298,7 +286,7 @@ def test_a_gif_that_announces_a_huge_screen(tmp_path: Path) -> None:
 
 
 def test_pixels_that_are_not_square_count_as_they_are_shown() -> None:
-    """Pixels that are not square count as they are shown: 640x480 with pixels 9,000 times as wide would take 8 GB."""
+    """640x480 with pixels 9,000 times as wide would take 8 GB."""
     with pytest.raises(UserError, match=r"clip: is shown with 5760000x480 pixels, more than the 37,748,736"):
         Display("clip", 9000.0).show(av.VideoFrame(640, 480, "yuv420p"))
     assert Display("clip", 9000.0, 512).show(av.VideoFrame(640, 480, "yuv420p")).shape == (1, 512, 3)

@@ -20,7 +20,7 @@ THEMES = {
     "processes, commands, recipes": "no_network|examples|two_commands|kills|plugins|new_|needs|startup|places|cli|"
     "interrupt|stops|terminal|memory|readers_beside|system|extras|end_to_end|checked_types|batch",
     "damage, fuzz, full disks, odd command lines": "damage|reader|fuzz|hostile|odd_|full_disks|inside|exhaust|"
-    "bad_input|matrices_in|handed_in|native_calls|edges_of|locks",
+    "bad_input|handed_in|native_calls|edges_of|locks",
     "tracking, alignment, drawn people": "track(?!ed)|alignment|outline|eyelids|synthetic|mesh|photometric|neutral|"
     "embedding",
     "face models": "face|flame|gnm|ict|teeth",

@@ -78,6 +78,19 @@ def new(*shape: int, kind: Any = np.float32) -> Change:
     return lambda array: np.zeros(shape, kind)
 
 
+def rigid(**entries: float) -> list[list[float]]:
+    """Return the matrix of a view with some entries changed: `a03` is that of the first row and the last column."""
+    matrix = np.array([[0.8, -0.6, 0, 0.1], [0.6, 0.8, 0, 0.2], [0, 0, 1, 0.7], [0, 0, 0, 1]])
+    for name, value in entries.items():
+        matrix[int(name[1]), int(name[2])] = value
+    return matrix.tolist()
+
+
+MATRICES = (
+    np.diag([2.0, 2, 2, 1]).tolist(), np.array(rigid()).T.tolist(), rigid(a01=0.3), rigid(a32=0.5), rigid(a22=-1),
+    rigid()[:3], rigid(a03=np.nan),
+)  # fmt: skip
+"""Matrices that are no view: scaled, transposed, sheared, tilted, mirrored, too short, NaN."""
 _TAIL = "protocols.self_reenactment_tail"
 _STORE = "avatar.store"
 VALUES: dict[str, tuple[Row, ...]] = {
@@ -195,7 +208,7 @@ VALUES: dict[str, tuple[Row, ...]] = {
     "cameras.json": (
         ("cameras.0.K.0.0", HUGE), ("cameras.0.K.0.0", None), ("cameras.0.K.0.0", 3e38),
         ("cameras.0.viewmat", [[3e38] * 4] * 4), ("cameras.0.height", "many"), ("cameras", [0] * 50_001),
-        ("cameras.0.viewmat", np.diag([2.0, 2, 2, 1]).tolist()),
+        *(("cameras.0.viewmat", matrix) for matrix in MATRICES),
     ),
     "added face models": (
         ("landmarks.mediapipe.faces.0", "x"), ("landmarks.mediapipe.faces.0", 99_999),
