@@ -133,10 +133,10 @@ fuzz: setup
 	$(MAKE) fuzz-native
 
 # FAULTS faults in each layout that `mien import` reads, layouts side by side, without the tests' checks of types at run time, as
-# users have it. Counts go to out/fuzz/datasets.jsonl. About ten minutes on two free cores.
+# users have it. About ten minutes on two free cores.
 FAULTS ?= 2000
 fuzz-datasets: setup
-	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_DATASET_FUZZ_COUNTS=$(abspath out/fuzz/datasets.jsonl) MIEN_THREADS=1 \
+	MIEN_DATASET_FUZZ=$(FAULTS) MIEN_THREADS=1 \
 	  $(BIN)/pytest -q -o addopts= -n auto --dist load --timeout 0 tests/test_datasets_fuzz.py -m 'not long'
 
 # Commands that are killed at random moments and run again, until there are KILLS kills; findings go to out/fuzz/kills.jsonl.

@@ -138,7 +138,6 @@ class Outcome:
     """The line that refused the dataset; nothing if it was imported."""
     wrong: str
     """The fault of the importer in words, or an empty text if there is none."""
-    seconds: float
 
 
 class Campaign:
@@ -190,7 +189,7 @@ class Campaign:
             wrong = "files outside of the dataset changed"
         for place in (root, self.folder / f"{root.name}-aside", canary, out):
             shutil.rmtree(place, ignore_errors=True)
-        return Outcome(fault, complaint, wrong, seconds)
+        return Outcome(fault, complaint, wrong)
 
     def fault_of(self, complaint: str, out: Path, around: set[str], seconds: float) -> str:
         """Return what must not be about a case that raised nothing else than complaints."""

@@ -4,18 +4,15 @@
 damage to a file of any kind; others have a meaning: a missing camera, another FLAME (`fuzzing.dataset_faults`).
 """
 
-import json
 import os
-import resource
 import shutil
-import time
 from pathlib import Path
 from random import Random
 
 import pytest
 
 from capture_helpers import tree_bytes
-from dataset_cases import LAYOUTS, Campaign, Outcome, make_quick
+from dataset_cases import LAYOUTS, Campaign, make_quick
 from fuzzing.dataset_faults import KINDS, faulty_dataset
 from mien.errors import UserError
 
@@ -41,33 +38,13 @@ def test_damage_is_told_in_one_line(
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
-    campaign, outcomes, start = Campaign(layout, tmp_path, capsys), {}, time.perf_counter()
-    cases = CASES or cases
-    for number in range(FIRST, FIRST + cases):
-        outcomes[number] = campaign.run(number)
+    campaign, cases = Campaign(layout, tmp_path, capsys), CASES or cases
+    outcomes = {number: campaign.run(number) for number in range(FIRST, FIRST + cases)}
     findings = [f"{number} ({each.fault}): {each.wrong}" for number, each in outcomes.items() if each.wrong]
-    _count(layout, list(outcomes.values()), len(findings), time.perf_counter() - start)
     again = "MIEN_DATASET_FUZZ=1 MIEN_DATASET_FUZZ_FROM=<number> repeats one"
     assert not findings, "\n".join([f"{layout}: {len(findings)} of {cases} ({again})", *findings[:_SHOWN]])
     refused = sum(bool(each.complaint) for each in outcomes.values())
     assert cases < 20 or refused > cases / 5, "faults that nobody notices"
-
-
-def _count(layout: str, outcomes: list[Outcome], findings: int, seconds: float) -> None:
-    """Add a line of figures to the file that MIEN_DATASET_FUZZ_COUNTS names."""
-    if "MIEN_DATASET_FUZZ_COUNTS" not in os.environ:
-        return
-    refused = sum(bool(each.complaint) for each in outcomes)
-    line = {
-        "layout": layout, "first": FIRST, "cases": len(outcomes), "refused": refused, "findings": findings,
-        "imported": len(outcomes) - refused - findings, "seconds": round(seconds),
-        "slowest": round(max(each.seconds for each in outcomes), 2),
-        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10,
-    }  # fmt: skip
-    file = Path(os.environ["MIEN_DATASET_FUZZ_COUNTS"])
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("a") as stream:
-        stream.write(json.dumps(line) + "\n")
 
 
 @pytest.mark.usefixtures("quick")

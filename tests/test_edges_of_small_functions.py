@@ -1,6 +1,9 @@
 """Edges of small functions that larger tests do not reach: first and last entries, limits, signs, directions."""
 
 import math
+import os
+import subprocess
+import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from mien import runtime
+from mien.arrays import native, recycled
 from mien.camera import camera_from_fov
 from mien.capture.matte import guided_filter
 from mien.commands.expression import with_expression
@@ -17,6 +22,7 @@ from mien.errors import UserError
 from mien.face.checks import check_face_model
 from mien.face.mirror import triangle_geometry
 from mien.face.npz import read_npz
+from mien.files import check_writable, read_arrays, remove_leftovers, write_arrays, write_atomically
 from mien.lab.synthetic import Segment, SyntheticRecipe
 from mien.limits import MAX_NUMBER
 from mien.ranges import Range
@@ -24,6 +30,7 @@ from mien.render.camera_paths import sway
 from mien.threads import MAX_THREADS, VARIABLE, asked_threads
 from mien.tracking.fitting.views import Views
 from mien.tracking.scoring import cut_matte
+from needs import IS_ROOT
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera, toy_face
 
@@ -158,3 +165,115 @@ def test_the_matte_beside_the_head_is_whole_within_a_margin() -> None:
     cut = cut_matte(np.full((300, 300), 255, np.uint8), head, np.full((300, 300), 0.5, np.float32))
     assert cut[150, 253] == 255
     assert cut[150, 254] == 128
+
+
+# Places and files -----------------------------------------------------------------------------------------------------
+
+
+def test_writable_places_leave_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "there.png").write_bytes(b"old")
+    check_writable(tmp_path / "there.png")
+    check_writable(tmp_path / "new.png")
+    check_writable(tmp_path / "a" / "b" / "new.png")
+    check_writable(tmp_path, folder=True)
+    check_writable(tmp_path / "a" / "new", folder=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["there.png"]
+    assert (tmp_path / "there.png").read_bytes() == b"old"
+
+
+def test_places_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    os.mkfifo(tmp_path / "pipe")
+    for path, folder, reason in (
+        (tmp_path, False, "is a folder"),
+        (tmp_path / "file", True, "is a file"),
+        (tmp_path / "file" / "new.png", False, "is a file, not a folder|Not a directory"),
+        (tmp_path / "file" / "a" / "new.png", False, "is a file, not a folder|Not a directory"),
+        (tmp_path / "link" / "new.png", False, "link to nowhere"),
+        (tmp_path / "pipe", False, "not an ordinary file"),
+        (Path("/dev/null"), False, "not an ordinary file"),
+        (Path("/proc/new.png"), False, "cannot be written"),
+        (Path("/proc/new"), True, "cannot be written"),
+        (tmp_path / ("x" * 300), False, "cannot be written"),
+    ):
+        with pytest.raises(UserError, match=reason):
+            check_writable(path, folder=folder)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason=IS_ROOT)
+def test_a_folder_without_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(UserError, match="Permission denied"):
+            check_writable(tmp_path / "new.png")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_names_as_long_as_a_file_system_allows(tmp_path: Path) -> None:
+    path = tmp_path / ("n" * 250 + ".bin")
+    check_writable(path)
+    write_atomically(path, lambda temporary: temporary.write_bytes(b"1"))
+    assert path.read_bytes() == b"1"
+
+
+def test_what_killed_writers_left_is_removed(tmp_path: Path) -> None:
+    path, kept = tmp_path / "overlay.mp4", tmp_path / ".overlay.json"
+    for name in (path, kept, tmp_path / ".overlay.mp4.a1b2c3.mp4", tmp_path / ".overlay.mp4.d4.mp4"):
+        name.write_bytes(b"1")
+    remove_leftovers(path)
+    assert sorted(tmp_path.iterdir()) == sorted([path, kept])
+    remove_leftovers(tmp_path / "missing" / "overlay.mp4")
+
+
+def test_arrays_and_their_metadata_need_no_torch(tmp_path: Path) -> None:
+    write_arrays(tmp_path / "a.safetensors", {"x": np.arange(3, dtype=np.float32)}, {"note": "hello"})
+    assert read_arrays(tmp_path / "a.safetensors")["x"].tolist() == [0, 1, 2]
+    code = "import sys, mien.files; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# The memory of large pictures is used again ---------------------------------------------------------------------------
+
+LARGE = (1024, 1025)
+
+
+def test_memory_is_used_again_but_never_while_somebody_holds_it() -> None:
+    first = recycled(*LARGE)
+    address = first.data_ptr()
+    view = first[10:].requires_grad_()
+    del first
+    second = recycled(*LARGE)
+    assert second.data_ptr() != address
+    del view
+    assert recycled(*LARGE).data_ptr() == address
+
+
+def test_a_recycled_tensor_is_like_any_other() -> None:
+    tensor = recycled(1100, 1000)
+    assert tensor.shape == (1100, 1000)
+    assert tensor.dtype == torch.float32
+    assert tensor.is_contiguous()
+    assert tensor.data_ptr() % 64 == 0
+    tensor.fill_(2)
+    assert float(tensor.sum()) == 2.2e6
+    assert recycled(0, 3).shape == (0, 3)
+    assert recycled(4, 0).numel() == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "taken"),
+    [
+        (torch.zeros(2), torch.zeros(2, dtype=torch.int32), "core"),
+        (torch.zeros(2), torch.zeros(2, dtype=torch.float64), "reference"),
+        (torch.zeros(2, device="meta"), torch.zeros(2), "reference"),
+        (torch.zeros(2, dtype=torch.float16), torch.zeros(2), "reference"),
+    ],
+)
+def test_the_reference_computes_what_the_core_cannot_take(first: Tensor, second: Tensor, taken: str) -> None:
+    @native(lambda *_, **__: "reference")
+    def operation(*_: Tensor, **__: Tensor) -> str:
+        return "core"
+
+    assert operation(first, second) == operation(first, named=second) == taken
