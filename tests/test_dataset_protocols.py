@@ -12,8 +12,7 @@ import pytest
 import torch
 from torch.nn.functional import conv2d, max_pool2d
 
-from evaluation_case import make_experiment
-from evaluation_rig import two_cameras, write_run, write_sequence
+from evaluation_case import make_experiment, two_cameras, write_run, write_sequence
 from mien.capture import read_capture, read_capture_hash
 from mien.commands.evaluate import Protocol
 from mien.errors import UserError

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from evaluation_case import make_experiment
-from evaluation_rig import write_run, write_sequence
+from evaluation_case import make_experiment, write_run, write_sequence
 from mien.capture.video import write_video
 from mien.cli import main
 from mien.errors import UserError

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from evaluation_case import make_experiment
-from evaluation_rig import two_cameras, write_run, write_sequence
+from evaluation_case import make_experiment, two_cameras, write_run, write_sequence
 from mien.capture.video import probe_video, read_video_frames
 from mien.cli import main
 from mien.errors import UserError
