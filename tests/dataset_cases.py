@@ -262,7 +262,7 @@ class Campaign:
 
 def one_fault(root: Path, canary: Path, dice: Random) -> str:
     """Damage a file of any kind, or make a fault with a meaning. Return what it is."""
-    if dice.random() < 0.5:
+    if dice.random() < 0.3:
         return faulty_dataset(root, canary, dice)
     file = dice.choice(sorted(each for each in root.rglob("*") if each.is_file()))
     fault = dice.choice([faulty_file, faulty_file, faulty_file, faulty_place])

@@ -22,15 +22,7 @@ from mien.capture.given import read_landmarks
 from mien.cli import main
 from mien.driving import motion, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
-from mien.export import (
-    read_glb,
-    read_glb_avatar,
-    read_ply,
-    read_sog,
-    read_usd,
-    write_sog,
-    write_usd,
-)  # fmt: skip
+from mien.export import read_glb, read_glb_avatar, read_ply, read_sog, read_usd, write_sog, write_usd  # fmt: skip
 from mien.export.glb_avatar import EXTENSION
 from mien.export.glb_file import GlbWriter
 from mien.export.ply import property_names

@@ -103,10 +103,7 @@ ODD = [
     ("view W --port -1", "--port -1: give a number from 1 to 65535"),
     ("view W --play none", "none: no such file or folder"),
     ("view W --host 256.1.1.1", "--host 256.1.1.1: is no address of this machine"),
-    (
-        "export W --out a.obj",
-        "cannot write .obj; use .mien, .html, .packed, .glb, .vrm, .ply, .spz, .sog,",
-    ),
+    ("export W --out a.obj", "cannot write .obj; use .mien, .html, .packed, .glb, .vrm, .ply, .spz, .sog,"),
     ("export W --out a.mien --set drop=1", "leave --set and --series out"),
     ("export W --out a.mien --every 3", "--every 3"),
     ("export W --out a.ply --series none", "--series none: no such sequence, file or folder; "),
