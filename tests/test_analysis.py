@@ -20,7 +20,6 @@ from damage import edit_json
 from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands.analyze import Command
-from mien.errors import UserError
 from mien.face import FaceModel
 from mien.lab.analysis import (
     ANALYSES,
@@ -40,6 +39,7 @@ from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, with
 from mien.plots import Axes, Series
 from mien.storage import write_tensors
 from mien.training import read_curves
+from shared_things import MadeOnce, toy_workspace
 from toy_workspace import write_toy_workspace
 from web_case import violations
 
@@ -62,24 +62,13 @@ def toy_with_teeth(rings: int = 9, around: int = 12) -> FaceModel:
     return replace(model, region_names=("skin", "lips", "teeth"), face_regions=regions)
 
 
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a workspace whose run has teeth."""
-    root = tmp_path_factory.mktemp("analysis") / "W"
+@pytest.fixture
+def workspace(made_once: MadeOnce, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a copy of a workspace whose run has teeth."""
+    monkeypatch.setattr(speed, "TABLE_3", SIZES)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(toy_scene, "toy_face_model", toy_with_teeth)
-        write_toy_workspace(root)
-    return root
-
-
-@pytest.fixture(autouse=True)
-def _small_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed, "TABLE_3", SIZES)
-
-
-@pytest.fixture
-def workspace(toy: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(toy, tmp_path / "W"))
+        return Path(shutil.copytree(made_once("toy_with_teeth", write_toy_workspace), tmp_path / "W"))
 
 
 def analyze(root: Path, *more: str) -> int:
@@ -176,6 +165,8 @@ def test_a_new_avatar_is_measured_again(workspace: Path) -> None:
 
 def test_growth_of_known_curves(workspace: Path) -> None:
     """Steps of 10 ms with 1,000 Gaussians and of 30 ms with 8,000 are a growth of 3 times and 8 times."""
+    x, y = growth.binned(np.linspace(1000, 8000, 100), np.linspace(10, 30, 100))
+    assert (len(x), x[0] < 1400, y[-1] > 29) == (12, True, True)
     path = workspace / "runs/toy/curves.safetensors"
     curves = read_curves(workspace / "runs/toy")
     changed = {name: torch.full((40,), 0.5, dtype=torch.float64) for name in curves}
@@ -189,24 +180,18 @@ def test_growth_of_known_curves(workspace: Path) -> None:
     assert part["values"]["gaussians_growth"] == pytest.approx(8)
     assert part["values"]["step_time_growth"] == pytest.approx(3, rel=0.02)
     assert "Step time grows 2.9 times while Gaussians grow 8.0 times" in part["findings"][0]
+    for peak, told in ((370, False), (385, True)):  # The limit, 400 in this run, is named from 95 % of it on.
+        changed["gaussians"] = torch.linspace(100, peak, 40, dtype=torch.float64)
+        write_tensors(path, changed)
+        shutil.rmtree(workspace / "analysis")
+        assert analyze(workspace, "--parts", "growth") == 0
+        notes = record(workspace)["parts"]["growth"]["notes"]
+        assert any("limit, --method.density.max-gaussians 400" in note for note in notes) == told
     changed["step_ms"][:] = torch.nan
     changed["step_ms"][0], changed["gaussians"][0] = 1.0, torch.nan
     write_tensors(path, changed)
     shutil.rmtree(workspace / "analysis")
     assert analyze(workspace, "--parts", "growth") == 2
-
-
-def test_growth_tells_of_the_limit_near_it_only(workspace: Path) -> None:
-    """The limit, 400 in this run, is named from 95 % of it on."""
-    curves = read_curves(workspace / "runs/toy")
-    changed = {name: torch.full((40,), 0.5, dtype=torch.float64) for name in curves}
-    for peak, told in ((370, False), (385, True), (400, True)):
-        changed["gaussians"] = torch.linspace(100, peak, 40, dtype=torch.float64)
-        write_tensors(workspace / "runs/toy/curves.safetensors", changed)
-        shutil.rmtree(workspace / "analysis", ignore_errors=True)
-        assert analyze(workspace, "--parts", "growth") == 0
-        notes = record(workspace)["parts"]["growth"]["notes"]
-        assert any("limit, --method.density.max-gaussians 400" in note for note in notes) == told
 
 
 def test_the_jaw_opens_and_teeth_go() -> None:
@@ -227,10 +212,10 @@ def test_the_jaw_opens_and_teeth_go() -> None:
     assert less.content_hash != model.content_hash
 
 
-def test_a_run_without_teeth_says_so(tmp_path: Path) -> None:
-    write_toy_workspace(tmp_path / "W")
-    assert analyze(tmp_path / "W", "--parts", "teeth", "teeth-trained") == 0
-    parts = record(tmp_path / "W")["parts"]
+def test_a_run_without_teeth_says_so(made_once: MadeOnce, tmp_path: Path) -> None:
+    workspace = Path(shutil.copytree(toy_workspace(made_once), tmp_path / "W"))
+    assert analyze(workspace, "--parts", "teeth", "teeth-trained") == 0
+    parts = record(workspace)["parts"]
     assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
 
 
@@ -351,16 +336,3 @@ def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.Ca
     shutil.rmtree(workspace / "analysis")
     (workspace / "analysis").symlink_to(workspace.parent)
     assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace))
-
-
-def test_curves_that_are_binned_keep_their_ends() -> None:
-    x, y = growth.binned(np.linspace(1000, 8000, 100), np.linspace(10, 30, 100))
-    assert len(x) == 12
-    assert x[0] < 1400
-    assert y[-1] > 29
-
-
-def test_options_are_checked_in_python_too(workspace: Path) -> None:
-    analysis = ANALYSES["gaussian-avatars"]
-    with pytest.raises(UserError, match="--steps -1"):
-        run_analysis(analysis, analysis.parts, workspace / "runs/toy", (), workspace / "out", AnalysisOptions(steps=-1))

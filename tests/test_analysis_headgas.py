@@ -24,6 +24,7 @@ from mien.lab.analysis.headgas.basis import start_of_bases
 from mien.lab.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
 from mien.lab.analysis.views import head_camera, labeled, mouth_camera
 from mien.runtime.filmed import head_angles
+from shared_things import MadeOnce
 from toy_scene import toy_camera, toy_face, toy_face_model
 from toy_workspace import write_toy_workspace
 
@@ -38,13 +39,11 @@ FILMS = {"basis.mp4": 32, "layers.mp4": 75, "beyond-expression.mp4": 60, "beyond
 """Frames of each film: 16 for each of the two expressions in the first one."""
 
 
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("analysis-headgas") / "W"
+@pytest.fixture
+def toy(made_once: MadeOnce) -> Path:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(train_toy, "CONFIG", CONFIG)
-        write_toy_workspace(root)
-    return root
+        return made_once("analysis_headgas", write_toy_workspace)
 
 
 @pytest.fixture(autouse=True)

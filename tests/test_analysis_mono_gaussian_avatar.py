@@ -19,6 +19,7 @@ from mien.lab.analysis.mono_gaussian_avatar.subsets import Measured, frontal_qua
 from mien.training import TrainSettings
 from mien.training.footage.frames import training_frames
 from plain_settings import plain_mono_gaussian_avatar
+from shared_things import MadeOnce
 from toy_scene import toy_sequence
 from toy_workspace import write_toy_workspace
 
@@ -26,13 +27,11 @@ pytestmark = pytest.mark.unchecked
 CONFIG = plain_mono_gaussian_avatar(points=60, max_points=120, epochs=10)
 
 
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("analysis-mono") / "W"
+@pytest.fixture
+def toy(made_once: MadeOnce) -> Path:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(train_toy, "CONFIG", CONFIG)
-        write_toy_workspace(root)
-    return root
+        return made_once("analysis_mono", write_toy_workspace)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +53,6 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_scaling_as_json_with_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`mien bench scaling` prints rows for every size and number of threads, and draws a chart."""
     chart = tmp_path / "chart.png"
     assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
@@ -76,16 +76,20 @@ def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPa
     assert _native.rasterize_isa() == best
 
 
-def test_a_chart_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "scaling", "--plot", str(tmp_path / "chart.jpg")]) == 2
-    assert ".png, .svg, .pdf" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("what", ["render", "train-step", "scaling"])
-@pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf"])
-def test_no_time_to_measure_in_is_told_at_once(what: str, seconds: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", what, f"--seconds={seconds}"]) == 2
-    assert f"--seconds {seconds}: give a positive number" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("scaling --plot chart.jpg", ".png, .svg, .pdf"),
+        ("train-step --parts --method headgas", "--parts --method headgas"),
+        ("render --seconds=-1", "--seconds -1: give a positive number"),
+        ("train-step --seconds=0", "--seconds 0: give a positive number"),
+        ("scaling --seconds=nan", "--seconds nan: give a positive number"),
+        ("scaling --seconds=inf", "--seconds inf: give a positive number"),
+    ],
+)
+def test_what_cannot_be_measured_is_told_at_once(line: str, told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", *line.split()]) == 2
+    assert told in capsys.readouterr().err
 
 
 def test_a_chart_has_a_line_for_every_size(tmp_path: Path) -> None:
@@ -94,19 +98,6 @@ def test_a_chart_has_a_line_for_every_size(tmp_path: Path) -> None:
     drawing = (tmp_path / "a.svg").read_text()
     assert "40x30, 1 thread " in drawing
     assert "40x30, 2 threads " in drawing
-
-
-def test_a_training_case_trains() -> None:
-    """The benchmarked step is the trainer's own, on pictures from which it can learn."""
-    state, data = train_step.training_case(load_face_model(), 2000, 96, 80)
-    before = state.avatar.gaussian_store()["sh_constant"].detach().clone()
-    for _ in range(10):
-        step(state, data, train_step.SETTINGS)
-    assert state.step == 10
-    assert len(state.avatar.gaussian_store()) == 2000
-    assert not torch.equal(before, state.avatar.gaussian_store()["sh_constant"])
-    target = data.targets[0].target(0, 0, np.full(3, 255, np.uint8), keep=False)
-    assert 0.2 < (target.matte > 127).float().mean() < 0.7  # the head fills about half of the picture
 
 
 class Clock:
@@ -144,30 +135,25 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown.count("feature_network_backward") == 1
 
 
-def test_parts_are_those_of_the_default_on_the_cpu(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "train-step", "--parts", "--method", "headgas"]) == 2
-    assert "--parts --method headgas" in capsys.readouterr().err
-
-
-def test_a_headgas_case_trains() -> None:
-    config = HeadGasConfig(features=4)
-    state, data = headgas_step.headgas_case(load_face_model(), config, 500, (96, 80))
-    before = state.avatar.gaussian_store()["bases"].detach().clone()
-    assert 0.2 < (data.targets[0].target(0, 0, np.full(3, 255, np.uint8), False).matte > 127).float().mean() < 0.8
-    for _ in range(3):
+@pytest.mark.parametrize(
+    ("made", "count", "name", "shape"),
+    [
+        (lambda: headgas_step.headgas_case(load_face_model(), HeadGasConfig(features=4), 500, (96, 80)), 3, "bases",
+         (500, 20, 4)),
+        (lambda: mono_step.mono_case(load_face_model(), 4000, (96, 80)), 3, "means", (4000, 3)),
+        (lambda: train_step.training_case(load_face_model(), 2000, 96, 80), 10, "sh_constant", (2000, 1, 3)),
+    ],
+)  # fmt: skip
+def test_a_case_trains(made: Any, count: int, name: str, shape: tuple[int, ...]) -> None:
+    """The benchmarked step is the trainer's own, on pictures from which it can learn."""
+    state, data = made()
+    begun, before = state.step, state.avatar.gaussian_store()[name].detach().clone()
+    matte = data.targets[0].target(0, 0, np.full(3, 255, np.uint8), keep=False).matte
+    assert 0.2 < (matte > 127).float().mean() < 0.8, "the head fills about half of the picture"
+    for _ in range(count):
         step(state, data, train_step.SETTINGS)
-    assert before.shape == (500, 20, 4)
-    assert not torch.equal(before, state.avatar.gaussian_store()["bases"])
-
-
-def test_a_mono_gaussian_avatar_case_trains() -> None:
-    state, data = mono_step.mono_case(load_face_model(), 4000, (96, 80))
-    before = state.avatar.gaussian_store()["means"].detach().clone()
-    assert 0.2 < (data.targets[0].target(0, 0, np.full(3, 255, np.uint8), False).matte > 127).float().mean() < 0.8
-    for _ in range(3):
-        step(state, data, train_step.SETTINGS)
-    assert before.shape == (4000, 3)
-    assert not torch.equal(before, state.avatar.gaussian_store()["means"])
+    assert (state.step - begun, before.shape) == (count, shape)
+    assert not torch.equal(before, state.avatar.gaussian_store()[name])
 
 
 def test_times_of_a_step_are_those_of_one_frame() -> None:

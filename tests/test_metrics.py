@@ -1,13 +1,20 @@
-"""Metrics agree with values computed by hand, a slow second implementation of SSIM, and a published ST-LPIPS figure."""
+"""Metrics agree with values computed by hand, slow second implementations, and published figures; LPIPS as well."""
+
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
+from mien.cli import main
 from mien.errors import UserError
+from mien.evaluation import scoring
 from mien.evaluation.metrics import MAX_PSNR, Windows, crop_to, l1, psnr, ssim, ssim_map
-from mien.perceptual import distance, load_perceptual, weights
+from mien.perceptual import distance, load_perceptual, lpips, weights
+from mien.storage import read_json
 
 
 @pytest.fixture
@@ -116,3 +123,120 @@ def test_ssim_with_shared_windows_is_that_of_the_target_itself() -> None:
     windows = Windows.of(target)
     for image in (first, second, first):
         assert torch.equal(ssim_map(image, windows), ssim_map(image, target))
+
+
+CHANNELS = {"lpips-alex": (64, 192, 384, 256, 256), "lpips-vgg": (64, 128, 256, 512, 512)}
+COMPARED = {"lpips-alex": (1, 4, 7, 9, 11), "lpips-vgg": (3, 8, 15, 22, 29)}
+"""The layers of torchvision's networks whose maps LPIPS compares. Of VGG16 they are relu1_2, relu2_2, relu3_3, relu4_3
+and relu5_3."""
+TRUNKS = {trunk.backbone: trunk for trunk in lpips.TRUNKS}
+
+
+def _trunk(backbone: str) -> nn.Sequential:
+    """Return the convolutions of AlexNet or VGG16 in torchvision's order, with random weights."""
+    torch.manual_seed(3)
+    if backbone == "lpips-vgg":
+        return _vgg16()
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(),
+        nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(), nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(),
+        nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU(),
+    )  # fmt: skip
+
+
+def _vgg16() -> nn.Sequential:
+    """Return VGG16's layers: convolutions 3x3 in five groups, each followed by a pooling that halves."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(depth):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+        layers.append(nn.MaxPool2d(2))
+    return nn.Sequential(*layers)
+
+
+def _write(folder: Path, backbone: str) -> tuple[Path, Path]:
+    """Write files of a trunk and of factors, as they are published."""
+    weights = {f"features.{name}": value for name, value in _trunk(backbone).state_dict().items()}
+    torch.save(weights, folder / "trunk.pth")
+    torch.manual_seed(4)
+    heads = {f"lin{k}.model.1.weight": torch.rand(1, c, 1, 1) for k, c in enumerate(CHANNELS[backbone])}
+    torch.save(heads, folder / "heads.pth")
+    return folder / "trunk.pth", folder / "heads.pth"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return files of AlexNet, whose second convolution has padding 2."""
+    return _write(tmp_path_factory.mktemp("lpips"), "lpips-alex")
+
+
+def _by_formula(backbone: str, first: Tensor, second: Tensor, heads: dict[str, Tensor]) -> float:
+    """Return LPIPS as the paper and its package define it."""
+    trunk, total = _trunk(backbone), 0.0
+    shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    values = [((2 * image - 1 - shift) / scale).permute(2, 0, 1)[None] for image in (first, second)]
+    tap = 0
+    with torch.no_grad():
+        for index, layer in enumerate(trunk):
+            values = [layer(value) for value in values]
+            if index in COMPARED[backbone]:
+                unit = [value / (value.square().sum(1, keepdim=True).sqrt() + 1e-10) for value in values]
+                weighted = (unit[0] - unit[1]).square() * heads[f"lin{tap}.model.1.weight"]
+                total += float(weighted.sum(1).mean())
+                tap += 1
+    assert tap == 5
+    return total
+
+
+@pytest.mark.parametrize("backbone", TRUNKS)
+def test_it_is_the_published_formula(backbone: str, tmp_path: Path) -> None:
+    trunk, heads = _write(tmp_path, backbone)
+    metric = lpips.build_lpips(TRUNKS[backbone], trunk, heads)
+    first, second = torch.rand(2, 70, 90, 3, generator=torch.Generator().manual_seed(1))
+    found = metric.between(metric.features(first), metric.features(second))
+    assert found == pytest.approx(_by_formula(backbone, first, second, torch.load(heads)), rel=1e-5)
+    assert metric.between(metric.features(first), metric.features(first)) == 0
+
+
+def test_other_files_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is not the file that torchvision published; give alexnet"):
+        lpips.load_lpips(files[0])
+    with pytest.raises(UserError, match="no such file"):
+        lpips.load_lpips(tmp_path / "none.pth")
+    with pytest.raises(UserError, match=r"damaged weights .*lpips==0\.1\.4"):
+        lpips.build_lpips(lpips.TRUNKS[1], *files)
+    (tmp_path / "bad.pth").write_bytes(b"no weights")
+    with pytest.raises(UserError, match="damaged weights"):
+        lpips.build_lpips(lpips.TRUNKS[0], tmp_path / "bad.pth", files[1])
+
+
+@pytest.fixture
+def exact(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Take the random trunk for the published one."""
+    metric = lpips.build_lpips(lpips.TRUNKS[0], *files)
+    monkeypatch.setattr(scoring, "load_lpips", lambda path: metric)
+    return files[0]
+
+
+def test_the_command_shows_it_beside_the_others(
+    exact: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random = np.random.default_rng(2)
+    for folder in ("truth", "images"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "0.png"), random.integers(0, 255, (64, 64, 3)).astype(np.uint8))
+    shutil.copy(tmp_path / "truth/0.png", tmp_path / "truth/1.png")
+    shutil.copy(tmp_path / "truth/0.png", tmp_path / "images/1.png")
+    command = ["evaluate", "--images", str(tmp_path / "images"), "--truth", str(tmp_path / "truth")]
+    out = tmp_path / "scores.json"
+    assert main([*command, "--lpips-weights", str(exact), "--no-perceptual", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert ", LPIPS 0." in shown
+    assert "ST-LPIPS" not in shown
+    scores = read_json(out, "mien.scores", 1)
+    assert scores["lpips_backbone"] == "lpips-alex"
+    assert scores["per_frame"]["lpips"][1] == 0 < scores["per_frame"]["lpips"][0]
+    assert main([*command, "--lpips-weights", str(tmp_path / "none")]) == 2
+    assert "--lpips-weights" in capsys.readouterr().err
