@@ -1,6 +1,7 @@
 """Settings of methods and runs come from options and files in a known order, and wrong ones are refused before work."""
 
 import json
+import shutil
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,8 +25,8 @@ from mien.cli import main
 from mien.commands.stages import training
 from mien.ranges import Range
 from mien.training import PRESETS, TrainSettings
+from shared_things import MadeOnce, toy_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 
 RUN, STANDARD = TrainSettings(), GaussianAvatarsConfig()
 OPEN = TrainSettings(background="white", edges="filmed", inside="free", mesh="tracked", unseen="trained")
@@ -121,7 +122,7 @@ def test_a_preset_that_the_method_does_not_have_is_refused(
     assert words in complaint(capsys, [*line, "--preset", "paper"])
 
 
-def test_options_reach_every_depth(choices: Any) -> None:
+def test_options_reach_every_depth_of_the_method(choices: Any) -> None:
     line = """--method.sh-degree 2 --method.sh-frame head --method.density.max-gaussians=20000 --training.resolution 256
         --method.means-rate.start 4e-3 --method.means-rate.end 4e-5 --method.photometric.alpha_weight 0.1 --steps 70
         --method.density.opacity-resets 0.2 0.5 --training.checkpoint-every 50 --training.record-every 5
@@ -137,9 +138,6 @@ def test_options_reach_every_depth(choices: Any) -> None:
         face_tuning=FaceTuning(head_translation=Rate(3e-4, begin=0.5), keep_mean_pose=True, keep_turns=True),
     )
     assert settings == replace(RUN, steps=70, resolution=256, checkpoint_every=50, record_every=5, threads=1)
-
-
-def test_options_are_those_of_the_method(choices: Any) -> None:
     config, _ = choices("--method headgas --method.features 8 --method.density.rounds 3")
     assert config == HeadGasConfig(features=8, density=replace(HeadGasConfig().density, rounds=3))
 
@@ -180,14 +178,10 @@ def test_options_that_make_no_sense_are_refused_before_any_work(
 
 
 def test_create_refuses_them_as_train_does(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (workspace / "file.json").write_text('{"settings": {"steps": -1}}')
-    for line, words in (
-        ("--method.sh-degre 2", "did you mean --method.sh-degree?"),
-        ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
-        (f"--config {workspace / 'file.json'}", "settings.steps -1: give a number from 1"),
-    ):
-        arguments = ["create", str(workspace), "--out", str(workspace / "new"), *line.split()]
-        assert words in complaint(capsys, arguments)
+    arguments = ["create", str(workspace), "--out", str(workspace / "new"), "--method.sh-degre", "2"]
+    assert "did you mean --method.sh-degree?" in complaint(capsys, arguments)
+    arguments[-2:] = with_file(workspace, '{"settings": {"steps": -1}}')[-2:]
+    assert "settings.steps -1: give a number from 1" in complaint(capsys, arguments)
     assert not (workspace / "new").exists()
 
 
@@ -209,11 +203,6 @@ def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) ->
     assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == replace(RUN, steps=4000, split="tail")
     assert choices("--method headgas", {"settings": {"seed": 1}}) == (HeadGasConfig(), replace(RUN, seed=1))
     assert choices("", {}) == choices("")
-
-
-def test_what_is_held_out_follows_the_file(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = with_file(workspace, '{"settings": {"held_out_sequences": ["nobody"]}}')
-    assert "--hold-out nobody: no such sequence" in complaint(capsys, words)
 
 
 @pytest.mark.parametrize(
@@ -250,6 +239,7 @@ def test_what_is_held_out_follows_the_file(workspace: Path, capsys: pytest.Captu
         ('{"method": {"' + "x" * 3000 + '": 1}}', "xxx: gaussian_avatars has no such setting"),
         ('{"method": {"kind": "' + "x" * 3000 + '"}}', "method.kind xxx"),
         ('{"format": "' + "x" * 3000 + '"}', "has format 'xxx"),
+        ('{"settings": {"held_out_sequences": ["nobody"]}}', "--hold-out nobody: no such sequence"),
         ('{"method": {"face_tuning": {"enabled": 1}}}', "method.face_tuning.enabled 1: give true or false"),
     ],
 )  # fmt: skip
@@ -275,18 +265,15 @@ def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.Capt
     assert "--config= is empty" in complaint(capsys, ["train", str(workspace), "--config="])
 
 
-def test_a_file_of_another_method_than_asked_for_is_refused(
-    workspace: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = with_file(workspace, '{"method": {"kind": "headgas"}}')
-    told = complaint(capsys, [*words, "--method", "gaussian_avatars"])
-    assert "has settings of headgas, but --method asks for gaussian_avatars" in told
+def test_a_file_of_another_method_than_asked_for_is_refused(workspace: Path, capsys: Any) -> None:
+    words = [*with_file(workspace, '{"method": {"kind": "headgas"}}'), "--method", "gaussian_avatars"]
+    assert "has settings of headgas, but --method asks for gaussian_avatars" in complaint(capsys, words)
 
 
 def test_a_run_is_repeated_from_its_config_to_the_same_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    made_once: MadeOnce, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_toy_workspace(tmp_path)
+    shutil.copytree(toy_workspace(made_once), tmp_path, dirs_exist_ok=True)
     monkeypatch.setattr(training, "load_face_model", lambda name: toy_face_model())
     runs = tmp_path / "runs"
     words = ["train", str(tmp_path), "--config", str(runs / "toy" / "config.json")]
