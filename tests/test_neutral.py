@@ -89,24 +89,16 @@ def test_what_is_held_throughout_reaches_the_avatar(
     torch.testing.assert_close(driven(face, "model").expression[:, index], face.expression[:, index])
 
 
-def test_a_head_turned_throughout_turns_the_avatar() -> None:
-    face = talking({}, head=55)
-    turned = driven(face).head_rotation
-    torch.testing.assert_close(turned, face.head_rotation, atol=1e-5, rtol=0)
-    assert driven(face, "calm").head_rotation.abs().max() < 0.05
-    torch.testing.assert_close(driven(face, "model").head_rotation, face.head_rotation, atol=1e-5, rtol=0)
-
-
-def test_a_gaze_aside_throughout_reaches_the_avatar() -> None:
-    face = talking({}, eyes=26)
-    torch.testing.assert_close(driven(face).joints, face.joints, atol=1e-5, rtol=0)
-    assert driven(face, "calm").joints.abs().max() < 1e-5
-
-
-def test_eyes_that_make_up_for_a_turned_head_move_with_it() -> None:
-    """A head that counts as turned looks into the camera still, and does not look aside."""
-    face = talking({}, head=60, eyes=-50)
-    torch.testing.assert_close(driven(face).joints, face.joints, atol=1e-5, rtol=0)
+def test_a_head_or_gaze_turned_throughout_reaches_the_avatar() -> None:
+    head, gaze = talking({}, head=55), talking({}, eyes=26)
+    for neutral in (None, "model"):
+        torch.testing.assert_close(driven(head, neutral).head_rotation, head.head_rotation, atol=1e-5, rtol=0)
+    assert driven(head, "calm").head_rotation.abs().max() < 0.05
+    torch.testing.assert_close(driven(gaze).joints, gaze.joints, atol=1e-5, rtol=0)
+    assert driven(gaze, "calm").joints.abs().max() < 1e-5
+    # Eyes that make up for a turned head move with it: it looks into the camera still.
+    both = talking({}, head=60, eyes=-50)
+    torch.testing.assert_close(driven(both).joints, both.joints, atol=1e-5, rtol=0)
 
 
 def test_who_rests_is_transferred_as_before() -> None:

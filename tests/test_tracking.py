@@ -44,7 +44,6 @@ def test_recovers_the_truth(tracked):
 
 @pytest.mark.unchecked
 def test_a_few_landmarks_will_do():
-    """A few landmarks are enough: 300-W's without their contour, and the irises."""
     case = make_tracking_case(timesteps=20)
     settings = replace(KNOWN_FOCAL, landmarks="ibug51")
     counted = landmark_weights("ibug51") > 0
@@ -61,7 +60,7 @@ def test_a_few_landmarks_will_do():
 
 
 @pytest.mark.unchecked
-def test_says_what_it_is(tracked):
+def test_says_what_it_is_and_interpolates_missing_frames(tracked):
     case, tracking = tracked
     assert tracking.face_model == "small"
     assert tracking.face_model_hash == make_small_face_model().content_hash
@@ -71,11 +70,6 @@ def test_says_what_it_is(tracked):
     torch.testing.assert_close(tracking.cameras[0].K.double(), case.camera.K, atol=0.01, rtol=0)
     # The median distance of points with 0.3 px of noise in each coordinate is 0.35 px.
     assert 0.3 < tracking.residuals.nanmedian() < 0.45
-
-
-@pytest.mark.unchecked
-def test_missing_frames_are_marked_and_interpolated(tracked):
-    _, tracking = tracked
     assert tracking.valid.logical_not().nonzero()[:, 0].tolist() == [20, 21]
     assert tracking.residuals[20:22].isnan().all()
     for field in (tracking.face.head_translation, tracking.face.expression, tracking.face.head_rotation):
@@ -147,41 +141,27 @@ def test_smoothing_calms_a_still_head():
     assert shake < 0.0006
 
 
-def test_focal_follows_the_crop():
-    case = make_tracking_case(timesteps=3)
+def test_the_focal_length_follows_the_crop_and_a_square_counts_as_cut_out():
+    capture = make_tracking_case(timesteps=3).capture
     crop = {"left": 300, "top": 0, "width": 1024, "height": 1024}
-    capture = replace(case.capture, source={"picture_size": [1920, 1080], "crop": crop})
-    K = initial_camera(capture, TrackingSettings()).K
-    assert float(K[0, 0]) == 1.5 * 1920 * 512 / 1024
+    cropped = replace(capture, source={"picture_size": [1920, 1080], "crop": crop})
+    assert float(initial_camera(cropped, TrackingSettings()).K[0, 0]) == 1.5 * 1920 * 512 / 1024
+    assert float(initial_camera(capture, TrackingSettings()).K[0, 0]) == pytest.approx(2.2 * 512)
 
 
-def test_a_square_picture_counts_as_cut_out_of_a_larger_one():
-    case = make_tracking_case(timesteps=3)
-    K = initial_camera(case.capture, TrackingSettings()).K
-    assert float(K[0, 0]) == pytest.approx(2.2 * 512)
-
-
-def test_several_cameras_are_refused():
-    case = make_tracking_case(timesteps=3)
-    with pytest.raises(UserError, match="2 cameras without calibration"):
-        track(capture_of(case.pixels, cameras=2), make_small_face_model())
-
-
-def test_too_few_faces_are_refused():
-    case = make_tracking_case(timesteps=4, missing=(0, 1))
-    with pytest.raises(UserError, match="found in 2 frames"):
-        track(case.capture, make_small_face_model())
-
-
-def test_a_model_without_landmarks_is_refused():
-    case = make_tracking_case(timesteps=4)
-    with pytest.raises(UserError, match="no MediaPipe landmarks"):
-        track(case.capture, replace(make_small_face_model(), landmarks={}))
+def test_what_cannot_be_tracked_is_refused():
+    case, model = make_tracking_case(timesteps=4, missing=(0, 1)), make_small_face_model()
+    for capture, tracked_with, reason in (
+        (capture_of(case.pixels, cameras=2), model, "2 cameras without calibration"),
+        (case.capture, model, "found in 2 frames"),
+        (make_tracking_case(timesteps=4).capture, replace(model, landmarks={}), "no MediaPipe landmarks"),
+    ):
+        with pytest.raises(UserError, match=reason):
+            track(capture, tracked_with)
 
 
 @pytest.mark.unchecked
 def test_report(tracked):
-    """The report has the residuals, lost frames and jitter of the tracking."""
     case, tracking = tracked
     report = residual_report(case.capture, tracking, make_small_face_model())
     assert report["frames_without_face"] == [20, 21]
@@ -189,11 +169,6 @@ def test_report(tracked):
     assert report["iris_distance"]["deviation_percent"] < 1.0
     assert report["jitter"]["fitted_px"] < report["jitter"]["detected_px"]
     assert report["flagged_frames"] == []
-
-
-@pytest.mark.unchecked
-def test_report_flags_a_bad_frame(tracked):
-    case, tracking = tracked
     residuals = tracking.residuals.clone()
     residuals[7] = 5.0
     report = residual_report(case.capture, replace(tracking, residuals=residuals), make_small_face_model())
@@ -219,7 +194,6 @@ def test_anny_lips_and_lids_part():
 
 
 def test_settings_that_a_schedule_does_not_use_do_not_count():
-    """Settings that a schedule does not use do not count: a tracking by pixels stays current if others change."""
     paper, sizes = PaperSettings(epochs=2), PhotometricSettings(sizes=(64,))
     asked = TrackingSettings(paper=paper, photometric=sizes)
     assert asked.in_effect() == TrackingSettings(photometric=sizes)

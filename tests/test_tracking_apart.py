@@ -20,8 +20,6 @@ from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import PhotometricCase, assert_alike, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
 
-pytestmark = pytest.mark.unchecked
-
 LANDMARKS = TrackingSettings(schedule="landmarks")
 """Settings with an unknown focal length, because the held-out sequence must not decide it."""
 FAST = replace(
@@ -97,6 +95,7 @@ def tracked(case, shaping, apart) -> Callable[[str], Tracked]:
 SLOW = [name if name in ("landmarks", "fast") else pytest.param(name, marks=pytest.mark.slow) for name in SCHEDULES]
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize("schedule", SLOW)
 def test_the_person_is_the_same_whatever_the_held_out_sequences_hold(tracked, schedule: str):
     found = tracked(schedule)
@@ -116,6 +115,7 @@ def test_the_person_is_the_same_whatever_the_held_out_sequences_hold(tracked, sc
     assert (found.alone.appearance is None) == (schedule == "landmarks")
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize("schedule", SLOW[1:])
 def test_pixels_calm_the_held_out_sequence(apart, tracked, schedule: str):
     by_landmarks, by_pixels = tracked("landmarks").apart, tracked(schedule).apart
@@ -125,6 +125,7 @@ def test_pixels_calm_the_held_out_sequence(apart, tracked, schedule: str):
     assert by_pixels.pixel_residuals.isfinite().all()
 
 
+@pytest.mark.unchecked
 def test_several_held_out_sequences_do_not_know_each_other(case, shaping, apart, tracked):
     alone = track_subject([shaping], case.model, FAST, held_out=[apart.capture])[1]
     assert_same_file(alone, tracked("fast").apart)
@@ -157,6 +158,7 @@ def test_the_light_is_the_mean_of_the_others_in_the_world(shaping):
     assert torch.equal(mean_light(shot, others, shown), lights[2]), "other kinds of sequences do not count"
 
 
+@pytest.mark.unchecked
 def test_an_interrupted_tracking_goes_on(case, shaping, apart, tracked, tmp_path, monkeypatch, capsys):
     keep = tmp_path / "kept"
     write, names = StageCache.write, []
@@ -197,6 +199,7 @@ def workspace(case, shaping, apart, tmp_path, monkeypatch) -> Path:
 QUICKLY = ("--overlay", "none", "--tracking.schedule", "landmarks")
 
 
+@pytest.mark.unchecked
 @pytest.mark.slow
 def test_the_command_tracks_apart(case, shaping, apart, workspace, capsys):
     overlay = workspace / "sequences/apart/tracking/overlay.png"

@@ -18,7 +18,6 @@ from mien.tracking.pixels import refine
 from mien.tracking.settings import PhotometricSettings
 from photometric_case import assert_alike, make_photometric_case, make_textured_model
 
-pytestmark = pytest.mark.unchecked
 FAST = TrackingSettings(photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1))
 """Settings with an unknown focal length, so that it has to be stored as well."""
 
@@ -36,6 +35,7 @@ def stops_after(piece: str, written: list[str], monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(StageCache, "write", write_then_stop)
 
 
+@pytest.mark.unchecked
 def test_goes_on_from_every_piece(tmp_path, monkeypatch, capsys):
     """One tracking is stopped again and again. At last, two of its pieces are damaged."""
     monkeypatch.setattr(stages, "FRAMES_AT_ONCE", 5)
@@ -73,6 +73,7 @@ def track_until_killed(piece: str, *words: str) -> None:
     main(["track", *words])
 
 
+@pytest.mark.unchecked
 def test_killed_tracking_goes_on(tmp_path, monkeypatch, capsys, fork_server):
     """A tracking that was killed, not asked to stop, ends with the same file after the same command."""
     monkeypatch.setattr(stage, "face_model_of", lambda choice: make_textured_model())

@@ -83,7 +83,7 @@ def test_the_starter_is_built_from_the_packed_package_and_shows_an_avatar(packed
     npm(starter, "run", "build")
     with served(starter / "dist") as address:
         told = browse(address, [script(LOADED, PRESS)], size=(640, 480))
-        assert violations(address, (390, 844)) == []
+        assert violations(address, (390, 844), (), LOADED) == []
     (count, jaw, shown) = told["results"][0]
     assert told["messages"] == []
     assert count >= 6

@@ -76,11 +76,11 @@ def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
         found["training_seconds"] = found.pop("seconds")
     if (run_dir / "film.mp4").is_file():
         thumbnail = batch.root / "thumbs" / f"{name}.{run_dir.name}.jpg"
-        write_atomically(thumbnail, partial(_write_strip, run_dir / "film.mp4"))
+        write_atomically(thumbnail, partial(write_strip, run_dir / "film.mp4"))
     return found
 
 
-def _write_strip(film: Path, path: Path) -> None:
+def write_strip(film: Path, path: Path) -> None:
     """Write pictures of a film side by side."""
     import av
     from PIL import Image
