@@ -125,6 +125,7 @@ def test_residuals_tell_how_well_colors_agree(by_pixels, by_landmarks):
     assert 0 < by_pixels.pixel_residuals.median() < 0.06
 
 
+@pytest.mark.unchecked
 def test_a_model_without_texture_coordinates_is_tracked_by_landmarks_and_says_so(capsys):
     case = make_tracking_case(timesteps=4)
     tracking = track(case.capture, case.model.to(torch.zeros(())), FAST)
@@ -230,8 +231,8 @@ def test_what_is_out_of_reach_does_not_count(short_case):
 @pytest.mark.unchecked
 def test_outlines_bring_the_focal_length_nearer_the_truth(short_case):
     def focal_error(weight: float) -> float:
-        settings = TrackingSettings()
-        settings = replace(settings, photometric=replace(settings.photometric, outline_weight=weight))
+        photometric = replace(FAST.photometric, texture_size=64, outline_weight=weight)
+        settings = TrackingSettings(photometric=photometric)
         found = float(track(short_case.capture, short_case.model, settings).cameras[0].K[0, 0])
         return abs(np.log(found / float(short_case.camera.K[0, 0])))
 

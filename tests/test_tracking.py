@@ -44,16 +44,18 @@ def test_recovers_the_truth(tracked):
 
 @pytest.mark.unchecked
 def test_a_few_landmarks_will_do():
-    case = make_tracking_case(timesteps=20)
+    case = make_tracking_case(timesteps=10)
     settings = replace(KNOWN_FOCAL, landmarks="ibug51")
     counted = landmark_weights("ibug51") > 0
     assert counted.sum() == 51 + 10
     moved = case.capture.landmarks.copy()
     moved[:, :, ~counted.numpy()] += 5
-    few, same = (
+    few, same, again = (
         track(capture, make_small_face_model(), settings)
-        for capture in (case.capture, replace(case.capture, landmarks=moved))
+        for capture in (case.capture, replace(case.capture, landmarks=moved), case.capture)
     )
+    for name, tensor in few.face.tensors().items():
+        assert torch.equal(tensor, again.face.tensors()[name]), f"{name} is not the same each time"
     pixels = case.camera.project(case.model.landmark_positions(case.model(few.face.to(case.pixels)), "mediapipe"))[0]
     assert (pixels - case.pixels).norm(dim=-1).median() < 0.8
     assert (few.face.expression - same.face.expression).abs().median() < 0.01
@@ -77,16 +79,8 @@ def test_says_what_it_is_and_interpolates_missing_frames(tracked):
         torch.testing.assert_close(field[20], between)
 
 
-@pytest.mark.unchecked
-def test_is_deterministic(tracked):
-    case, tracking = tracked
-    again = track(case.capture, make_small_face_model(), KNOWN_FOCAL)
-    for name, tensor in tracking.face.tensors().items():
-        assert torch.equal(tensor, again.face.tensors()[name]), name
-
-
 def test_expression_stays_in_bounds():
-    case = make_tracking_case(timesteps=12)
+    case = make_tracking_case(timesteps=6)
     model = make_small_face_model()
     narrow = model.expression_bounds.clone()
     narrow[:4, 1] = 0.2
