@@ -140,7 +140,9 @@ BLINK = {20: 0.5, 21: 1.0, 22: 0.5}
         pytest.param(TREMBLING, TREMBLING, TREMBLING, 0.02, id="colours that agree change little"),
         pytest.param(at({}), at(BLINK), at(BLINK), 0.05, id="a few frames that disagree follow the colours"),
         pytest.param(at({}), ANYWHERE, at({}), 0.05, id="colours that contradict every frame count for nothing"),
-        pytest.param(at({30: 0.5}, 0.2), at(SHUT), at({30: 0.97}, 0.2), 0.02, id="too open throughout, but where lids meet"),
+        pytest.param(
+            at({30: 0.5}, 0.2), at(SHUT), at({30: 0.97}, 0.2), 0.02, id="too open throughout, but where lids meet"
+        ),
         pytest.param(at({}), at(OPENER), at({}), 0.01, id="opener than any is left alone"),
     ],
 )
