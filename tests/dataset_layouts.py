@@ -187,7 +187,7 @@ class Layout:
     clips: dict[str, range] = field(default_factory=lambda: {"me": range(6)})
     """Sequences, with the timesteps of each."""
     splits: tuple[OwnSplit | None, ...] = (None,)
-    """What the authors hold out of each."""
+    """Frames that the authors hold out of each sequence."""
     cameras: tuple[str, ...] = ("0",)
     size: tuple[int, int] | None = None
     """Width and height of the pictures, if they are not the usual ones."""

@@ -1,4 +1,4 @@
-"""What `mien demo` leaves of a short clip of small pictures, made in a network namespace where there is one."""
+"""The workspace of a short `mien demo` with small pictures, made in a network namespace where there is one."""
 
 import ctypes
 import os

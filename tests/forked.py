@@ -31,12 +31,12 @@ class Forked:
 
     @property
     def stdout(self) -> str:
-        """What the process has printed until now."""
+        """The text that the process has printed until now."""
         return (self._folder / "stdout").read_text(encoding="utf-8", errors="replace")
 
     @property
     def stderr(self) -> str:
-        """What the process has complained until now."""
+        """The text that the process has written to standard error until now."""
         return (self._folder / "stderr").read_text(encoding="utf-8", errors="replace")
 
     def poll(self) -> int | None:

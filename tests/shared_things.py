@@ -1,4 +1,4 @@
-"""What several files of tests read and a run makes once, by the fixture `made_once` (tests/conftest.py).
+"""Things that several files of tests read. A run makes each once, by the fixture `made_once` (tests/conftest.py).
 
 Folders are for reading: a test that changes one copies it first.
 """

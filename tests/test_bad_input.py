@@ -201,6 +201,22 @@ def test_a_damaged_avatar_is_made_again_as_advised(run_dir: Path, tmp_path: Path
         assert (tmp_path / "avatar" / name).read_bytes() == (run_dir / "avatar" / name).read_bytes()
 
 
+def test_the_command_line_tells_damage_in_one_line(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = run_dir / "avatar" / "avatar.json"
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(whole[: len(whole) // 2])
+        assert main(["export", str(run_dir.parent.parent), "--out", str(tmp_path / "a.ply")]) == 2
+    finally:
+        path.write_bytes(whole)
+    shown = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
+    assert len(shown) == 1
+    assert "avatar.json" in shown[0]
+    assert not (tmp_path / "a.ply").exists()
+
+
 def test_going_on_from_an_older_checkpoint_is_said(
     run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

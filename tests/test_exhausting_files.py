@@ -32,7 +32,6 @@ from shared_things import MadeOnce, toy_workspace
 from test_glb_avatar import rewritten, written
 from test_splat_files import needs_usd, some
 
-pytestmark = pytest.mark.unchecked
 DIGITS = int("9" * 400)
 
 

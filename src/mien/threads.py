@@ -55,7 +55,10 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def use_one_torch_thread() -> None:
-    """Keep torch on one thread from now on. What does not import torch does not wait for it."""
+    """Keep torch on one thread from now on, and leave the cores to native code: their two pools stall each other.
+
+    If torch is not imported yet, it is limited when it is: commands that do not need it do not wait for its import.
+    """
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     elif not any(isinstance(finder, _OneTorchThread) for finder in sys.meta_path):

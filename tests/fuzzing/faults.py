@@ -188,7 +188,7 @@ PLACES: dict[str, Callable[[Path, Path, bool], object]] = {
     "sparse": _sparse,
     "text": lambda path, canary, was_folder: path.write_text(f"{{}} {DEEP}"),
 }
-"""What may lie in the place of a file or folder."""
+"""Things that may lie in the place of a file or folder."""
 
 
 def _changed(change: Callable[[bytes], bytes]) -> Callable[[Place], str]:

@@ -26,7 +26,7 @@ SIZES = {
 
 
 class Call:
-    """What the arguments of one call are made of. Named tuples and classes of the core take words for their arrays."""
+    """The parts of the arguments of one call. Named tuples and classes of the core take words for their arrays."""
 
     def __init__(self, native: Any, rng: Rng) -> None:
         self.native, self.rng = native, rng
@@ -352,7 +352,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "triangle_penalties": lambda c: c.given(
         (1.0, 0.6), (0.01, 1.0), "n 3", "n 3", "<3 n:i4", "=n 3", "=n 3", number(), number()),
 }  # fmt: skip
-"""What makes the arguments of a valid call, by the name of the native function."""
+"""Name of a native function -> the parts that make the arguments of a valid call."""
 
 
 def arguments_of(name: str, native: Any, rng: Rng) -> Arguments:

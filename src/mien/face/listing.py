@@ -35,7 +35,7 @@ class FaceModelInfo:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a model that comes with mien is from."""
+    """The terms of a model that comes with mien, and the functions that make and identify it."""
 
     licence: str
     description: str

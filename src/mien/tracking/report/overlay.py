@@ -122,7 +122,7 @@ class OverlayPainter:
         return picture
 
     def caption(self, timestep: int, camera_index: int) -> str:
-        """What is written above a picture: camera, timestep and residual."""
+        """Return the caption of a picture: camera, timestep and residual."""
         tracking = self._tracking
         residual = float(tracking.residuals[timestep, camera_index])
         missing = "no face found" if tracking.valid[timestep] else "no face, interpolated"
