@@ -83,7 +83,7 @@ def test_the_starter_is_built_from_the_packed_package_and_shows_an_avatar(packed
     npm(starter, "run", "build")
     with served(starter / "dist") as address:
         told = browse(address, [script(LOADED, PRESS)], size=(640, 480))
-        assert violations(address, (390, 844), (), LOADED) == []
+        assert violations(address, (390, 844), (), "", LOADED) == [], "before and after its avatar is there"
     (count, jaw, shown) = told["results"][0]
     assert told["messages"] == []
     assert count >= 6

@@ -31,7 +31,6 @@ export class MienAvatar extends HTMLElement {
   private attached = false;
 
   connectedCallback(): void {
-    if (!this.hasAttribute("role")) this.setAttribute("role", "img");
     this.attached = true;
     this.open();
   }
@@ -118,6 +117,8 @@ export class MienAvatar extends HTMLElement {
       if (loading.signal.aborted) return;
       const canvas = document.createElement("canvas");
       this.show(canvas);
+      // Not before there is a label. To screen readers, what is inside of a picture is hidden, an error as well.
+      if (!this.hasAttribute("role")) this.setAttribute("role", "img");
       if (!this.hasAttribute("aria-label")) this.setAttribute("aria-label", `Avatar of ${avatar.about.name}`);
       const viewer = (this.viewer = new Viewer(canvas, avatar, motion, backend));
       if (this.hasAttribute("controls")) {
