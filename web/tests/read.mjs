@@ -5,10 +5,17 @@ import { pathToFileURL } from "node:url";
 
 const [bundle, path] = process.argv.slice(2);
 const { AvatarError, Poser, readAny } = await import(pathToFileURL(bundle).href);
-let message = "";
+let message = "", bytes = null;
 try {
-  const { avatar } = await readAny(new Uint8Array(readFileSync(path)));
-  new Poser(avatar.baked).pose(avatar.neutral);
+  bytes = new Uint8Array(readFileSync(path));
+} catch (error) {
+  message = `cannot be opened (${error.code})`; // no matter of the reader: a page hands it bytes
+}
+try {
+  if (bytes !== null) {
+    const { avatar } = await readAny(bytes);
+    new Poser(avatar.baked).pose(avatar.neutral);
+  }
 } catch (error) {
   message = error instanceof AvatarError ? error.message : `not told: ${error}`;
 }

@@ -224,16 +224,17 @@ def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
         UserError: they were tracked separately, or with another face model.
     """
     for sequence in sequences:
+        place = str(sequence.folder or sequence.name)
         if sequence.tracking.face_model_hash != face_model.content_hash:
             raise UserError(
-                f"{sequence.name}: was tracked with another version of face model {sequence.tracking.face_model!r} "
+                f"{place}: was tracked with another version of face model {sequence.tracking.face_model!r} "
                 f"({sequence.tracking.face_model_hash}) than {face_model.name!r} now is ({face_model.content_hash}); "
                 "run `mien track` again"
             )
-        check_face_params(face_model, sequence.tracking.face, str(sequence.folder or sequence.name), "track again")
+        check_face_params(face_model, sequence.tracking.face, place, "track again")
         if not sequence.tracking.face.identity.equal(sequences[0].tracking.face.identity):
             raise UserError(
-                f"{sequences[0].name} and {sequence.name}: were tracked apart and have two identities; "
+                f"{place}: was tracked apart from {sequences[0].name}, so that there are two identities; "
                 "run `mien track` on their workspace"
             )
 
