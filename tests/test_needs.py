@@ -1,14 +1,16 @@
-"""The summary of skipped tests names reason and remedy, and strict runs fail where a set-up is not complete."""
+"""The summary of skipped tests names reason and remedy, strict runs fail for some, and calls of tests are checked."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
+import torch
+from jaxtyping import TypeCheckError
 
-import conftest
+from checked_types import unchecked
+from mien.rotation import skew
 from needs import IS_ROOT, NO_CHROMIUM, NO_GPU, NO_INSTRUCTIONS, NO_NODE, NO_TEST_DATA, skipped_lines, unexpected
 
 TESTS = Path(__file__).parent
@@ -24,31 +26,7 @@ def test_skipped_tests_are_counted_by_reason_with_a_remedy() -> None:
         "     1  because",
     ]
     assert skipped_lines([]) == ["No test was skipped."]
-    assert skipped_lines([IS_ROOT])[0] == "1 test was skipped:"
-
-
-def test_the_first_line_says_what_was_not_tested() -> None:
-    line = skipped_lines([NO_NODE, NO_GPU, NO_CHROMIUM])[0]
-    assert line == "3 tests were skipped; not tested: pages in a browser, the web runtime, GPUs:"
-
-
-def test_only_the_machine_excuses_a_skip() -> None:
-    assert unexpected([NO_GPU, IS_ROOT, f"Skipped: {NO_INSTRUCTIONS}avx512"]) == []
-    assert unexpected([NO_GPU, f"Skipped: {NO_CHROMIUM}", NO_CHROMIUM, "because"]) == ["because", NO_CHROMIUM]
-
-
-@pytest.mark.parametrize(
-    ("reason", "strict", "fails"), [(NO_NODE, "", False), (NO_NODE, "1", True), (NO_GPU, "1", False)]
-)
-def test_a_skip_fails_a_strict_run_where_a_program_is_missing(
-    monkeypatch: pytest.MonkeyPatch, reason: str, strict: str, fails: bool
-) -> None:
-    monkeypatch.setenv("MIEN_STRICT", strict)
-    reporter = SimpleNamespace(stats={"skipped": [SimpleNamespace(longrepr=("file", 1, f"Skipped: {reason}"))]})
-    config = SimpleNamespace(pluginmanager=SimpleNamespace(get_plugin=lambda name: reporter))
-    session = SimpleNamespace(config=config, exitstatus=pytest.ExitCode.OK)
-    conftest.pytest_sessionfinish(session)  # type: ignore[arg-type]
-    assert (session.exitstatus == pytest.ExitCode.TESTS_FAILED) == fails
+    assert unexpected([NO_GPU, f"Skipped: {NO_CHROMIUM}", NO_CHROMIUM, IS_ROOT, "because"]) == ["because", NO_CHROMIUM]
 
 
 def test_a_strict_run_with_a_worker_fails(tmp_path: Path) -> None:
@@ -59,3 +37,11 @@ def test_a_strict_run_with_a_worker_fails(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "MIEN_STRICT is set" in done.stdout
+
+
+def test_a_wrong_type_is_found_where_calls_are_checked() -> None:
+    integers = torch.zeros(2, 3, dtype=torch.int64)
+    with unchecked():
+        skew(integers)
+    with pytest.raises(TypeCheckError):
+        skew(integers)

@@ -1,98 +1,126 @@
-"""The rules of `seams.py` find what they are meant for, and nothing else."""
+"""`seams.py` and `sizes.py` find what they are meant for and nothing else; the native module is what its stub says."""
 
-import pytest
+import ast
+from pathlib import Path
 
+import mien
+from mien import _native
 from seams import MethodNames, naming_faults, override_faults, private_faults
+from sizes import cpp_faults, python_faults
 
 METHODS = [MethodNames("old", ("OldAvatar", "OldConfig")), MethodNames("new_one", ("NewOne", "NewOneConfig"))]
+NAMES = {
+    "src/mien/a.py": ("import mien\n\nif method == 'new_one':\n    pass\n", 3),
+    "src/mien/b.py": ("from mien.avatar import (\n    NewOneConfig,\n)\n", 2),
+    "src/mien/avatar/old/avatar.py": ("x = NewOne\n", 1),
+    "web/src/points.ts": ("// new_one\n", 1),
+    "src/mien/avatar/new_one/avatar.py": ("class NewOne:\n    name = 'new_one'\n", None),
+    "src/mien/lab/analysis/new_one/__init__.py": ("method = 'new_one'\n", None),
+    "src/mien/c.py": ('"""The paper NewOne."""\nfrom mien.export.new_one_folder import NewOneFolder\n', None),
+    "list.py": ("METHODS = ['old', 'new_one']\n", None),
+    "idle.py": ("pass\n", None),
+}
+"""Files, and the lines that name a method and may not."""
 BASE = """
-from abc import ABC, abstractmethod
-from typing import Protocol
-from torch import nn
-
 class Base(nn.Module, ABC):
     def __init__(self): ...
     @abstractmethod
     def open(self): ...
     def done(self): ...
-    @property
-    def size(self): ...
     def forward(self): ...
-
 class Shape(Protocol):
     def draw(self): ...
 """
+OWN = """from mien import a
+from mien.door import Base, Shape
+from torch import nn
+class Own(Base):
+    def __init__(self): ...
+    def open(self): ...
+    def done(self): ...
+class Last(Own, Shape, nn.Module):
+    def open(self): ...
+    def draw(self): ...
+    def forward(self): ...
+class Far(a.Base[int]):
+    def done(self): ...
+"""
+PRIVATE = """from mien.face import _part, loading
+from mien import _native, cli
+_native.draw()
+loading._read(1)
+loading.read(1)
+monkeypatch.setattr(cli, '_run', None)
+monkeypatch.setattr(cli, 'run', None)
+import mien.face
+mien.face._part
+self._y
+"""
+CPP = """
+namespace {{
+
+struct Counter {{
+  template <typename T>
+  explicit Counter(const std::pair<T, int>& first,
+                   int second) : first_(first), second_{{second}} {{
+    {member}
+  }}
+}};
+
+}}  // namespace
+
+int counted({parameters}) {{
+  {body}
+}}
+"""
 
 
-@pytest.mark.parametrize(
-    ("place", "text", "line"),
-    [
-        ("src/mien/export/packed.py", "import mien\n\nif method == 'new_one':\n    pass\n", 3),
-        ("src/mien/export/packed.py", "# as in new_one\n", 1),
-        ("src/mien/export/packed.py", "from mien.avatar.new_one.settings import PRESETS\n", 1),
-        ("src/mien/export/packed.py", "from mien.avatar import (\n    NewOneConfig,\n)\n", 2),
-        ("src/mien/avatar/old/avatar.py", "x = NewOne\n", 1),
-        ("web/src/points.ts", "// new_one\n", 1),
-        ("src/mien/avatar/new_one/avatar.py", "class NewOne:\n    name = 'new_one'\n", None),
-        ("src/mien/avatar/new_one.py", "class NewOne:\n    name = 'new_one'\n", None),
-        ("src/mien/lab/analysis/new_one/__init__.py", "method = 'new_one'\n", None),
-        (
-            "src/mien/export/packed.py",
-            '"""The paper NewOne."""\nfrom mien.export.new_one_folder import NewOneFolder\n',
-            None,
-        ),
-    ],
-)
-def test_names_of_methods_are_found(place: str, text: str, line: int | None) -> None:
-    found = list(naming_faults({place: text}, METHODS, {}))
-    expected = f"{place}:{line}: names the method new_one; ask what it is needed for of the avatar itself"
-    assert found == ([] if line is None else [expected])
+def test_what_seams_finds() -> None:
+    told = "names the method new_one; ask what it is needed for of the avatar itself"
+    texts = {place: text for place, (text, _) in NAMES.items()}
+    found = list(naming_faults(texts, METHODS, {"list.py": "", "idle.py": ""}))
+    expected = [f"{place}:{line}: {told}" for place, (_, line) in NAMES.items() if line]
+    assert found == [*expected, "tests/seams.py: idle.py names no method any more; take it out of MAY_NAME"]
+    door = "from mien.a import Base, Shape\n"
+    faults = override_faults({"src/mien/a.py": BASE, "src/mien/door.py": door, "src/mien/b.py": OWN})
+    assert [fault.split(",")[0] for fault in faults] == [
+        "src/mien/b.py:7: mien.b.Own.done overrides that of mien.a.Base",
+        "src/mien/b.py:9: mien.b.Last.open overrides that of mien.b.Own",
+        "src/mien/b.py:11: mien.b.Last.forward overrides that of mien.a.Base",
+        "src/mien/b.py:13: mien.b.Far.done overrides that of mien.a.Base",
+    ]
+    assert sorted(fault.split(":")[1] for fault in private_faults({"t.py": PRIVATE})) == ["1", "4", "6", "9"]
 
 
-def test_allowed_places_may_name_methods_and_have_to() -> None:
-    texts = {"a.py": "METHODS = ['old', 'new_one']\n", "b.py": "pass\n"}
-    found = list(naming_faults(texts, METHODS, {"a.py": "a list", "b.py": "nothing"}))
-    assert found == ["tests/seams.py: b.py names no method any more; take it out of MAY_NAME"]
+def test_what_sizes_finds() -> None:
+    place = Path("file")
+    python = "def fits():\n" + 59 * "    pass\n" + "def count():\n" + 60 * "    pass\n"
+    assert list(python_faults(place, python)) == ["file:61: count has 61 lines; at most 60"]
+    for lines in (57, 58, 59):
+        body = ["if (a) {", *["  b();"] * (lines - 2), "}"]
+        parameters = ", ".join(f"const Array<float, nb::shape<-1, 3>>& p{i}" for i in range(lines - 48))
+        text = CPP.format(member="\n    ".join(body), body="\n  ".join(body), parameters=parameters)
+        sizes = {6: lines + 3, 13 + lines: lines + 2}
+        expected = [f"file:{line}: {size} lines; at most 60" for line, size in sizes.items() if size > 60]
+        many = [f"file:{13 + lines}: counted has 11 parameters; at most 10"] if lines == 59 else []
+        assert list(cpp_faults(place, text)) == expected + many
 
 
-@pytest.mark.parametrize(
-    ("body", "found"),
-    [
-        ("class Own(Base):\n    def done(self): ...\n", "mien.b.Own.done overrides that of mien.a.Base"),
-        ("class Own(Base):\n    size = 3\n    @property\n    def size(self): ...\n", "mien.b.Own.size overrides"),
-        ("class Middle(Base): ...\n\nclass Own(Middle):\n    def done(self): ...\n", "mien.b.Own.done overrides"),
-        (
-            "class Own(Base):\n    def open(self): ...\n\nclass Last(Own):\n    def open(self): ...\n",
-            "mien.b.Last.open overrides",
-        ),
-        ("class Own(Base):\n    def __init__(self): ...\n    def open(self): ...\n    def more(self): ...\n", None),
-        ("class Own(Shape):\n    def draw(self): ...\n", None),
-        ("from torch import nn\nclass Own(nn.Module):\n    def forward(self): ...\n", None),
-        ("class Base:\n    def done(self): ...\n", None),
-    ],
-)
-@pytest.mark.parametrize("way", ["from mien.a import Base, Shape", "from mien.door import Base, Shape"])
-def test_overridden_methods_are_found(body: str, found: str | None, way: str) -> None:
-    texts = {"src/mien/a.py": BASE, "src/mien/door.py": "from mien.a import Base, Shape\n"}
-    faults = list(override_faults({**texts, "src/mien/b.py": f"{way}\n\n{body}"}))
-    assert len(faults) == (found is not None)
-    assert not faults or (faults[0].startswith("src/mien/b.py:") and str(found) in faults[0])
+def test_the_stub_lists_what_the_native_module_has() -> None:
+    body = ast.parse(Path(mien.__file__).with_name("_native.pyi").read_text()).body
+    functions = {node.name: node.args.args for node in body if isinstance(node, ast.FunctionDef)}
+    classes = {node.name: fields(node.body) for node in body if isinstance(node, ast.ClassDef)}
+    assert {*functions, *classes, *fields(body)} == {name for name in dir(_native) if not name.startswith("_")}
+    for name, own in classes.items():
+        assert own == list(getattr(getattr(_native, name), "_fields", ())), name
+        assert len(own) <= 10
+    for name, given in functions.items():
+        signature = getattr(_native, name).__doc__.splitlines()[0]
+        assert all(f"{one.arg}: " in signature for one in given), signature
+        assert signature.count(": ") == len(given), signature
 
 
-def test_a_base_class_by_its_module_and_of_a_generic_class_is_found() -> None:
-    generic = "class Kept(Generic[T]):\n    def get(self): ...\n"
-    user = "from mien import kept\n\nclass Own(kept.Kept[int]):\n    def get(self): ...\n"
-    faults = list(override_faults({"src/mien/kept.py": generic, "src/mien/user.py": user}))
-    assert len(faults) == 1
-
-
-@pytest.mark.parametrize(("text", "count"), [
-    ("from mien.face import _part\n", 1),
-    ("from mien import _native\n_native.draw()\n", 0),
-    ("from mien.face import loading\nloading._read(1)\nloading.read(1)\n", 1),
-    ("import mien.face\nmien.face._part\n", 1),
-    ("from mien import cli\nmonkeypatch.setattr(cli, '_run', None)\nmonkeypatch.setattr(cli, 'run', None)\n", 1),
-    ("import pathlib\npathlib._x\nself._y\n", 0),
-])  # fmt: skip
-def test_private_names_of_mien_are_found_in_tests(text: str, count: int) -> None:
-    assert len(list(private_faults({"tests/test_x.py": text}))) == count
+def fields(body: list[ast.stmt]) -> list[str]:
+    """Return the names that a module or class declares with a type."""
+    declared = (one.target for one in body if isinstance(one, ast.AnnAssign))
+    return [target.id for target in declared if isinstance(target, ast.Name)]
