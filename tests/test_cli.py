@@ -4,7 +4,6 @@ import importlib
 import os
 import re
 import signal
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,16 +22,18 @@ from mien.commands.options import check_driver
 from mien.errors import UserError
 from mien.files import write_atomically
 
+Told = pytest.CaptureFixture[str]
 
-def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+
+def complaint(capsys: Told, *arguments: str | Path) -> str:
     """Run a command that must fail by the user's mistake, and return its one line."""
-    assert main(arguments) == 2
+    assert main(list(map(str, arguments))) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
     assert len(lines) == 1, lines
     return lines[0]
 
 
-def help_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+def help_of(capsys: Told, *arguments: str) -> str:
     """Ask for help, and return it."""
     with pytest.raises(SystemExit) as ended:
         main(arguments)
@@ -40,24 +41,8 @@ def help_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().out
 
 
-@pytest.fixture
-def faceless_video(tmp_path: Path) -> Path:
-    frame = np.random.default_rng(0).integers(0, 255, (96, 96, 3), dtype=np.uint8)
-    path = tmp_path / "wall.mp4"
-    write_video(path, [frame] * 5, 25.0)
-    return path
-
-
-def test_overview_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
-    shown = capsys.readouterr().out
-    assert all(f"  {name} " in shown for name in COMMANDS)
-
-
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(name: str, capsys: Told) -> None:
     command = importlib.import_module(f"mien.commands.{name.replace('-', '_')}").Command
     hints = get_type_hints(readable(command), include_extras=True).values()
     texts = [mark.help for hint in hints for mark in get_args(hint)[1:] if getattr(mark, "help", None)]
@@ -67,47 +52,23 @@ def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(
     assert f"usage: mien {name}" in shown
     assert "default: None)" not in shown
     assert "default: )" not in shown
+    assert main(["--help"]) == 0
+    assert f"  {name} " in capsys.readouterr().out
 
 
-def test_help_of_create_is_read_at_a_glance(capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
     shown = help_of(capsys, "create", "--help")
     assert sorted(re.findall(r"^\W*(--[a-z][\w.-]*)", shown, re.MULTILINE)) == [
         "--device", "--method", "--name", "--out", "--preset", "--view",
     ]  # fmt: skip
     assert shown.rstrip().endswith("mien create --method gaussian_avatars --help-all")
     assert len(shown.splitlines()) < 45
-
-
-@pytest.mark.parametrize(("arguments", "near"), [
-    ("create a.mp4 --uot here", "--out"),
-    ("render here --out a.png --sett smile=1", "--set"),
-    ("create a.mp4 --calibrations cameras.json --out here", "--calibration"),
-    ("export --webcm here --out a.html", "--webcam"),  # tyro takes the folder for its value
-    ("create a.mp4 --helpp", "--help"),
-    ("train here --training.step 3", "--steps"),
-    ("create --method headgas --step 3 --out here a.mp4", "--steps"),
-    ("bench quality --captures beard --oput here", "--out"),
-])  # fmt: skip
-def test_an_unknown_option_is_told_with_the_one_that_was_meant(
-    arguments: str, near: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = complaint(capsys, *arguments.split())
-    assert f"did you mean {near}?" in told
-    assert "a.mp4" not in told
-    assert "missing" not in told
-
-
-@pytest.mark.parametrize("name", ["capture", "track"])
-def test_help_leaves_details_to_help_all(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    short, whole = (help_of(capsys, name, flag) for flag in ("--help", "--help-all"))
-    assert len(short.splitlines()) < 125
-    last = short.rstrip().splitlines()[-1]
-    assert f": mien {name} " in last
-    assert last.endswith("--help-all")
-    detail = "--capture.max-frames" if name == "capture" else "--tracking.photometric.sizes"
-    assert detail in whole
-    assert detail not in short
-    assert all(option in short for option in ("--tracking.schedule",) if name != "capture")
+    for name, detail in (("capture", "--capture.max-frames"), ("track", "--tracking.photometric.sizes")):
+        short, whole = (help_of(capsys, name, flag) for flag in ("--help", "--help-all"))
+        assert len(short.splitlines()) < 125
+        assert re.search(rf": mien {name} .*--help-all$", short.rstrip().splitlines()[-1])
+        assert (detail in whole, detail in short) == (True, False)
+        assert ("--tracking.schedule" in short) == (name == "track")
 
 
 PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'nerface', 'nerf-blendshape'"
@@ -116,9 +77,16 @@ PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'n
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ("create a.mp4 --uot here", ("did you mean --out?",)),
+        ("render here --out a.png --sett smile=1", ("did you mean --set?",)),
+        ("export --webcm here --out a.html", ("did you mean --webcam?",)),  # tyro takes the folder for its value
+        ("create a.mp4 --helpp", ("did you mean --help?",)),
+        ("train here --training.step 3", ("did you mean --steps?",)),
+        ("create --method headgas --step 3 --out here a.mp4", ("did you mean --steps?",)),
+        ("bench quality --captures beard --oput here", ("did you mean --out?",)),
+        ("render here --out a.mp4 --siez 3", ("--siez", "did you mean --size?", "see mien render --help")),
         ("crate", ("no sub-command 'crate'",)),
         ("create", ("--out DIR", "see mien create --help")),
-        ("render here --out a.mp4 --siez 3", ("--siez", "did you mean --size?", "see mien render --help")),
         ("render DIR --out a.png --set jawOpen=1 --set=eyeBlinkLeft=1", ("--set is given twice",)),
         ("demo --out demo --out=", ("--out= is empty",)),  # as a path, the current folder (found by the fuzzer, seed 5)
         ("train here --method.appearance nonsense", ("nonsense", "features", "see mien train --help-all")),
@@ -132,107 +100,86 @@ PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'n
         # Choices in the order of their declaration, without None, which cannot be typed.
         ("evaluate x --protocol nope", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'nope'; see mien",)),
         ("evaluate x --protocol None", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'None'; see mien",)),
-        ("export x --out y --mattes hair", ("mien: --mattes: give one of 'head', 'person' instead of 'hair'; see",)),
         ("export x --out y --sh 7", ("mien: --sh: give one of '0', '1', '2', '3' instead of '7'; see mien",)),
-        ("evaluate x --edges no", ("mien: --edges: give one of 'cleaned', 'filmed' instead of 'no'; see mien",)),
         ("capture x --out y --capture.turn 45", ("--capture.turn: give one of '0', '90', '180', '270' instead of",)),
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(
-    arguments: str,
-    words: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: str, words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
 ) -> None:
     monkeypatch.chdir(tmp_path)
     message = complaint(capsys, *arguments.split())
     assert all(word in message for word in words), message
+    if words[0].startswith("did you mean"):
+        assert "a.mp4" not in message
+        assert "missing" not in message
     assert not set("│╭╰─") & set(message)
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    message = complaint(capsys, "create", str(tmp_path / "none.mp4"), "--out", str(tmp_path / "out"))
-    assert "none.mp4" in message
+def test_missing_video(tmp_path: Path, capsys: Told) -> None:
+    assert "none.mp4" in complaint(capsys, "create", tmp_path / "none.mp4", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("command", ["create", "capture"])
-def test_file_that_is_no_video(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_file_that_is_no_video(tmp_path: Path, capsys: Told, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     """It is refused before anything heavy is loaded, so that nobody waits for the answer."""
-    path = tmp_path / "letter.mp4"
-    path.write_text("Dear reader")
     monkeypatch.setattr(f"mien.commands.{command}.Command.run", lambda command: pytest.fail("the work began"))
-    assert "letter.mp4" in complaint(capsys, command, str(path), "--out", str(tmp_path / "out"))
-    picture = cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes()
-    for name in ("face.jpg", "face.mp4"):
-        (tmp_path / name).write_bytes(picture)
-        message = complaint(capsys, command, str(tmp_path / name), "--out", str(tmp_path / "out"))
-        assert f"{name}: is a picture; give a video" in message
+    (tmp_path / "letter.mp4").write_text("Dear reader")
+    (tmp_path / "face.mp4").write_bytes(cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes())
+    for name, told in (("letter.mp4", "letter.mp4"), ("face.mp4", "face.mp4: is a picture; give a video")):
+        assert told in complaint(capsys, command, tmp_path / name, "--out", tmp_path / "out")
 
 
-def test_bad_driver_and_bad_colour_are_refused_before_any_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_driver_and_bad_colour_are_refused_before_any_work(tmp_path: Path, capsys: Told) -> None:
     """They are refused although the workspace is empty, because they are looked at before it is."""
     letter = tmp_path / "letter.mp4"
     letter.write_text("Dear reader")
     with pytest.raises(UserError, match=r"letter\.mp4: cannot be read as a video"):
         check_driver(letter, None)
-    message = complaint(capsys, "render", str(tmp_path), "--sheet", "turntable", "--background", "darkblue")
+    message = complaint(capsys, "render", tmp_path, "--sheet", "turntable", "--background", "darkblue")
     assert "--background darkblue" in message
 
 
-def test_video_without_a_face(faceless_video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    message = complaint(capsys, "create", str(faceless_video), "--out", str(tmp_path / "out"))
-    assert "wall.mp4" in message
-    assert "face" in message
+def test_video_without_a_face(tmp_path: Path, capsys: Told) -> None:
+    frame = np.random.default_rng(0).integers(0, 255, (96, 96, 3), dtype=np.uint8)
+    write_video(tmp_path / "wall.mp4", [frame] * 5, 25.0)
+    message = complaint(capsys, "create", tmp_path / "wall.mp4", "--out", tmp_path / "out")
+    assert re.search(r"wall\.mp4.*face", message)
 
 
-@pytest.mark.parametrize("command", ["track", "train", "evaluate", "export", "render"])
-def test_workspace_that_is_not_there(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = {"export": ["--out", "a.ply"], "render": ["--out", "a.mp4"]}.get(command, [])
-    assert "no such folder" in complaint(capsys, command, str(tmp_path / "gone"), *out)
-    (tmp_path / "empty").mkdir()
-    assert "not a mien workspace" in complaint(capsys, command, str(tmp_path / "empty"), *out)
+@pytest.mark.parametrize("command", ["track", "train", "evaluate", "export --out a.ply", "render --out a.mp4"])
+def test_workspace_that_is_not_there(command: str, tmp_path: Path, capsys: Told) -> None:
+    name, *out = command.split()
+    assert "no such folder" in complaint(capsys, name, tmp_path / "gone", *out)
+    assert "not a mien workspace" in complaint(capsys, name, tmp_path, *out)
 
 
-def test_damaged_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = tmp_path / "out" / "sequences" / "clip" / "capture"
+def test_damaged_capture(tmp_path: Path, capsys: Told) -> None:
+    capture = tmp_path / "sequences" / "clip" / "capture"
     capture.mkdir(parents=True)
     (capture / "capture.json").write_text('{"format": "mien.capture", "ver')
-    said = complaint(capsys, "track", str(tmp_path / "out"))
-    assert "capture.json" in said
-    assert "run `mien capture` again" in said
+    assert re.search("capture.json.*run `mien capture` again", complaint(capsys, "track", tmp_path))
 
 
-def test_choices_do_not_depend_on_hashes() -> None:
-    command = [sys.executable, "-m", "mien.cli", "evaluate", "x", "--protocol", "nope"]
-    shown = subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": "1"}, capture_output=True, text=True)
-    assert f"give one of {PROTOCOLS} instead of" in shown.stderr
+def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: Told) -> None:
+    (tmp_path / "sequences" / "me" / "tracking").mkdir(parents=True)
+    told = complaint(capsys, "track", tmp_path)
+    assert "the capture of me is missing" in told
+    assert f"mien capture VIDEO --out {tmp_path} --name me" in told
 
 
-def test_a_bug_keeps_its_traceback_in_a_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", None)
+def test_a_bug_keeps_its_traceback_in_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["mien", "\x1b[2J\udcff"])
     monkeypatch.setattr("mien.workspace.Workspace.sequence_names", lambda self: 1 / 0)
     assert main(["track", str(tmp_path)]) == 1
     shown = capsys.readouterr().err
     assert "bug in mien" in shown
-    assert "Traceback" not in shown
-    assert "ZeroDivisionError" in next(tmp_path.glob("mien-crash-*.log")).read_text()
-
-
-def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "sequences" / "me" / "tracking").mkdir(parents=True)
-    told = complaint(capsys, "track", str(tmp_path))
-    assert "the capture of me is missing" in told
-    assert f"mien capture VIDEO --out {tmp_path} --name me" in told
+    assert not [word for word in ("Traceback", "\x1b") if word in shown]
+    (log,) = tmp_path.glob("mien-crash-*.log")
+    assert "ZeroDivisionError" in log.read_text()
 
 
 STOPPED = "mien: stopped; the same command continues where it stopped, or starts again\n"
