@@ -19,7 +19,6 @@ from web_case import WEB, drawn_head, node
 
 pytestmark = pytest.mark.unchecked
 MOST_BYTES, SECONDS = 1 << 30, 120
-AN_ARRAY = "avatar.baked.means"
 
 
 def read_by_node(built: Path, content: bytes, tmp_path: Path) -> str:
@@ -46,46 +45,30 @@ def packed(header: dict[str, Any], arrays: bytes) -> bytes:
     return gzip.compress(struct.pack("<I", len(text)) + text + arrays, 1)
 
 
-def test_a_whole_file_is_read(built: Path, tmp_path: Path) -> None:
-    assert read_by_node(built, packed(*parts()), tmp_path) == ""
-
-
-@pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        (f"tensors/{AN_ARRAY}/middle", {"length": 1e15}),
-        (f"tensors/{AN_ARRAY}/step", {"length": 1e15}),
-        (f"tensors/{AN_ARRAY}/middle", []),
-        (f"tensors/{AN_ARRAY}/shape", [1e9, 1e9]),
-        (f"tensors/{AN_ARRAY}/shape", {"length": 3e9}),
-        (f"tensors/{AN_ARRAY}/shape", [-5, -3]),
-        (f"tensors/{AN_ARRAY}/bits", 1e-9),
-        (f"tensors/{AN_ARRAY}/at", -1e15),
-        (f"tensors/{AN_ARRAY}", None),
-        ("tensors", None),
-        ("content/avatar/expression_names", {"length": 3e9}),
-        ("content/avatar/baked/rig/joint_names", {"length": 3e9}),
+def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path) -> None:
+    """Lengths without end, shapes and places that cannot be, parts of another type, and parents that are no tree."""
+    array, rig = "tensors/avatar.baked.means", "content/avatar/baked/rig"
+    header, arrays = parts()
+    assert read_by_node(built, packed(header, arrays), tmp_path) == "", "the whole file is read"
+    for place, value in (
+        (f"{array}/middle", {"length": 1e15}), (f"{array}/step", {"length": 1e15}), (f"{array}/middle", []),
+        (f"{array}/shape", [1e9, 1e9]), (f"{array}/shape", {"length": 3e9}), (f"{array}/shape", [-5, -3]),
+        (f"{array}/bits", 1e-9), (f"{array}/at", -1e15), (array, None), ("tensors", None),
+        ("content/avatar/expression_names", {"length": 3e9}), (f"{rig}/joint_names", {"length": 3e9}),
         ("content/avatar/baked/faces", {"length": 3e9}),
         ("content/avatar/baked/means", {"tensor": "avatar.baked.rig.expression_basis", "length": 3e9}),
-        ("content/avatar/baked", None),
-        ("content/avatar/baked/rig/joint_template", [0, 1, 2]),
-        ("content/avatar/baked/rig/joint_parents", [5, 5, 5]),
-        ("content/avatar/baked/rig/joint_parents", [-1, [[]], 0]),
-        ("content/avatar/baked/rig/joint_names", "x" * 100_000),
-        ("content/avatar/baked/changes/rest", [0]),
-        ("content/avatar/neutral", None),
-        ("content/avatar/camera", []),
+        ("content/avatar/baked", None), (f"{rig}/joint_template", [0, 1, 2]), (f"{rig}/joint_parents", [5, 5, 5]),
+        (f"{rig}/joint_parents", [-1, [[]], 0]), (f"{rig}/joint_names", "x" * 100_000),
+        ("content/avatar/baked/changes/rest", [0]), ("content/avatar/neutral", None), ("content/avatar/camera", []),
         ("content/motion", {"fps": 30}),
-    ],
-)
-def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path, place: str, value: Any) -> None:
-    header, arrays = copy.deepcopy(parts())
-    *way, last = place.split("/")
-    node_of: Any = header
-    for name in way:
-        node_of = node_of[name]
-    node_of[last] = value
-    assert read_by_node(built, packed(header, arrays), tmp_path).startswith("is damaged")
+    ):  # fmt: skip
+        changed = copy.deepcopy(header)
+        *way, last = place.split("/")
+        part: Any = changed
+        for name in way:
+            part = part[name]
+        part[last] = value
+        assert read_by_node(built, packed(changed, arrays), tmp_path).startswith("is damaged"), (place, value)
 
 
 def test_damage_behind_the_beginning_is_told(built: Path, tmp_path: Path) -> None:

@@ -9,9 +9,8 @@ import pytest
 from mien import runtime
 from mien.export import write_glb, write_packed
 from test_glb import mesh_model
-from web_case import WEB, browse, bundle, drawn_head, picture, psnr, script, served, violations
+from web_case import WEB, browse, bundle, drawn_head, expect_usable, likeness, picture, psnr, rendered, script, served
 
-SIDE = 320
 EXAMPLES = WEB / "examples"
 LOADED = """
 window.avatar = document.querySelector("mien-avatar");
@@ -32,8 +31,6 @@ viewer.background = [1, 1, 1, 1];
 viewer.draw();
 return viewer.canvas.toDataURL();
 """
-
-
 PAGE = '<link rel="icon" href="data:,"><canvas id="scene" style="width: 400px; height: 400px"></canvas>'
 ONE_BY_ONE = "for (const [name, value] of [['jawOpen', 0.7], ['eyeBlinkLeft', 1]]) avatar.setExpression(name, value);"
 STILL = """
@@ -60,7 +57,7 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
         script("avatar.expression = '';", ONE_BY_ONE, SHOT),
         script("avatar.setAttribute('yaw', '20');", SHOT),
         *(script(f"avatar.setAttribute('yaw', '{yaw}');", AHEAD) for yaw in (0, 30, -30)),
-        "[avatar.getAttribute('role'), avatar.getAttribute('aria-label'), avatar.setExpression('smirk', 1),"
+        "[...['role', 'aria-label'].map((name) => avatar.getAttribute(name)), avatar.setExpression('smirk', 1),"
         " avatar.viewer.canvas.tabIndex]",
         script("avatar.remove(); const gone = avatar.viewer; document.body.append(avatar);", LOADED, "return gone;"),
         script(
@@ -73,17 +70,14 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
     with served(site) as address:
         told = browse(f"{address}/index.html", steps, size=(500, 600))
     rest, open_, same, turned, ahead, left, right, facts, gone, error = told["results"]
-    assert left > ahead + 0.2, "yaw goes to the left of the person, as for `mien render --yaw`"
-    assert right < ahead - 0.2
-    exact = runtime.Avatar(drawn_head(2000, rank=2))
-    camera = exact.camera.resized(SIDE, SIDE)
-    shut = exact.render(exact.pose({"jawOpen": 0.0}), camera)[0]
-    assert psnr(picture(rest)[..., :3], shut) >= 45
+    assert left - 0.2 > ahead > right + 0.2, "yaw goes to the left of the person, as for `mien render --yaw`"
+    head = drawn_head(2000, rank=2)
+    shut, wide = (rendered(head, face, 320)[0] for face in ({"jawOpen": 0.0}, {"jawOpen": 0.7, "eyeBlinkLeft": 1.0}))
     np.testing.assert_array_equal(picture(open_), picture(same))
-    wide = exact.render(exact.pose({"jawOpen": 0.7, "eyeBlinkLeft": 1.0}), camera)[0]
-    assert psnr(picture(open_)[..., :3], wide) >= 45
+    assert likeness(rest, shut) >= 45
+    assert likeness(open_, wide) >= 45
     assert psnr(shut, wide) < 40
-    assert psnr(picture(turned)[..., :3], wide) < 30
+    assert likeness(turned, wide) < 30
     assert facts == ["img", "Avatar of drawn", False, 0]
     assert gone is None
     words = "nobody.packed cannot be fetched: the server answers 404"
@@ -112,31 +106,24 @@ def test_an_avatar_stands_in_a_scene_of_three(site: Path) -> None:
     with served(site) as address:
         told = browse(f"{address}/three.html", steps, size=(600, 600))
     assert told["messages"] == []
-    scene, (front, behind), alone, turned = told["results"]
+    scene, (front, _), alone, turned = told["results"]
     scene, alone, turned = (picture(address)[..., :3] for address in (scene, alone, turned))
-
-    def at(image: np.ndarray, place: list[float]) -> np.ndarray:
-        height, width = image.shape[:2]
-        return image[round((1 - place[1]) / 2 * height), round((1 + place[0]) / 2 * width)]
-
-    red, head = at(scene, front), at(alone, front)
-    assert red[0] > 2 * red[2]
-    assert np.abs(red - head).max() > 0.1
-    blue = (scene[..., 2] > scene[..., 0] + 0.3).mean()
-    # The whole box would take 0.16 of the picture.
-    assert 0.03 < blue < 0.11
-    # Where the head is opaque, the box behind it changes nothing.
+    row, column = round((1 - front[1]) / 2 * 400), round((1 + front[0]) / 2 * 400)
+    assert scene[row, column, 0] > 2 * scene[row, column, 2], "the red box before the head"
+    assert np.abs(scene - alone)[row, column].max() > 0.1
+    # The whole blue box would take 0.16 of the picture.
+    assert 0.03 < (scene[..., 2] > scene[..., 0] + 0.3).mean() < 0.11
     exact = runtime.Avatar(drawn_head(2000, rank=2))
-    gaussians = exact.pose()
-    moved = runtime.Gaussians(**{**vars(gaussians), "T_world_local": np.eye(4, dtype=np.float32)})
-    for degrees, found in ((0.0, alone), (20.0, turned)):
-        camera = scene_camera(np.radians(degrees), 400)
-        expected, alpha = exact.render(moved, camera, background=(0xDD / 255, 0xE4 / 255, 0xEA / 255))
-        assert psnr(found, expected) >= 40
-        if degrees == 0:
-            near_blue = np.s_[:200, :200]
-            solid = alpha[near_blue] > 0.99
-            assert np.abs(scene - alone).max(-1)[near_blue][solid].max() < 0.03
+    moved = runtime.Gaussians(**{**vars(exact.pose()), "T_world_local": np.eye(4, dtype=np.float32)})
+    (expected, alpha), (aside, _) = (
+        exact.render(moved, scene_camera(np.radians(degrees), 400), background=(0xDD / 255, 0xE4 / 255, 0xEA / 255))
+        for degrees in (0.0, 20.0)
+    )
+    assert psnr(alone, expected) >= 40
+    assert psnr(turned, aside) >= 40
+    # Where the head is opaque, the box behind it changes nothing.
+    near_blue = np.s_[:200, :200]
+    assert np.abs(scene - alone).max(-1)[near_blue][alpha[near_blue] > 0.99].max() < 0.03
 
 
 DROP = """
@@ -165,34 +152,27 @@ def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
         return get.call(this, kind, { ...made, preserveDrawingBuffer: true });
       };
     """
-    names = ("same.packed", "same.mien", "same.glb", "none.txt")
-    steps = [script(DROP % (name, name), SEEN) for name in names[:3]]
+    names = ("same.packed", "same.mien", "same.glb")
+    steps = [script(DROP % (name, name), SEEN) for name in names]
     steps += [script("document.querySelector('nav button').click(); const words = { textContent: '' };", SEEN)]
-    steps += [script(DROP % (names[3], names[3]), SEEN)]
+    steps += [script(DROP % ("none.txt", "none.txt"), SEEN)]
     with served(site) as address:
         told = browse(f"{address}/playground.html", steps, size=(600, 700), opening=kept)
-    packed, mien, glb, smiling, none = told["results"]
-    assert [words for words, _, _ in (packed, mien, glb)] == [
-        f"{name}: drag it, or press a face." for name in names[:3]
-    ]
+    words, addresses, faces = zip(*told["results"], strict=True)
+    assert words[:3] == tuple(f"{name}: drag it, or press a face." for name in names)
+    assert words[4] == "none.txt is not a .mien file"
+    assert faces[2] > 5
     # Colours of clear pixels are rounded, so they count by their alpha.
-    by_packed, by_mien, by_glb, smile = (
-        picture(url)[..., :3] * picture(url)[..., 3:] for _, url, _ in (packed, mien, glb, smiling)
-    )
-    assert by_packed.std() > 0.05, "somebody is seen"
-    assert psnr(by_packed, by_mien) >= 40
-    np.testing.assert_array_equal(by_mien, by_glb)
-    assert glb[2] > 5
-    assert psnr(smile, by_glb) < 45
-    assert none[0] == "none.txt is not a .mien file"
+    packed, mien, glb, smile = (picture(url)[..., :3] * picture(url)[..., 3:] for url in addresses[:4])
+    assert packed.std() > 0.05, "somebody is seen"
+    assert psnr(packed, mien) >= 40
+    np.testing.assert_array_equal(mien, glb)
+    assert psnr(smile, glb) < 45
 
 
-@pytest.mark.parametrize("device", [[], ["dark", "touch"]])
-def test_everybody_can_use_the_playground(site: Path, device: list[str]) -> None:
-    """axe-core finds no fault in it, with and without an avatar."""
+def test_everybody_can_use_the_playground(site: Path) -> None:
     with served(site) as address:
-        steps = ("", DROP % ("me.packed", "me.packed"))
-        assert violations(f"{address}/playground.html", (390, 844), device, *steps) == []
+        expect_usable(f"{address}/playground.html", "", DROP % ("me.packed", "me.packed"))
 
 
 def scene_camera(turn: float, side: int) -> runtime.Camera:

@@ -1,7 +1,6 @@
 """The back end in WebGPU draws as the native renderer does, and WebGL2 takes over where it is missing or lost."""
 
 import base64
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,17 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import web_case as web
 from mien import runtime
-from mien.cli import main
 from mien.export import unpacked, write_packed, write_page
 from needs import NO_WEBGPU
-from test_web import POSE as POSE_PAGE
-from test_web import REST, SIDE, SLIDE
+from test_web import REST, SHOW, SLIDE, WHITE, posing
 from test_web_element import LOADED, SHOT
 from test_web_skinned import points, skinned_head
-from web_case import as_json, browse, drawn_head, faces_of, painted_head, picture, posed_by_python, psnr, script, served
+from web_case import browse, drawn_head, faces_of, likeness, picture, psnr, rendered, script
 
-ADAPTER = "(async () => Boolean(await navigator.gpu?.requestAdapter()))()"
 PAGE = '<link rel="icon" href="data:,"><canvas id="view" width="512" height="512"></canvas>'
 OPEN = """
 const { readAny, Viewer } = await import("./mien.js"), { findBackend } = await import("./webgpu.js");
@@ -31,19 +28,7 @@ before.replaceWith(canvas);
 window.viewer = new Viewer(canvas, avatar, null, await findBackend("BACKEND"));
 viewer.background = [1, 1, 1, 1];
 """
-DRAW = """
-viewer.draw();
-return canvas.toDataURL("image/png");
-"""
-POSE = """
-const { canvas } = viewer, face = FACE;
-viewer.take(Object.fromEntries(Object.entries(face).map(([name, values]) => [name, Float32Array.from(values)])));
-"""
-LACKING = "delete window.Float16Array;"
-"""A browser without half floats stands for a device with too little memory."""
-RESIZE = """
-[canvas.width, canvas.height] = [300, 300];
-"""
+RESIZE = "[viewer.canvas.width, viewer.canvas.height] = [300, 300];"
 CLEAR = "viewer.background = [0, 0, 0, 0];"
 LOSE = """
 const { drawer } = viewer.renderer;
@@ -75,9 +60,8 @@ def site(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the package and an empty page, or skip the test if the browser has no WebGPU."""
     folder = Path(shutil.copytree(built, tmp_path_factory.mktemp("site"), dirs_exist_ok=True))
     (folder / "index.html").write_text(PAGE)
-    with served(folder) as address:
-        if browse(f"{address}/index.html", [ADAPTER], webgpu=True)["results"] != [True]:
-            pytest.skip(NO_WEBGPU)
+    if run(folder, ["(async () => Boolean(await navigator.gpu?.requestAdapter()))()"])["results"] != [True]:
+        pytest.skip(NO_WEBGPU)
     return folder
 
 
@@ -86,46 +70,46 @@ def opened(name: str, backend: str = "webgpu") -> str:
 
 
 def run(site: Path, scripts: list[str], webgpu: bool = True) -> dict[str, Any]:
-    with served(site) as address:
+    with web.served(site) as address:
         return browse(f"{address}/index.html", scripts, webgpu=webgpu)
 
 
 HEADS = {
     "gaussian_avatars": lambda: drawn_head(4000, rank=2, sh=4, sh_frame="world"),
-    "headgas": lambda: painted_head(1500),
+    "headgas": lambda: web.painted_head(1500),
     "mono_gaussian_avatar": skinned_head,
     "colors that depend on the view": lambda: points(1500)["points"],
 }
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize(
-    ("backend", "method"),
-    [*(("page", method) for method in list(HEADS)[1:]), *(("webgpu", method) for method in list(HEADS)[:3])],
-)
-def test_pictures_are_those_of_the_native_renderer(
-    request: pytest.FixtureRequest, tmp_path: Path, backend: str, method: str
-) -> None:
-    """By the page with WebGL2, and by WebGPU. The page's network runs on the GPU."""
+@pytest.mark.parametrize("method", list(HEADS)[:3])
+def test_pictures_are_those_of_the_native_renderer(site: Path, method: str) -> None:
     portable = HEADS[method]()
     faces = [runtime.Face(**vars(portable.neutral)), *faces_of(portable, 2)]
-    if backend == "page":
-        assert write_page(tmp_path / "a.html", portable).psnr >= 45
-        poses = [POSE_PAGE % json.dumps(face) for face in as_json(faces)]
-        told = browse(tmp_path / "a.html", ["(async () => (await mien).poser.runsNetwork)()", *poses])
-        assert told["requests"] == []
-        assert (told["results"][0] is False) == (method == "headgas"), "its network runs on the GPU"
-    else:
-        site = request.getfixturevalue("site")
-        write_packed(site / "drawn.packed", portable)
-        poses = [script(POSE.replace("FACE", json.dumps(face)), DRAW) for face in as_json(faces)]
-        told = run(site, [script(opened("drawn")), *poses])
+    write_packed(site / "drawn.packed", portable)
+    told = run(site, [script(opened("drawn")), *(script(web.taking(face), SHOW) for face in faces)])
+    expect_pictures(portable, faces, told)
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("method", list(HEADS)[1:])
+def test_a_page_draws_every_kind_with_webgl2(tmp_path: Path, method: str) -> None:
+    """Its network runs on the GPU."""
+    portable = HEADS[method]()
+    faces = [runtime.Face(**vars(portable.neutral)), *faces_of(portable, 2)]
+    assert write_page(tmp_path / "a.html", portable).psnr >= 45
+    told = browse(tmp_path / "a.html", ["(async () => (await mien).poser.runsNetwork)()", *map(posing, faces)])
+    assert told["requests"] == []
+    assert (told["results"][0] is False) == (method == "headgas"), "its network runs on the GPU"
+    expect_pictures(portable, faces, told)
+
+
+def expect_pictures(portable: runtime.PortableAvatar, faces: list[runtime.Face], told: dict[str, Any]) -> None:
     assert told["messages"] == []
-    exact = runtime.Avatar(portable)
-    camera = exact.camera.resized(SIDE, SIDE)
-    expected = [exact.render(runtime.pose(portable.baked, face), camera)[0] for face in faces]
+    expected = [rendered(portable, face)[0] for face in faces]
     for truth, address in zip(expected, told["results"][1:], strict=True):
-        assert psnr(picture(address)[..., :3], truth) >= 45
+        assert likeness(address, truth) >= 45
     assert psnr(expected[1], expected[2]) < 35
 
 
@@ -135,18 +119,13 @@ def numbers(told: dict[str, str], name: str, dtype: Any = np.float32) -> np.ndar
 
 def test_the_gpu_poses_as_python(site: Path) -> None:
     """Centres to 1e-5 m, outputs of the network to 1e-3. The second face is the first one with another expression."""
-    heads = {
-        "gaussian_avatars": drawn_head(500, 3),
-        "some columns": drawn_head(499, 5, columns=2),
-        "headgas": painted_head(300),
-    }
-    steps = []
-    for name, portable in heads.items():
-        write_packed(site / f"{name}.packed", portable)
-        poses = [script(POSE.replace("FACE", json.dumps(face)), BUFFERS) for face in as_json(faces_of(portable, 2))]
-        steps += [script(opened(name)), *poses]
+    heads, steps = (drawn_head(500, 3), drawn_head(499, 5, columns=2), web.painted_head(300)), []
+    for index, portable in enumerate(heads):
+        write_packed(site / f"{index}.packed", portable)
+        poses = [script(web.taking(face), BUFFERS) for face in faces_of(portable, 2)]
+        steps += [script(opened(str(index))), *poses]
     told = run(site, steps)["results"]
-    for index, portable in enumerate(map(unpacked, heads.values())):
+    for index, portable in enumerate(map(unpacked, heads)):
         expect_posed(portable, faces_of(portable, 2), told[3 * index + 1 : 3 * index + 3])
 
 
@@ -160,7 +139,7 @@ def expect_posed(portable: runtime.PortableAvatar, faces: list[runtime.Face], to
         means, colors = (numbers(found, name)[: 4 * n].reshape(n, 4) for name in ("means", "colors"))
         np.testing.assert_array_equal(means[:, 3], baked.face_index)
         centers = np.einsum("nij,nj->ni", frames[..., :3], means[:, :3]) + frames[..., 3]
-        _, expected, logits, shown = posed_by_python(baked, face)
+        _, expected, logits, shown = web.posed_by_python(baked, face)
         np.testing.assert_allclose(centers, expected, rtol=0, atol=1e-5)
         np.testing.assert_allclose(colors, np.column_stack([shown, logits]), rtol=0, atol=1e-3)
         moved.append(colors)
@@ -202,98 +181,70 @@ def test_the_gpu_sorts_from_far_to_near(site: Path, count: int) -> None:
 def test_size_background_and_a_lost_device(site: Path) -> None:
     portable = drawn_head(3000, rank=2)
     write_packed(site / "small.packed", portable)
-    face = faces_of(portable, 1)
-    (told_face,) = as_json(face)
-    pose = POSE.replace("FACE", json.dumps(told_face))
-    resize, clear, lose = (script("const { canvas } = viewer;", part, DRAW) for part in (RESIZE, CLEAR, LOSE))
-    told = run(site, [script(opened("small")), script(pose, DRAW), resize, clear, lose, script("viewer.dispose();")])
+    (face,) = faces_of(portable, 1)
+    parts = (opened("small"), web.taking(face), RESIZE, CLEAR, LOSE)
+    told = run(site, [*(script(part, SHOW) for part in parts), script("viewer.dispose();")])
     _, first, smaller, clear, after, _ = told["results"]
-    exact = runtime.Avatar(portable)
-    posed = runtime.pose(portable.baked, face[0])
-    large, small = (exact.camera.resized(side, side) for side in (SIDE, 300))
-    assert psnr(picture(first)[..., :3], exact.render(posed, large)[0]) >= 45
+    expected, alpha = rendered(portable, face, 300)
+    assert likeness(first, rendered(portable, face)[0]) >= 45
     assert picture(smaller).shape[:2] == (300, 300)
-    assert psnr(picture(smaller)[..., :3], exact.render(posed, small)[0]) >= 45
-    alpha = exact.render(posed, small)[1]
-    assert np.abs(picture(clear)[..., 3] - alpha).max() < 0.02
+    assert likeness(smaller, expected) >= 45
     # WebGL2 has drawn the face that WebGPU had posed.
-    assert np.abs(picture(after)[..., 3] - alpha).max() < 0.02
+    for address in (clear, after):
+        assert np.abs(picture(address)[..., 3] - alpha).max() < 0.02
     assert psnr(picture(after)[alpha > 0.9], picture(clear)[alpha > 0.9]) >= 45
     (message,) = told["messages"]
     assert message.startswith("mien: the WebGPU device is lost (")
     assert message.endswith("; WebGL2 draws instead")
 
 
-@pytest.mark.parametrize(
-    ("backend", "webgpu", "before", "reason"),
-    [
-        ("webgpu", False, "", "WebGPU has no adapter here"),
-        ("auto", True, "", "WebGPU has an adapter in software only"),
-        ("webgl2", True, "", None),
-        (
-            "webgpu",
-            True,
-            "delete window.Float16Array;",
-            "this avatar needs half floats, which this browser's WebGPU lacks",
-        ),
-    ],
-)
-def test_webgl2_draws_where_webgpu_cannot(
-    site: Path, backend: str, webgpu: bool, before: str, reason: str | None
-) -> None:
-    portable = painted_head(300) if before else drawn_head(500)
-    write_packed(site / "few.packed", portable)
-    draw = script("const { canvas } = viewer;", DRAW)
-    told = run(site, [script(before, opened("few", backend)), draw], webgpu=webgpu)
-    # Chromium itself has a word to say about adapters.
-    ours = [message for message in told["messages"] if message.startswith("mien")]
-    assert ours == ([f"mien: {reason}; WebGL2 draws instead"] if reason else [])
-    exact = runtime.Avatar(portable)
-    expected, _ = exact.render(camera=exact.camera.resized(SIDE, SIDE))
-    assert psnr(picture(told["results"][1])[..., :3], expected) >= 45
+def test_webgl2_draws_where_webgpu_cannot(site: Path) -> None:
+    """A browser without half floats stands for a device with too little memory."""
+    lacking = "this avatar needs half floats, which this browser's WebGPU lacks"
+    for portable, backend, webgpu, before, reason in (
+        (drawn_head(500), "webgpu", False, "", "WebGPU has no adapter here"),
+        (drawn_head(500), "auto", True, "", "WebGPU has an adapter in software only"),
+        (drawn_head(500), "webgl2", True, "", None),
+        (web.painted_head(300), "webgpu", True, "delete window.Float16Array;", lacking),
+    ):
+        write_packed(site / "few.packed", portable)
+        told = run(site, [script(before, opened("few", backend), SHOW)], webgpu=webgpu)
+        # Chromium itself has a word to say about adapters.
+        ours = [message for message in told["messages"] if message.startswith("mien")]
+        assert ours == ([f"mien: {reason}; WebGL2 draws instead"] if reason else [])
+        assert likeness(told["results"][0], rendered(portable)[0]) >= 45, reason
 
 
 def test_a_page_draws_with_webgpu(site: Path, tmp_path: Path) -> None:
     """If it is asked to by its address. By itself it does so on a GPU only."""
-    portable = drawn_head(3000, rank=2)
-    page = tmp_path / "a.html"
+    portable, page = drawn_head(3000, rank=2), tmp_path / "a.html"
     write_page(page, portable, webgpu=True)
     plain = write_page(tmp_path / "b.html", portable)
     assert 0 < page.stat().st_size - plain.size < 25_000
     (face,) = faces_of(portable, 1)
-    scripts = [POSE_PAGE % json.dumps(as_json([face])[0]), REST, SLIDE]
-    exact = runtime.Avatar(portable)
-    expected, _ = exact.render(runtime.pose(portable.baked, face), exact.camera.resized(SIDE, SIDE))
-    told = browse(page, scripts, fragment="webgpu", webgpu=True)
+    told = browse(page, [posing(face), REST, script(WHITE, SLIDE, SHOW)], fragment="webgpu", webgpu=True)
     assert (told["requests"], told["messages"]) == ([], [])
-    posed, rest, slid = map(picture, told["results"])
-    assert psnr(posed[..., :3], expected) >= 45
-    assert np.abs(slid - rest).max() > 0.1
+    posed, rest, slid = told["results"]
+    assert likeness(posed, rendered(portable, face)[0]) >= 45
+    assert np.abs(picture(slid) - picture(rest)).max() > 0.1
     told = browse(page, ["mien.then(() => 0)"], webgpu=True)
     assert told["messages"] == ["mien: WebGPU has an adapter in software only; WebGL2 draws instead"]
 
 
 def test_the_element_draws_with_webgpu(site: Path) -> None:
-    write_packed(site / "me.packed", drawn_head(3000, rank=2))
+    portable = drawn_head(3000, rank=2)
+    write_packed(site / "me.packed", portable)
     (site / "element.html").write_text(
         '<link rel="icon" href="data:,"><script type="module" src="element.js"></script>'
         '<mien-avatar src="me.packed" backend="webgpu" expression="jawOpen:0.5"></mien-avatar>'
     )
-    with served(site) as address:
-        page = f"{address}/element.html"
-        told = browse(page, [script(LOADED, SHOT), "Boolean(avatar.viewer.renderer.drawer)"], webgpu=True)
+    steps = [script(LOADED, SHOT), "Boolean(avatar.viewer.renderer.drawer)"]
+    with web.served(site) as address:
+        told = browse(f"{address}/element.html", steps, webgpu=True)
         (site / "webgpu.js").rename(site / "elsewhere.js")
-        without = browse(page, [script(LOADED, SHOT)], webgpu=True)
+        without = browse(f"{address}/element.html", steps[:1], webgpu=True)
         (site / "elsewhere.js").rename(site / "webgpu.js")
-    assert told["messages"] == []
-    assert told["results"][1] is True
+    assert (told["messages"], told["results"][1]) == ([], True)
     assert without["messages"][-1].endswith("WebGL2 draws instead")
-    exact = runtime.Avatar(drawn_head(3000, rank=2))
-    expected, _ = exact.render(exact.pose({"jawOpen": 0.5}), exact.camera.resized(320, 320))
     for results in (told["results"], without["results"]):
-        assert psnr(picture(results[0])[..., :3], expected) >= 45
-
-
-def test_only_a_page_takes_webgpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(tmp_path), "--out", str(tmp_path / "a.packed"), "--webgpu"]) == 2
-    assert "only an .html page draws with WebGPU; leave --webgpu out" in capsys.readouterr().err
+        assert likeness(results[0], rendered(portable, {"jawOpen": 0.5}, 320)[0]) >= 45

