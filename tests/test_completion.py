@@ -14,7 +14,7 @@ from mien.render.mesh import shade
 from mien.tracking.landmarks import with_regions_by_landmarks
 from mien.training.whole_head.completion import complete_colors, vertex_means
 
-_SKIN, _HAIR, _SHIRT = (0.8, 0.6, 0.5), (0.2, 0.12, 0.08), (0.1, 0.7, 0.2)
+_SKIN, _HAIR, _SHIRT = torch.tensor([[0.8, 0.6, 0.5], [0.2, 0.12, 0.08], [0.1, 0.7, 0.2]])
 
 
 @pytest.fixture(scope="module")
@@ -29,82 +29,59 @@ def _middles(model: FaceModel) -> torch.Tensor:
 
 def _painted(model: FaceModel) -> torch.Tensor:
     """The colours of a person with brown hair and a light skin."""
-    colors = torch.tensor(_SKIN).repeat(len(model.faces), 1)
-    colors[head_parts(model).scalp] = torch.tensor(_HAIR)
-    return colors
+    return torch.where(head_parts(model).scalp[:, None], _HAIR, _SKIN)
 
 
-# The mirror map -------------------------------------------------------------------------------------------------------
+def _completed(model: FaceModel, seen: torch.Tensor, colors: torch.Tensor, unseen: float = 0.5) -> torch.Tensor:
+    """The colours that are completed from those of the triangles that are seen."""
+    return complete_colors(model, model.template, seen.float(), torch.where(seen[:, None] > 0, colors, unseen))
 
 
-def test_mirror_images_of_a_symmetric_mesh_are_an_involution(anny):
-    images = mirror_triangles(anny)
+def test_mirror_images_lie_on_the_other_side_in_the_same_region(anny, flame):
+    images, middles = mirror_triangles(anny), _middles(anny)
     assert (images >= 0).float().mean() > 0.99
     has = (images >= 0).nonzero()[:, 0]
-    back = images[images[has]]
-    assert (back == has).float().mean() > 0.99
-    reflected = _middles(anny) * torch.tensor([-1.0, 1.0, 1.0])
-    assert (reflected[has] - _middles(anny)[images[has]]).norm(dim=1).median() < 1e-4
-
-
-def test_mirror_images_stay_in_their_region_and_change_sides(anny):
-    images = mirror_triangles(anny)
-    has = images >= 0
+    assert (images[images[has]] == has).float().mean() > 0.99, "an involution"
+    reflected = middles * torch.tensor([-1.0, 1.0, 1.0])
+    assert (reflected[has] - middles[images[has]]).norm(dim=1).median() < 1e-4
     assert torch.equal(anny.face_regions[images[has]], anny.face_regions[has])
-    aside = has & (_middles(anny)[:, 0] > 0.01)
-    assert (_middles(anny)[images[aside], 0] < 0).all()
-
-
-def test_mirror_images_of_another_topology_and_of_a_mesh_that_is_not_quite_symmetric(flame):
+    aside = has[middles[has, 0] > 0.01]
+    assert (middles[images[aside], 0] < 0).all()
     random = torch.Generator().manual_seed(1)
     bent = replace(flame, template=flame.template + 3e-4 * torch.randn(flame.template.shape, generator=random))
     for model in (flame, bent):
-        images = mirror_triangles(model)
-        assert (images >= 0).float().mean() > 0.9
-
-
-def test_a_triangle_without_a_counterpart_has_no_mirror_image(anny):
-    middles = _middles(anny)
+        assert (mirror_triangles(model) >= 0).float().mean() > 0.9
     left = middles[:, 0] > 0.03
     half = replace(anny, faces=anny.faces[left], uv_faces=anny.uv_faces[left], face_regions=anny.face_regions[left])
     assert (mirror_triangles(half) == -1).all()
-
-
-# Completion -----------------------------------------------------------------------------------------------------------
 
 
 def test_seen_colors_are_untouched(anny):
     random = torch.Generator().manual_seed(2)
     colors = torch.rand(len(anny.faces), 3, generator=random)
     seen = (torch.rand(len(anny.faces), generator=random) > 0.5).float()
-    light = torch.randn(9, 3, generator=random)
-    for given in (None, light):
-        completed = complete_colors(anny, anny.template, seen, colors, light=given)
+    for light in (None, torch.randn(9, 3, generator=random)):
+        completed = complete_colors(anny, anny.template, seen, colors, light=light)
         assert torch.equal(completed[seen == 1], colors[seen == 1])
 
 
 def test_an_unseen_side_gets_the_mirror_images_colors(anny):
     """A mole on one cheek appears on the other, which the camera did not see."""
-    colors = _painted(anny)
-    middles = _middles(anny)
+    colors, middles, face = _painted(anny), _middles(anny), head_parts(anny).face
     away = (middles - torch.tensor([0.045, -0.03, 0.08])).norm(dim=1)
-    mole = head_parts(anny).face & (away < away[head_parts(anny).face].kthvalue(12).values)
+    mole = face & (away < away[face].kthvalue(12).values)
     assert mole.sum() > 5
     colors[mole] = torch.tensor([0.4, 0.25, 0.2])
-    seen = (middles[:, 0] > -0.01).float()
-    completed = complete_colors(anny, anny.template, seen, torch.where(seen[:, None] > 0, colors, 0.5))
-    images = mirror_triangles(anny)[mole]
-    assert (completed[images] - colors[mole]).abs().max() < 0.02
+    completed = _completed(anny, middles[:, 0] > -0.01, colors)
+    assert (completed[mirror_triangles(anny)[mole]] - colors[mole]).abs().max() < 0.02
 
 
 def test_no_border_shows_if_one_side_is_lit_less(anny):
     """The left is brighter than the right. Where neither side is on the midline, the step between both is small."""
     middles = _middles(anny)
-    face = head_parts(anny).face
-    lit = torch.tensor(_SKIN) * (1 + 3 * middles[:, :1].clamp(-0.07, 0.07))
-    seen = (middles[:, 0] > -0.03).float()
-    completed = complete_colors(anny, anny.template, seen, torch.where(seen[:, None] > 0, lit, 0.5))
-    border = face & (middles[:, 0] < -0.03) & (middles[:, 0] > -0.04)
+    lit = _SKIN * (1 + 3 * middles[:, :1].clamp(-0.07, 0.07))
+    completed = _completed(anny, middles[:, 0] > -0.03, lit)
+    border = head_parts(anny).face & (middles[:, 0] < -0.03) & (middles[:, 0] > -0.04)
     assert (completed - lit)[border].abs().mean() < 0.03
     mirrored_only = (lit[mirror_triangles(anny)] - lit)[border].abs().mean()
     assert mirrored_only > 0.1
@@ -115,15 +92,15 @@ def test_hair_skin_and_neck_from_a_front_view(source, anny, flame):
     """The back of the head takes hair's colour and not skin's, the neck takes skin's and not the collar's."""
     model = anny if source == "anny" else flame if source == "flame" else with_regions_by_landmarks(flame)
     parts, middles, colors = head_parts(model), _middles(model), _painted(model)
-    colors[parts.neck & (middles[:, 1] < -0.15)] = torch.tensor(_SHIRT)
-    seen = (middles[:, 2] > 0.03).float()
-    assert (parts.scalp & (seen == 1)).any()
-    completed = complete_colors(model, model.template, seen, torch.where(seen[:, None] > 0, colors, 0.9))
-    back = parts.scalp & (seen == 0)
+    colors[parts.neck & (middles[:, 1] < -0.15)] = _SHIRT
+    seen = middles[:, 2] > 0.03
+    assert (parts.scalp & seen).any()
+    completed = _completed(model, seen, colors, unseen=0.9)
+    back = parts.scalp & ~seen
     assert back.sum() > 100
-    assert (completed[back] - torch.tensor(_HAIR)).abs().max() < 0.05
-    nape = parts.neck & (seen == 0) & (middles[:, 1] > -0.12)
-    assert (completed[nape] - torch.tensor(_SKIN)).abs().mean() < 0.05
+    assert (completed[back] - _HAIR).abs().max() < 0.05
+    nape = parts.neck & ~seen & (middles[:, 1] > -0.12)
+    assert (completed[nape] - _SKIN).abs().mean() < 0.05
 
 
 def test_everything_unseen_is_filled_and_damage_does_not_spread(anny):
@@ -134,50 +111,38 @@ def test_everything_unseen_is_filled_and_damage_does_not_spread(anny):
     colors[8], seen[8] = torch.inf, 0.5
     seen[9] = torch.nan
     completed = complete_colors(anny, anny.template, seen, colors, texture=1.0)
-    assert completed.isfinite().all()
-    assert (completed >= 0).all()
-    assert (completed <= 1).all()
+    assert ((completed >= 0) & (completed <= 1)).all()
     sound = (seen == 1) & (torch.arange(len(seen)) != 7)
     assert torch.equal(completed[sound], colors[sound])
-
-
-def test_nothing_seen_at_all_is_still_filled(anny):
-    completed = complete_colors(
-        anny, anny.template, torch.zeros(len(anny.faces)), torch.full((len(anny.faces), 3), 0.5)
-    )
-    assert completed.isfinite().all()
+    assert _completed(anny, torch.zeros(len(seen)), _painted(anny)).isfinite().all(), "nothing seen at all"
 
 
 def test_light_is_taken_out_before_mirroring_and_put_back(anny):
     """A head of one colour in a lamp from its left: the side that is not seen is as dark as the lamp leaves it."""
-    light = torch.zeros(9, 3)
-    light[0], light[3] = 3.2, 1.2
-    shading = shade(triangle_geometry(anny.template, anny.faces)[2], light)
-    if float(shading[_middles(anny)[:, 0] > 0.05].mean()) < float(shading[_middles(anny)[:, 0] < -0.05].mean()):
-        light[3] = -light[3]
-        shading = shade(triangle_geometry(anny.template, anny.faces)[2], light)
-    truth = (torch.tensor(_SKIN) * shading.clamp_min(0.1)).clamp(0, 1)
-    seen = (_middles(anny)[:, 0] > 0).float()
-    outside = head_parts(anny).face & (seen == 0)
-    given = torch.where(seen[:, None] > 0, truth, 0.5)
-    error = [
-        (complete_colors(anny, anny.template, seen, given, light=known) - truth)[outside].abs().mean()
-        for known in (None, light)
-    ]
+    light, seen = torch.zeros(9, 3), _middles(anny)[:, 0] > 0
+    light[0] = 3.2
+    normals = triangle_geometry(anny.template, anny.faces)[2]
+    for strength in (1.2, -1.2):
+        light[3] = strength
+        shading = shade(normals, light)
+        if shading[seen].mean() > shading[~seen].mean():
+            break
+    truth = (_SKIN * shading.clamp_min(0.1)).clamp(0, 1)
+    given = torch.where(seen[:, None], truth, 0.5)
+    found = [complete_colors(anny, anny.template, seen.float(), given, light=known) for known in (None, light)]
+    error = [(each - truth)[head_parts(anny).face & ~seen].abs().mean() for each in found]
     assert error[1] < 0.5 * error[0]
 
 
 def test_a_mouth_that_was_not_seen_is_dark_with_light_teeth(anny):
     parts, middles = head_parts(anny), _middles(anny)
-    seen = ((middles[:, 2] > 0.03) & ~parts.interior).float()
-    completed = complete_colors(anny, anny.template, seen, _painted(anny))
+    completed = _completed(anny, (middles[:, 2] > 0.03) & ~parts.interior, _painted(anny))
     luminance = completed.mean(1)
-    front = middles[:, 2] > 0.09
-    assert luminance[parts.teeth & front].mean() > 0.45
+    front = luminance[parts.teeth & (middles[:, 2] > 0.09)].mean()
+    assert front > 0.45
     assert luminance[parts.mouth].max() < 0.3
     assert luminance[parts.mouth & (middles[:, 2] < 0.04)].max() < 0.08
-    teeth_in_depth = parts.teeth & (middles[:, 2] < 0.06)
-    assert luminance[teeth_in_depth].mean() < 0.5 * luminance[parts.teeth & front].mean()
+    assert luminance[parts.teeth & (middles[:, 2] < 0.06)].mean() < 0.5 * front
     tongue = completed[parts.tongue]
     assert (tongue[:, 0] > 1.3 * tongue[:, 1]).all()
 
@@ -185,8 +150,7 @@ def test_a_mouth_that_was_not_seen_is_dark_with_light_teeth(anny):
 def test_vertices_get_the_mean_of_their_triangles(anny):
     colors = _painted(anny)
     vertices = vertex_means(anny, colors)
-    inside = head_parts(anny).face
-    assert torch.allclose(vertices[anny.faces[inside]].amax(), torch.tensor(_SKIN[0]))
+    assert torch.allclose(vertices[anny.faces[head_parts(anny).face]].amax(), _SKIN[0])
     assert vertices.isfinite().all()
     around = (anny.faces == anny.faces[100, 0]).any(1)
     assert torch.allclose(vertices[anny.faces[100, 0]], colors[around].mean(0), atol=1e-6)

@@ -19,6 +19,7 @@ from mien.tracking import TrackingSettings
 from mien.training import TrainSettings
 
 SETTINGS = TrainSettings(steps=12_000)
+TWO = [Piece("capture", "capture ", 10.0), Piece("training", "training", 190.0)]
 
 
 class Clock:
@@ -33,12 +34,20 @@ class Clock:
     __call__ = monotonic
 
 
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    return clock
+
+
 def pieces_of(frames: int, settings: TrainSettings = SETTINGS) -> list[Piece]:
     return expected_pieces([frames], count_scored([frames], ["me"], settings), TrackingSettings(), settings, "auto")
 
 
-def work(pieces: list[Piece], clock: Clock, seconds: list[float]) -> Iterator[tuple[int, float, float]]:
+def work(pieces: list[Piece], seconds: list[float]) -> Iterator[tuple[int, float, float]]:
     """Do pieces that take so long, and yield the stage, the moment and the remaining time after each tenth of each."""
+    clock = Clock()
     overall = Overall(pieces, clock)
     for piece, each in zip(pieces, seconds, strict=True):
         assert overall.begin(f"{piece.title} me", 0.0)
@@ -49,51 +58,43 @@ def work(pieces: list[Piece], clock: Clock, seconds: list[float]) -> Iterator[tu
         overall.end()
 
 
-@pytest.mark.parametrize("slower", [1.0, 0.25, 6.0])
-def test_the_estimate_converges(slower: float) -> None:
-    """On a machine of any speed, the error shrinks: a quarter of all after the capture, a tenth in half of training."""
-    clock, pieces = Clock(), pieces_of(1000)
-    seconds = [slower * piece.seconds for piece in pieces]
+@pytest.mark.parametrize(("frames", "slower", "most"), [
+    (1000, {}, {2: 0.25, 3: 0.1, 4: 0.05}),
+    (1000, dict.fromkeys(("capture", "tracking", "training", "scoring"), 0.25), {2: 0.25, 3: 0.1, 4: 0.05}),
+    (1000, dict.fromkeys(("capture", "tracking", "training", "scoring"), 6.0), {2: 0.25, 3: 0.1, 4: 0.05}),
+    (500, {"training": 5.0}, {3: 0.25}),
+])  # fmt: skip
+def test_the_estimate_converges(frames: int, slower: dict[str, float], most: dict[int, float]) -> None:
+    """The error shrinks on machines of any speed, and a method that takes longer is noticed while it trains."""
+    pieces = pieces_of(frames)
+    seconds = [slower.get(piece.stage, 1.0) * piece.seconds for piece in pieces]
     whole = sum(seconds)
-    moments = list(work(pieces, clock, seconds))
+    moments = list(work(pieces, seconds))
     errors = [(stage, abs(now + left - whole) / whole) for stage, now, left in moments]
-    for stage, most in ((2, 0.25), (3, 0.1), (4, 0.05)):
-        assert max(error for at, error in errors if at == stage) < most, stage
+    for stage, bound in most.items():
+        assert max(error for at, error in errors if at == stage) < bound, stage
     assert moments[-1][2] == 0.0
-
-
-def test_a_method_that_takes_longer_is_noticed_while_it_trains() -> None:
-    clock, pieces = Clock(), pieces_of(500)
-    seconds = [piece.seconds * (5.0 if piece.stage == "training" else 1.0) for piece in pieces]
-    whole = sum(seconds)
-    errors = [abs(now + left - whole) / whole for stage, now, left in work(pieces, clock, seconds) if stage == 3]
-    assert max(errors) < 0.25
-
-
-def test_stages_come_in_order_and_current_ones_take_no_time() -> None:
-    clock, pieces = Clock(), pieces_of(500)
-    stages = [stage for stage, _, _ in work(pieces, clock, [1.0] * len(pieces))]
+    stages = [stage for stage, *_ in moments]
     assert all(before <= after for before, after in pairwise(stages))
     assert set(stages) == {1, 2, 3, 4}
+
+
+def test_current_stages_take_no_time_and_other_bars_do_not_count() -> None:
+    clock, pieces = Clock(), pieces_of(500)
+    scoring = sum(piece.seconds for piece in pieces if piece.stage == "scoring")
     overall = Overall(pieces, clock)
-    whole = overall.remaining()
-    assert whole == pytest.approx(sum(piece.seconds for piece in pieces))
+    assert overall.remaining() == pytest.approx(sum(piece.seconds for piece in pieces))
     assert overall.begin("training", 0.5)  # capture and tracking are current; the run resumes
     assert overall.stage() == 3
-    assert overall.remaining() == pytest.approx(
-        12_000 * 0.042 / 2 + sum(p.seconds for p in pieces if p.stage == "scoring")
-    )
+    assert overall.remaining() == pytest.approx(12_000 * 0.042 / 2 + scoring)
     clock.now += 100.0
     overall.advance(0.75)
-    assert overall.remaining() == pytest.approx(100.0 + sum(p.seconds for p in pieces if p.stage == "scoring"))
-
-
-def test_another_part_of_a_clip_is_the_same_piece_and_other_bars_do_not_count() -> None:
-    overall = Overall(pieces_of(500), Clock())
+    assert overall.remaining() == pytest.approx(100.0 + scoring)
+    overall = Overall(pieces, Clock())
     assert overall.begin("capture me-1", 0.0)
     overall.end()
     left = overall.remaining()
-    assert overall.begin("capture me-2", 0.0)
+    assert overall.begin("capture me-2", 0.0), "another part of a clip is the same piece"
     overall.end()
     assert (overall.stage(), overall.remaining()) == (1, pytest.approx(left, rel=0.05))
     assert not overall.begin("decode me-1", 0.0)
@@ -111,26 +112,22 @@ def test_pieces_follow_the_settings() -> None:
 
 
 def test_frames_are_counted_as_the_settings_take_them(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", (np.zeros((32, 32, 3), np.uint8) for _ in range(50)), 25.0)
-    (tmp_path / "pictures").mkdir()
+    video, pictures, broken = tmp_path / "a.mp4", tmp_path / "pictures", tmp_path / "broken.mp4"
+    write_video(video, (np.zeros((32, 32, 3), np.uint8) for _ in range(50)), 25.0)
+    pictures.mkdir()
     for number in range(7):
-        (tmp_path / "pictures" / f"{number}.png").touch()
-    (tmp_path / "broken.mp4").write_bytes(b"no video")
-    video = tmp_path / "a.mp4"
-    assert count_captured(video, CaptureSettings()) == 50
-    assert count_captured(video, CaptureSettings(start=0.4, end=1.6, stride=2)) == 15
-    assert count_captured(video, CaptureSettings(max_frames=9)) == 9
-    assert count_captured(tmp_path / "pictures", CaptureSettings()) == 7
-    assert count_captured(tmp_path / "broken.mp4", CaptureSettings()) == 0
+        (pictures / f"{number}.png").touch()
+    broken.write_bytes(b"no video")
+    part = CaptureSettings(start=0.4, end=1.6, stride=2)
+    assert [count_captured(each, CaptureSettings()) for each in (video, pictures, broken)] == [50, 7, 0]
+    assert [count_captured(video, each) for each in (part, CaptureSettings(max_frames=9))] == [15, 9]
 
 
-def test_a_bar_has_the_whole_command_beside_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bar_has_the_whole_command_beside_it(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(progress, "console", Console(file=sys.stderr, width=150, force_terminal=True))
     clock = Clock()
-    with whole_command(Overall([Piece("capture", "capture ", 10.0), Piece("training", "training", 190.0)], clock)):
+    with whole_command(Overall(TWO, clock)):
         with progress_bar("capture me", 2) as advance:
             clock.now += 5.0
             advance(status="sharp")
@@ -142,13 +139,8 @@ def test_a_bar_has_the_whole_command_beside_it(
     assert "alone; all" not in shown
 
 
-def test_a_log_has_a_line_at_each_stage_and_now_and_then(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock = Clock()
-    monkeypatch.setattr(progress, "time", clock)
-    overall = Overall([Piece("capture", "capture ", 10.0), Piece("training", "training", 190.0)], clock)
-    with whole_command(overall):
+def test_a_log_has_a_line_at_each_stage_and_now_and_then(clock: Clock, capsys) -> None:
+    with whole_command(Overall(TWO, clock)):
         with progress_bar("capture me", 1) as advance:
             clock.now += 10.0
             advance()
@@ -158,37 +150,30 @@ def test_a_log_has_a_line_at_each_stage_and_now_and_then(
                 advance()
     with progress_bar("training", 1) as advance:
         advance()
-    lines = [line for line in capsys.readouterr().err.splitlines() if "whole command" in line]
+    ending = " left of the whole command"
+    lines = [line.removesuffix(ending) for line in capsys.readouterr().err.splitlines() if line.endswith(ending)]
     assert lines == [
-        "stage 1 of 2 (capture), about 3 min left of the whole command",
-        "stage 2 of 2 (training), about 3 min left of the whole command",
-        "stage 2 of 2 (training), about 4 min left of the whole command",
-        "stage 2 of 2 (training), about 2 min left of the whole command",
-        "stage 2 of 2 (training), about 70 s left of the whole command",
-        "stage 2 of 2 (training), less than 10 s left of the whole command",
+        "stage 1 of 2 (capture), about 3 min",
+        "stage 2 of 2 (training), about 3 min",
+        "stage 2 of 2 (training), about 4 min",
+        "stage 2 of 2 (training), about 2 min",
+        "stage 2 of 2 (training), about 70 s",
+        "stage 2 of 2 (training), less than 10 s",
     ]
 
 
-def test_the_last_line_is_printed_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    clock = Clock()
-    monkeypatch.setattr(progress, "time", clock)
-    with progress_bar("Tracking", 2) as advance:
-        for _ in range(2):
-            clock.now += 10.0
-            advance(status="clip")
-    assert capsys.readouterr().err.splitlines() == ["Tracking: 1/2 in 10 s; clip", "Tracking: 2/2 in 20 s; clip"]
-
-
-def test_a_slow_first_item_does_not_count(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    clock = Clock()
-    monkeypatch.setattr(progress, "time", clock)
-    with progress_bar("evaluate", 20) as advance:
-        for seconds in (100.0, 10.0, 10.0, *[0.0] * 17):
+@pytest.mark.parametrize(("durations", "status", "told"), [
+    ([10.0, 10.0], "clip", ["1/2 in 10 s; clip", "2/2 in 20 s; clip"]),
+    (
+        [100.0, 10.0, 10.0, *[0.0] * 17], "",
+        ["1/20 in 100 s", "2/20 in 110 s", "3/20 in 120 s, ETA 170 s", "20/20 in 120 s"],
+    ),
+])  # fmt: skip
+def test_a_slow_first_item_does_not_count_and_the_last_line_comes_once(
+    durations: list[float], status: str, told: list[str], clock: Clock, capsys
+) -> None:
+    with progress_bar("Tracking", len(durations)) as advance:
+        for seconds in durations:
             clock.now += seconds
-            advance()
-    assert capsys.readouterr().err.splitlines() == [
-        "evaluate: 1/20 in 100 s",
-        "evaluate: 2/20 in 110 s",
-        "evaluate: 3/20 in 120 s, ETA 170 s",
-        "evaluate: 20/20 in 120 s",
-    ]
+            advance(status=status)
+    assert capsys.readouterr().err.splitlines() == [f"Tracking: {each}" for each in told]

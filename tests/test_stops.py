@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 
 import pytest
 
@@ -12,30 +13,36 @@ from forked import ForkServer
 from mien import stops
 from mien.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Put, Terminated, orderly_stops, stops_put_off
 
-KINDS = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, HungUp)]
+KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated, signal.SIGHUP: HungUp}
+of_every_kind = pytest.mark.parametrize("number", KINDS)
 
 
-@pytest.mark.parametrize(("number", "kind"), KINDS)
-def test_a_second_signal_does_not_interrupt_the_removal(number: signal.Signals, kind: type[BaseException]) -> None:
-    before = [signal.getsignal(each) for each, _ in KINDS]
+def orderly(number: signal.Signals, work: Callable[[], object]) -> None:
+    """Do work that a signal stops."""
+    with pytest.raises(KINDS[number]), orderly_stops():
+        work()
+
+
+@of_every_kind
+def test_a_second_signal_does_not_interrupt_the_removal(number: signal.Signals) -> None:
+    before = [signal.getsignal(each) for each in KINDS]
     removed = []
 
     def work() -> None:
         try:
             signal.raise_signal(number)
         finally:
-            for each, _ in KINDS:
+            for each in KINDS:
                 signal.raise_signal(each)
             removed.append("half a file")
 
-    with pytest.raises(kind), orderly_stops():
-        work()
+    orderly(number, work)
     assert removed == ["half a file"]
-    assert [signal.getsignal(each) for each, _ in KINDS] == before
+    assert [signal.getsignal(each) for each in KINDS] == before
 
 
-@pytest.mark.parametrize(("number", "kind"), KINDS)
-def test_a_stop_that_is_dropped_comes_again(number: signal.Signals, kind: type[BaseException]) -> None:
+@of_every_kind
+def test_a_stop_that_is_dropped_comes_again(number: signal.Signals) -> None:
     """Python can only report an exception in a callback of a library, or in a finaliser. The stop is not lost."""
 
     class Finalised:
@@ -48,13 +55,12 @@ def test_a_stop_that_is_dropped_comes_again(number: signal.Signals, kind: type[B
             time.sleep(0.05)
 
     hook = sys.unraisablehook
-    with pytest.raises(kind), orderly_stops():
-        work()
+    orderly(number, work)
     assert sys.unraisablehook is hook
 
 
-@pytest.mark.parametrize(("number", "kind"), KINDS)
-def test_an_error_that_a_library_makes_of_a_stop_is_the_stop(number: signal.Signals, kind: type[BaseException]) -> None:
+@of_every_kind
+def test_an_error_that_a_library_makes_of_a_stop_is_the_stop(number: signal.Signals) -> None:
     """Found by killing `mien capture` while it imported: ImportError: initialization failed."""
 
     def work() -> None:
@@ -63,8 +69,7 @@ def test_an_error_that_a_library_makes_of_a_stop_is_the_stop(number: signal.Sign
         except BaseException:  # noqa: BLE001
             raise ImportError("initialization failed") from None
 
-    with pytest.raises(kind), orderly_stops():
-        work()
+    orderly(number, work)
 
 
 def test_a_later_signal_counts_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,29 +81,23 @@ def test_a_later_signal_counts_again(monkeypatch: pytest.MonkeyPatch) -> None:
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGTERM)
 
-    with pytest.raises(Terminated), orderly_stops():
-        work()
+    orderly(signal.SIGTERM, work)
 
 
-def test_errors_without_a_stop_stay_as_they_are() -> None:
-    with pytest.raises(ZeroDivisionError), orderly_stops():
-        raise ZeroDivisionError
-
-
-def test_other_errors_in_callbacks_are_reported_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_errors_are_raised_and_reported_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     class Finalised:
         def __del__(self) -> None:
             raise ZeroDivisionError
 
     reported = []
     monkeypatch.setattr(sys, "unraisablehook", lambda dropped: reported.append(dropped.exc_type))
-    with orderly_stops():
-        Finalised()
+    with pytest.raises(ZeroDivisionError), orderly_stops():
+        raise ZeroDivisionError(bool(Finalised()))
     assert reported == [ZeroDivisionError]
 
 
-@pytest.mark.parametrize(("number", "kind"), KINDS)
-def test_a_stop_is_put_off(number: signal.Signals, kind: type[BaseException]) -> None:
+@of_every_kind
+def test_a_stop_is_put_off(number: signal.Signals) -> None:
     done = []
 
     def work(stop: Put) -> None:
@@ -109,14 +108,9 @@ def test_a_stop_is_put_off(number: signal.Signals, kind: type[BaseException]) ->
             done.append((step, stop.asked()))
             stop.follow()
 
-    with pytest.raises(kind), stops_put_off() as stop:
+    with pytest.raises(KINDS[number]), stops_put_off() as stop:
         work(stop)
     assert done == [(0, False), (1, True)]
-
-
-def test_a_stop_in_the_last_step_is_not_lost() -> None:
-    with pytest.raises(Terminated), stops_put_off():
-        signal.raise_signal(signal.SIGTERM)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, EXIT_TERMINATED), (signal.SIGHUP, EXIT_HUNG_UP)])
@@ -127,6 +121,7 @@ def test_without_a_command_a_stop_ends_the_process(number: signal.Signals, code:
 
 
 def stop_put_off(number: int) -> None:
+    """Get a stop in the last step, which is not lost."""
     with stops_put_off():
         signal.raise_signal(number)
 
