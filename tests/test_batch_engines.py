@@ -59,25 +59,24 @@ def run_with(engine: str, root: Path, rows: list, fault: object = None, **option
     return {state.name: state.runs[0]["psnr"] for state in states if state is not None and state.status == "done"}
 
 
-def too_large(root: Path) -> str:
-    """The error of the row that needs more memory than any node has."""
+def rows_of(seconds: str) -> list:
+    return [stub_row(name, ("sleep", seconds), ("value", str(figure))) for name, figure in EXPECTED.items()]
+
+
+def check_too_large(engine: str, root: Path, words: str, **options: object) -> None:
+    """Check that a row that needs more memory than any node has fails alone."""
+    rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of("0.1")]
+    assert run_with(engine, root, rows, **options) == EXPECTED
     found = {row["name"]: row for row in batch_progress(Batch(root))["rows"]}
     assert found["large"]["status"] == "failed"
-    return found["large"]["error"]
-
-
-def rows_of(count: int, seconds: str) -> list:
-    return [stub_row(f"row{index}", ("sleep", seconds), ("value", str(20 + index))) for index in range(count)]
-
-
-def overlaps(root: Path) -> int:
-    """How often a row ran in two processes at the same time."""
-    return (root / "begins.txt").read_text().count("overlap ")
+    assert words in found["large"]["error"]
 
 
 def begins(root: Path, name: str) -> int:
-    """How often a row began."""
-    return (root / "begins.txt").read_text().count(f"begin {name} ")
+    """How often a row began. No row may run in two processes at the same time."""
+    text = (root / "begins.txt").read_text()
+    assert "overlap " not in text
+    return text.count(f"begin {name} ")
 
 
 def ancestors(process: int) -> Iterator[int]:
@@ -87,29 +86,23 @@ def ancestors(process: int) -> Iterator[int]:
         yield process
 
 
-def lines_of(path: Path) -> list[str]:
-    """The lines of a file that may be missing."""
-    return path.read_text().splitlines() if path.exists() else []
-
-
 def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(tmp_path: Path, ray_cluster: Any):
     def kill() -> None:
         os.kill(next(ancestors(wait_for_begin(tmp_path, "row1"))), signal.SIGKILL)
 
-    assert run_with("ray", tmp_path, rows_of(4, "2"), kill, address=ray_cluster.address) == EXPECTED
-    assert overlaps(tmp_path) == 0
+    assert run_with("ray", tmp_path, rows_of("2"), kill, address=ray_cluster.address) == EXPECTED
     assert begins(tmp_path, "row1") == 2
 
 
 def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: Any):
     rows = [stub_row(name, ("wait", f"go {name}"), ("value", str(figure))) for name, figure in EXPECTED.items()]
-    lost, until = [], time.monotonic() + 120
+    lost, until, place = [], time.monotonic() + 120, tmp_path / "begins.txt"
 
     def kill() -> None:
         processes = [process for _, process in list(ray_cluster.worker_nodes)[0].live_processes()]
         numbers = {process.pid for process in processes}
         while not lost and time.monotonic() < until:
-            begun = [line.split() for line in lines_of(tmp_path / "begins.txt")]
+            begun = [line.split() for line in place.read_text().splitlines()] if place.exists() else []
             lost.extend(name for _, name, row in begun if set(ancestors(int(row))) & numbers)
             time.sleep(0.05)
         for process in processes:
@@ -123,26 +116,13 @@ def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: An
             (tmp_path / f"go {name}").touch()
 
     assert run_with("ray", tmp_path, rows, kill, address=ray_cluster.address) == EXPECTED
-    assert overlaps(tmp_path) == 0
     assert begins(tmp_path, lost[0]) == 2
 
 
-def test_a_row_that_no_node_of_ray_can_hold_fails_alone(
-    tmp_path: Path, ray_cluster: Any, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_row_that_no_node_of_ray_can_hold_fails_alone(tmp_path: Path, ray_cluster: Any, monkeypatch: Any):
     monkeypatch.setattr("mien.batch.engines.on_ray.LOOK_SECONDS", 0.5)
     monkeypatch.setattr("mien.batch.engines.on_ray.PATIENCE_SECONDS", 1.0)
-    rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of(4, "0.1")]
-    assert run_with("ray", tmp_path, rows, address=ray_cluster.address) == EXPECTED
-    assert "enough memory" in too_large(tmp_path)
-
-
-@IN_SLURM
-def test_a_row_that_no_node_of_slurm_can_hold_fails_alone(tmp_path: Path):
-    pytest.importorskip("submitit")
-    rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of(4, "0.1")]
-    assert run_with("slurm", tmp_path, rows) == EXPECTED
-    assert "Slurm does not take it" in too_large(tmp_path)
+    check_too_large("ray", tmp_path, "enough memory", address=ray_cluster.address)
 
 
 @IN_SLURM
@@ -150,11 +130,12 @@ def test_slurm_gives_the_same_figures_though_a_task_is_requeued(tmp_path: Path):
     pytest.importorskip("submitit")
 
     def requeue() -> None:
-        wait_for_begin(tmp_path, "row1")
+        wait_for_begin(tmp_path / "a", "row1")
         jobs = subprocess.run(["squeue", "-h", "-r", "-o", "%i %T"], capture_output=True, text=True).stdout.split()
         running = [job for job, state in zip(jobs[::2], jobs[1::2], strict=True) if state == "RUNNING"]
         subprocess.run(["scontrol", "requeue", running[0]], check=True)
         subprocess.run(["scancel", running[-1]], check=True)
 
-    assert run_with("slurm", tmp_path, rows_of(4, "4"), requeue) == EXPECTED
-    assert overlaps(tmp_path) == 0
+    assert run_with("slurm", tmp_path / "a", rows_of("4"), requeue) == EXPECTED
+    assert begins(tmp_path / "a", "row1") > 0
+    check_too_large("slurm", tmp_path / "b", "Slurm does not take it")

@@ -24,15 +24,11 @@ from web_case import violations
 
 def scored(batch: Batch) -> list[dict[str, object]]:
     """A batch of three people and two methods, with figures."""
-    rows = []
-    for person, light in (("ann", "sun"), ("bob", "lamp"), ("eve", "sun")):
-        rows.append(Row(person, (), {"light": light}))
+    rows = [Row(*one) for one in (("ann", (), {"light": "sun"}), ("bob", (), {"light": "lamp"}), ("eve", (), {}))]
     batch.write_plan(rows)
     for index, row in enumerate(rows[:2]):
-        runs = tuple(
-            {"run": m, "method": m, "psnr": 30.0 + index + gain, "perceptual": 0.1}
-            for m, gain in (("a", 0.0), ("b", 1.0 + index))
-        )
+        figures = {"a": 30.0 + index, "b": 31.0 + 2 * index}
+        runs = tuple({"run": m, "method": m, "psnr": psnr, "perceptual": 0.1} for m, psnr in figures.items())
         batch.write_state(State(row.name, "done", "", runs=runs, stages={"training": 3.0}))
     batch.write_state(State("eve", "failed", "", error="=cmd: <b>no face</b>"))
     return write_results(batch)
@@ -62,6 +58,7 @@ def test_results_have_all_figures_and_paired_differences(tmp_path: Path):
         means_by(rows, "gone", ["psnr"])
 
 
+@pytest.mark.slow
 def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
     batch = Batch(tmp_path)
     write_wall(batch, scored(batch))
@@ -71,78 +68,57 @@ def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
     assert "<b>no face" not in page
     assert "PSNR 30.00 dB" in page
     assert "Methods compared" in page
+    for device in ([], ["dark", "touch"]):  # axe-core finds no fault
+        assert violations(tmp_path / "index.html", (390, 844), device) == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("device", [[], ["dark", "touch"]])
-def test_everybody_can_use_the_wall(tmp_path: Path, device: list[str]):
-    """axe-core finds no fault in it."""
-    batch = Batch(tmp_path)
-    write_wall(batch, scored(batch))
-    assert violations(tmp_path / "index.html", (390, 844), device) == []
-
-
-def test_status_and_table_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_status_and_table_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
     scored(Batch(tmp_path))
     assert main(["batch", "status", str(tmp_path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["counts"] == {"done": 2, "failed": 1}
     assert main(["batch", "table", str(tmp_path), "--rows", "light", "--columns", "psnr"]) == 0
     assert "| sun | 2 |" in capsys.readouterr().out
-    assert main(["batch", "status", str(tmp_path / "gone")]) == 2
-    assert "is not the folder of a batch" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["status", "DIR", "--rows", "light"], "--rows: changes nothing for `mien batch status`"),
-        (["table", "DIR", "--watch"], "--watch: changes nothing for `mien batch table`"),
-        (["TABLE", "--out", "DIR", "--columns", "ssim"], "--columns: changes nothing for a batch that runs on local"),
-        (["TABLE", "--out", "DIR", "--gpus", "1"], "--gpus: changes nothing for a batch that runs on local"),
-        (["status", "DIR", "--shard", "1/2"], "--shard: changes nothing for `mien batch status`"),
-        (["TABLE", "--out", "DIR", "--program", "echo 'x"], "--program echo 'x: No closing quotation"),
-        (["TABLE", "--out", "DIR", "--store", "nosuch://x"], "nosuch://x: cannot be reached"),
-        (["status", "TABLE"], "is not the folder of a batch"),
-        (["table", "EMPTY"], "no row is done yet"),
-        (["status", "OTHER"], "version 99, expected 'mien.batch' version 1"),
-    ],
-)
-def test_what_makes_no_sense_is_told(words: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    scored(Batch(tmp_path / "DIR"))
-    (tmp_path / "TABLE").write_text("video\n")
-    Batch(tmp_path / "EMPTY").write_plan([Row("ann", (("create",),), fingerprint="a")])
-    Batch(tmp_path / "OTHER").write_plan([])
-    plan = tmp_path / "OTHER" / "plan.json"
-    plan.write_text(plan.read_text().replace('"version": 1', '"version": 99'))
-    assert main(["batch", *(str(tmp_path / word) if word.isupper() else word for word in words)]) == 2
-    assert told in capsys.readouterr().err
-
-
-def test_a_missing_engine_is_told_before_rows_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
+    # A missing engine is told before rows are read.
     monkeypatch.setattr(batch_command.importlib.util, "find_spec", lambda name: None)
     (tmp_path / "table.csv").write_text("nonsense\n")
     assert main(["batch", str(tmp_path / "table.csv"), "--out", str(tmp_path / "out"), "--on", "ray"]) == 2
     assert "pip install 'mien[batch]'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        None, {"version": 99},
-        {"status": []}, {"status": "bogus"}, {"runs": [1]}, {"stages": "x"}, {"stages": {"a": "x"}},
-        {"began": float("nan")}, {"tries": None},
-    ],
-    ids=str,
-)  # fmt: skip
-def test_any_damage_of_a_state_is_shown(
-    changed: dict[str, Any] | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_what_makes_no_sense_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
+    monkeypatch.chdir(tmp_path)
+    scored(Batch(Path("DIR")))
+    Path("TABLE").write_text("video\n")
+    Batch(Path("EMPTY")).write_plan([Row("ann", (("create",),), fingerprint="a")])
+    Batch(Path("OTHER")).write_plan([])
+    plan = Path("OTHER/plan.json")
+    plan.write_text(plan.read_text().replace('"version": 1', '"version": 99'))
+    for line, told in (
+        ("status DIR --rows light", "--rows: changes nothing for `mien batch status`"),
+        ("table DIR --watch", "--watch: changes nothing for `mien batch table`"),
+        ("TABLE --out DIR --columns ssim", "--columns: changes nothing for a batch that runs on local"),
+        ('TABLE --out DIR --program "echo \'x"', "--program echo 'x: No closing quotation"),
+        ("TABLE --out DIR --store nosuch://x", "nosuch://x: cannot be reached"),
+        ("status TABLE", "is not the folder of a batch"),
+        ("table EMPTY", "no row is done yet"),
+        ("status OTHER", "version 99, expected 'mien.batch' version 1"),
+    ):
+        assert main(["batch", *shlex.split(line)]) == 2
+        assert told in capsys.readouterr().err
+
+
+def test_any_damage_of_a_state_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     batch = Batch(tmp_path)
     scored(batch)
     file = batch.state_file("ann")
-    file.write_text("{" if changed is None else json.dumps(json.loads(file.read_text()) | changed))
-    assert main(["batch", "status", str(tmp_path)]) == 0
-    assert "ann: failed, try 1: " in capsys.readouterr().out
+    whole = json.loads(file.read_text())
+    for changed in (
+        {"version": 99}, {"status": []}, {"status": "bogus"}, {"runs": [1]}, {"stages": "x"}, {"stages": {"a": "x"}},
+        {"began": float("nan")}, {"tries": None}, None,
+    ):  # fmt: skip
+        file.write_text("{" if changed is None else json.dumps(whole | changed))
+        assert main(["batch", "status", str(tmp_path)]) == 0
+        assert "ann: failed, try 1: " in capsys.readouterr().out, changed
     assert main(["batch", "table", str(tmp_path), "--columns", "psnr"]) == 0
     assert "| a | 1 | 31.00 |" in capsys.readouterr().out
 
@@ -158,13 +134,12 @@ def test_rows_of_an_earlier_table_are_told(tmp_path: Path, capsys: pytest.Captur
     assert "1 of 1 row failed" in told
 
 
-@pytest.mark.parametrize("count", [1, 3, 40])
-def test_a_film_of_any_length_has_a_thumbnail(count: int, tmp_path: Path):
-    pictures = (np.full((32, 32, 3), 6 * index, np.uint8) for index in range(count))
-    write_video(tmp_path / "film.mp4", pictures, 25)
-    write_strip(tmp_path / "film.mp4", tmp_path / "strip.jpg")
-    with Image.open(tmp_path / "strip.jpg") as strip:
-        assert strip.size == (12 * 160, 160)
+def test_a_film_of_any_length_has_a_thumbnail(tmp_path: Path):
+    for count in (1, 3, 40):
+        write_video(tmp_path / "film.mp4", (np.full((32, 32, 3), 6 * index, np.uint8) for index in range(count)), 25)
+        write_strip(tmp_path / "film.mp4", tmp_path / "strip.jpg")
+        with Image.open(tmp_path / "strip.jpg") as strip:
+            assert strip.size == (12 * 160, 160)
 
 
 @pytest.fixture
@@ -172,33 +147,25 @@ def table(tmp_path: Path) -> Path:
     for name in ("ann", "bob"):
         (tmp_path / f"{name}.mp4").write_bytes(b"a video")
     path = tmp_path / "people.csv"
-    path.write_text(
-        "name,video,methods,steps,hold_out,age\n,ann.mp4,gaussian_avatars;headgas,60,,30\nrobert,bob.mp4,,,,41\n"
-    )
+    rows = (",ann.mp4,gaussian_avatars;headgas,60,,30", "robert,bob.mp4,,,,41")
+    path.write_text("\n".join(("name,video,methods,steps,hold_out,age", *rows, "")))
     return path
 
 
 def test_rows_are_tracked_once_and_trained_by_each_method(table: Path):
     ann, bob = read_table(table)
-    assert ann.name == "ann"
-    assert bob.name == "robert"
-    assert ann.labels == {"age": "30"}
-    first, *others = ann.steps
-    video = str(table.parent / "ann.mp4")
-    assert first == ("create", video, "--out", "{workspace}", "--method", "gaussian_avatars", "--steps", "60")
-    assert others == [
+    assert (ann.name, bob.name, ann.labels) == ("ann", "robert", {"age": "30"})
+    made = ("--out", "{workspace}", "--method", "gaussian_avatars")
+    assert ann.steps == (
+        ("create", str(table.parent / "ann.mp4"), *made, "--steps", "60"),
         ("train", "{workspace}", "--method", "headgas", "--steps", "60"),
         ("evaluate", "{workspace}", "--run", "headgas"),
-    ]
-    assert bob.steps == (
-        ("create", str(table.parent / "bob.mp4"), "--out", "{workspace}", "--method", "gaussian_avatars"),
     )
-
-
-def test_a_changed_video_or_setting_changes_the_fingerprint(table: Path):
-    before = [row.fingerprint for row in read_table(table)]
+    assert bob.steps == (("create", str(table.parent / "bob.mp4"), *made),)
+    # A changed video changes the fingerprint.
     (table.parent / "bob.mp4").write_bytes(b"another video")
-    assert [row.fingerprint == old for row, old in zip(read_table(table), before, strict=True)] == [True, False]
+    again = [row.fingerprint for row in read_table(table)]
+    assert (again[0] == ann.fingerprint, again[1] == bob.fingerprint) == (True, False)
 
 
 def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
@@ -208,68 +175,53 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
     assert row.steps[0][1:3] == (str(table.parent / "ann.mp4"), str(table.parent / "bob.mp4"))
     assert row.steps[0][-2:] == ("--capture.size", "256")
     assert [row.name for row in read_table(table.parent)] == ["ann", "bob"]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("video,stepz\nann.mp4,3", "did you mean 'steps'"),
-        ("video\ngone.mp4", "gone.mp4: no such file"),
-        ("video,method\nann.mp4,nerf", "nerf"),
-        ("video,steps\nann.mp4,-3", "row 1: "),
-        ("video,steps\nann.mp4,many", "row 1: --steps: give a whole number instead of 'many'; see mien create"),
-        ("video,preset\nann.mp4,best", "row 1: --preset: give one of 'draft', "),
-        ("video,capture.sizes\nann.mp4,9", "did you mean --capture.size"),
-        ("video,age,age\nann.mp4,3,4", "columns 'age' and 'age' are the same"),
-        ("video,hold_out,hold-out\nann.mp4,3,4", "columns 'hold_out' and 'hold-out' are the same"),
-        ("video,out\nann.mp4,elsewhere", "column 'out' cannot be set"),
-        ("video,name\nann.mp4,x\nbob.mp4,x", "two rows have the name 'x'"),
-        ("video,name\nann.mp4,../x", "cannot be the name of a folder"),
-        ("name\nann", "row 1: has no video and no dataset; its columns are 'name'"),
-        ("movie;steps\nann.mp4;3", "has no video and no dataset"),
-        ("video,methodx\nann.mp4,headgas", "column 'methodx' is no option; did you mean 'method'"),
-        ("video,namex\nann.mp4,x", "did you mean 'name'"),
-        ("video,capture-size\nann.mp4,256", "did you mean 'capture.size'"),
-        ("video,psnr\nann.mp4,256", "column 'psnr' is one of the results"),
-        ("video,\nann.mp4,256", "a column has no name"),
-        ("video,methods\nann.mp4,headgas;headgas", "method 'headgas' is there twice"),
-        ("video\nann.mp4;ann.mp4", "two videos have the name 'ann'"),
-        ("video,calibration\nann.mp4,rig.json", "rig.json: no such file"),
-        ("video\nann.mp4,3", "more cells than the heading"),
-        ("video,memory_gb\nann.mp4,lots", "gigabytes above 0"),
-        ("", "has no rows"),
-        ("video,protocol\nann.mp4,insta", "column 'protocol' is for datasets"),
-        ("video,retrack\nann.mp4,yes", "column 'retrack' is for datasets"),
-        ("dataset,capture.size\nann.mp4,256", "column 'capture.size' is for videos"),
-        ("dataset,video\nann.mp4,bob.mp4", "a video or a dataset, and not both"),
-    ],
-)
-def test_mistakes_in_a_table_are_named_before_any_work(table: Path, text: str, words: str):
-    table.write_text(text + "\n")
-    with pytest.raises(UserError, match=".") as caught:
-        read_table(table)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
+    for content, words in (
         ('[{"video": "ann.mp4", "video": "bob.mp4"}]', "'video' twice"),
         ('[{"video": "ann.mp4", "capture": {"size": 9}}]', "column 'capture' holds an object"),
-    ],
-)
-def test_mistakes_in_json_are_named_as_well(table: Path, content: str, words: str):
-    path = table.with_name("people.json")
-    path.write_text(content)
-    with pytest.raises(UserError, match=words):
-        read_table(path)
-
-
-def test_a_table_that_is_not_utf_8_is_told_so(table: Path):
+    ):
+        path.write_text(content)
+        with pytest.raises(UserError, match=words):
+            read_table(path)
     table.write_bytes("name,video\nJosé,ann.mp4\n".encode("latin-1"))
     with pytest.raises(UserError, match="save it as UTF-8"):
         read_table(table)
+
+
+MISTAKES = [
+    ("video,stepz\nann.mp4,3", "did you mean 'steps'"),
+    ("video\ngone.mp4", "gone.mp4: no such file"),
+    ("video,method\nann.mp4,nerf", "nerf"),
+    ("video,steps\nann.mp4,-3", "row 1: "),
+    ("video,steps\nann.mp4,many", "row 1: --steps: give a whole number instead of 'many'; see mien create"),
+    ("video,preset\nann.mp4,best", "row 1: --preset: give one of 'draft', "),
+    ("video,capture.sizes\nann.mp4,9", "did you mean --capture.size"),
+    ("video,hold_out,hold-out\nann.mp4,3,4", "columns 'hold_out' and 'hold-out' are the same"),
+    ("video,out\nann.mp4,elsewhere", "column 'out' cannot be set"),
+    ("video,name\nann.mp4,x\nbob.mp4,x", "two rows have the name 'x'"),
+    ("video,name\nann.mp4,../x", "cannot be the name of a folder"),
+    ("name\nann", "row 1: has no video and no dataset; its columns are 'name'"),
+    ("video,capture-size\nann.mp4,256", "did you mean 'capture.size'"),
+    ("video,psnr\nann.mp4,256", "column 'psnr' is one of the results"),
+    ("video,\nann.mp4,256", "a column has no name"),
+    ("video,methods\nann.mp4,headgas;headgas", "method 'headgas' is there twice"),
+    ("video\nann.mp4;ann.mp4", "two videos have the name 'ann'"),
+    ("video,calibration\nann.mp4,rig.json", "rig.json: no such file"),
+    ("video\nann.mp4,3", "more cells than the heading"),
+    ("video,memory_gb\nann.mp4,lots", "gigabytes above 0"),
+    ("", "has no rows"),
+    ("video,protocol\nann.mp4,insta", "column 'protocol' is for datasets"),
+    ("dataset,capture.size\nann.mp4,256", "column 'capture.size' is for videos"),
+    ("dataset,video\nann.mp4,bob.mp4", "a video or a dataset, and not both"),
+]
+
+
+def test_mistakes_in_a_table_are_named_before_any_work(table: Path):
+    for text, words in MISTAKES:
+        table.write_text(text + "\n")
+        with pytest.raises(UserError) as caught:
+            read_table(table)
+        assert words in str(caught.value)
+        assert "\n" not in str(caught.value)
 
 
 def test_the_driver_imports_neither_torch_nor_what_only_rows_need(table: Path, tmp_path: Path):
@@ -282,26 +234,20 @@ def test_the_driver_imports_neither_torch_nor_what_only_rows_need(table: Path, t
     assert len(list((tmp_path / "people" / "states").glob("*.json"))) == 2
 
 
-@pytest.fixture
-def subjects(tmp_path: Path) -> Path:
-    """Return a folder with ten people of IMavatar's layout."""
+def test_datasets_are_imported_trained_and_scored(tmp_path: Path):
+    """Ten people of IMavatar's layout."""
     for number in range(10):
-        clip = tmp_path / "data" / f"subject{number}" / f"subject{number}" / "MVI_1810"
+        clip = tmp_path / f"subject{number}" / f"subject{number}" / "MVI_1810"
         clip.mkdir(parents=True)
         (clip / "flame_params.json").write_text('{"frames": [{"world_mat": []}]}')
-    return tmp_path / "data"
-
-
-def test_datasets_are_imported_trained_and_scored(subjects: Path):
-    table = subjects / "people.csv"
+    table = tmp_path / "people.csv"
     head = "dataset,face_model,method,split,protocol,steps,training.resolution,age\n"
     table.write_text(head + "".join(f"subject{n},flame,headgas,dataset,imavatar,30,96,{n}\n" for n in range(10)))
     rows = read_table(table)
     assert [row.name for row in rows] == [f"subject{n}" for n in range(10)]
     assert rows[3].labels == {"age": "3"}
-    place = str(subjects / "subject3")
     assert rows[3].steps == (
-        ("import", place, "--out", "{workspace}", "--resume", "--face-model", "flame"),
+        ("import", str(tmp_path / "subject3"), "--out", "{workspace}", "--resume", "--face-model", "flame"),
         ("train", "{workspace}", "--method", "headgas", "--split", "dataset", "--steps", "30",
          "--training.resolution", "96"),
         ("evaluate", "{workspace}", "--run", "headgas", "--protocol", "imavatar"),

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from mien.face import FaceParams
 from mien.lab.benchmarking.following import (
     LIDS,
     Following,
@@ -39,38 +38,30 @@ def found_in(values: np.ndarray) -> Following:
     return found
 
 
-@pytest.mark.parametrize(("delay", "height"), [(-1.3, 0.8), (0.0, 1.0), (0.6, 1.1), (2.0, 0.8)])
-def test_delay_and_height_are_found(delay: float, height: float):
-    found = found_in(5 + bumps(delay, height))
-    assert found.lag_frames == pytest.approx(delay, abs=0.1)
-    assert found.loss_percent == pytest.approx(100 * (1 - height), abs=2)
-    assert found.events == 2
-
-
-def test_smoothing_loses_amplitude_and_noise_does_not():
+def test_delay_and_height_are_found():
+    for delay, height in [(-1.3, 0.8), (0.0, 1.0), (0.6, 1.1), (2.0, 0.8)]:
+        found = found_in(5 + bumps(delay, height))
+        assert found.lag_frames == pytest.approx(delay, abs=0.1)
+        assert found.loss_percent == pytest.approx(100 * (1 - height), abs=2)
+        assert found.events == 2
+    # Smoothing loses amplitude, and noise does not.
     smooth = found_in(np.convolve(bumps(), np.ones(5) / 5, mode="same"))
     assert smooth.loss_percent > 10
     assert abs(smooth.lag_frames) < 0.1
     noisy = found_in(bumps() + 0.03 * np.random.default_rng(0).standard_normal(len(TIME)))
     assert abs(noisy.loss_percent) < 4
     assert abs(noisy.lag_frames) < 0.15
-
-
-def test_where_nothing_happens_there_is_nothing_to_measure():
-    none = np.zeros(len(TIME), bool)
-    assert following(bumps()[:, None], bumps()[:, None], none, 6) is None
+    # Where nothing happens there is nothing to measure, and an event that was not tracked is left out.
+    assert following(bumps()[:, None], bumps()[:, None], np.zeros(len(TIME), bool), 6) is None
     gap = bumps()
     gap[28:33] = np.nan
-    assert found_in(gap).events == 1, "an event that was not tracked is left out"
-
-
-def face_of(rotations: torch.Tensor) -> FaceParams:
-    return replace(make_small_face_model().neutral(len(rotations)), head_rotation=rotations)
+    assert found_in(gap).events == 1
 
 
 def truth_of(rotations: torch.Tensor) -> tuple[Tracking, Truth]:
+    face = replace(make_small_face_model().neutral(len(rotations)), head_rotation=rotations)
     tracking = Tracking(
-        face_model="small", face_model_hash="", face=face_of(rotations), valid=torch.ones(len(rotations)).bool(),
+        face_model="small", face_model_hash="", face=face, valid=torch.ones(len(rotations)).bool(),
         cameras=(still_camera().to(torch.zeros(())),), neck_lines=torch.zeros(len(rotations), 1, 3),
         residuals=torch.zeros(len(rotations), 1),
     )  # fmt: skip
@@ -120,8 +111,7 @@ def test_jitter_counts_where_the_truth_stands_still():
     true = np.zeros((20, 1, 478, 2), np.float32)
     true[10:] += np.arange(10)[:, None, None, None]
     still = still_timesteps(true)
-    assert still[:8].all()
-    assert not still[9:].any()
+    assert (still[:8].all(), still[9:].any()) == (True, False)
     points = np.zeros((20, 478, 3))
     points[1::2, :, 0] = 0.001
     points[12:] = 50 * np.random.default_rng(0).standard_normal((8, 478, 3))

@@ -34,19 +34,13 @@ RECIPE = replace(
 @pytest.fixture(scope="module")
 def case():
     scene = SyntheticScene(RECIPE, 3)
-    truth, timesteps = truth_of(scene), RECIPE.timesteps
+    truth, t = truth_of(scene), RECIPE.timesteps
     capture = Capture(
-        name="case",
-        camera_ids=("front",),
-        fps=10.0,
-        timestamps=np.arange(timesteps) / 10,
-        images=np.zeros((timesteps, 1, 128, 128, 3), np.uint8),
-        mattes=np.zeros((timesteps, 1, 128, 128), np.uint8),
-        landmarks=truth.landmarks,
-        valid=np.ones((timesteps, 1), bool),
-        principal_point=np.full((1, 2), 64.0, np.float32),
+        name="case", camera_ids=("front",), fps=10.0, timestamps=np.arange(t) / 10,
+        images=np.zeros((t, 1, 128, 128, 3), np.uint8), mattes=np.zeros((t, 1, 128, 128), np.uint8),
+        landmarks=truth.landmarks, valid=np.ones((t, 1), bool), principal_point=np.full((1, 2), 64.0, np.float32),
         source={},
-    )
+    )  # fmt: skip
     return scene, capture, truth
 
 
@@ -65,12 +59,11 @@ def test_the_truth_has_no_error(case):
 def test_a_constant_turn_is_not_unsteady(case):
     scene, capture, truth = case
     face = truth.tracking.face
-    still = replace(face, head_rotation=torch.zeros_like(face.head_rotation))
-    turned = replace(face, head_rotation=torch.zeros_like(face.head_rotation) + torch.tensor([0.0, 0.1, 0.0]))
-    errors = tracking_errors(
-        replace(truth.tracking, face=turned), capture, replace(truth, tracking=replace(truth.tracking, face=still)),
-        scene.model,
-    )  # fmt: skip
+    still, turned = (
+        replace(truth.tracking, face=replace(face, head_rotation=0 * face.head_rotation + torch.tensor([0, yaw, 0])))
+        for yaw in (0.0, 0.1)
+    )
+    errors = tracking_errors(turned, capture, replace(truth, tracking=still), scene.model)
     assert errors.rotation_deg == pytest.approx(np.degrees(0.1), abs=1e-2)
     assert errors.rotation_steady_deg < 0.05
 
@@ -92,9 +85,8 @@ def test_another_expression_is_a_distance_and_noise_is_jitter(case):
 def test_vertices_that_do_not_face_the_camera_are_left_out(case, yaw):
     """A vertex counts if the cosine of its normal and the direction to a camera is above 0.2."""
     scene, _, truth = case
-    face = replace(
-        truth.tracking.face, head_rotation=torch.tensor([0.0, yaw, 0.0]).expand_as(truth.tracking.face.head_rotation)
-    )
+    rotation = torch.tensor([0.0, yaw, 0.0]).expand_as(truth.tracking.face.head_rotation)
+    face = replace(truth.tracking.face, head_rotation=rotation)
     turned = replace(truth, tracking=replace(truth.tracking, face=face))
     vertices = scene.model(face[0])
     towards = truth.tracking.cameras[0].position - vertices[0]
@@ -123,7 +115,7 @@ def test_truth_follows_the_capture_s_crop(case):
     np.testing.assert_allclose(moved, (truth.landmarks - [32, 16]) * [2, 4], rtol=1e-5)
 
 
-def test_the_table_names_key_and_baselines():
+def test_the_table_names_key_and_baselines(tmp_path, capsys):
     figures = {"psnr": 30.0, "ssim": 0.9, "l1": 0.01, "perceptual": None}
     figures = {**figures, "head": dict(figures)}
     protocols = {"novel_view": {**figures, "baselines": {"mean_frame": figures, "mesh": figures}}}
@@ -135,9 +127,7 @@ def test_the_table_names_key_and_baselines():
     assert "1.00 mm | 2.00 px | 3.00 (0.50) deg | - | - | - | - |" in table
     known = TrackingErrors(1.0, 2.0, 3.0, 0.5, 0.02, 0.04, Following(0.3, 7.0, 5), None, 0.61)
     assert tracking_cells(known).endswith("| 0.020 px, 0.040 mm | 0.30 frames, 7 % (5) | - | 0.61 %")
-
-
-def test_an_unknown_capture_is_one_line(tmp_path, capsys):
+    # An unknown capture is told.
     assert main(["bench", "quality", "--captures", "mono", "--out", str(tmp_path)]) == 2
     assert "mono-short" in capsys.readouterr().err
     assert set(get_args(CaptureName)) == set(REFERENCES), "the command line knows their names without importing them"

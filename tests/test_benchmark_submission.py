@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
+from dataset_checks import decoded
 from dataset_scene import SIDE, NoDetector, Scene, drawn_person, head_view, projected
 from dataset_writers import BENCHMARK_SCALE, UNEQUAL, benchmark_vertices, write_benchmark
 from mien.avatar import DEFAULT_METHOD, FaceTuning
+from mien.capture.video import probe_video
 from mien.cli import main
 from mien.datasets import overlay
 from mien.datasets.submission import monocular_tasks
@@ -26,9 +27,7 @@ TESTED = ("222200037", "222200046", "220700191", "222200039")
 """Cameras of the monocular task, frontal one first."""
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return drawn_person(3)
+scene = pytest.fixture(scope="module")(lambda: drawn_person(3))
 
 
 @pytest.fixture(scope="module")
@@ -54,12 +53,10 @@ def workspace(scene: Scene, person: Path, tmp_path_factory: pytest.TempPathFacto
     patch.undo()
 
 
-def frames_of(video: Path) -> tuple[np.ndarray, float]:
-    """Return the pictures of a video and its rate, by PyAV alone, as the benchmark reads them."""
-    with av.open(str(video)) as container:
-        rate = container.streams.video[0].average_rate
-        assert rate is not None
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]), float(rate)
+def film_of(video: Path, truth: Path, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pictures of a video, whose rate is checked, and those of the truth."""
+    assert probe_video(video).fps == pytest.approx(rate)
+    return decoded(video), decoded(truth)
 
 
 def inside(pictures: np.ndarray, mattes: np.ndarray, shift: int = 0) -> list[float]:
@@ -76,11 +73,10 @@ def test_faces_and_cameras_are_those_of_the_benchmark(scene: Scene, person: Path
     """Vertices that the benchmark's forward pass gives are seen at the same pixels by all four cameras."""
     (task,) = monocular_tasks(person, scene.model, (SIDE, SIDE))
     assert (task.sequence, task.fps, tuple(task.cameras)) == ("FREE", 24.3, TESTED)
-    with np.load(person / "truth.npz") as truth:
-        angles, shifts = truth["angles"], truth["shifts"]
+    truth = np.load(person / "truth.npz")
     for index, serial in enumerate(TESTED):
         for timestep in range(len(scene)):
-            vertices = benchmark_vertices(scene, timestep, angles[timestep], shifts[timestep])
+            vertices = benchmark_vertices(scene, timestep, truth["angles"][timestep], truth["shifts"][timestep])
             wanted = projected(vertices, UNEQUAL, *head_view(2 + index, 1.0))
             found = task.cameras[serial].project(scene.model(task.face[timestep])[0])[0].numpy()
             assert np.abs(found - wanted).max() < 0.02, serial
@@ -100,9 +96,8 @@ def test_test_sequences_are_rendered_from_their_four_cameras(
     files = sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
     assert files == sorted(f"393/FREE/cam_{serial}.mp4" for serial in TESTED)
     for serial in TESTED:
-        pictures, rate = frames_of(out / f"393/FREE/cam_{serial}.mp4")
-        assert rate == pytest.approx(24.3)
-        truth, _ = frames_of(person / f"sequences/EXP-2-eyes/alpha_maps/cam_{serial}.mp4")
+        mattes = person / f"sequences/EXP-2-eyes/alpha_maps/cam_{serial}.mp4"
+        pictures, truth = film_of(out / f"393/FREE/cam_{serial}.mp4", mattes, 24.3)
         assert pictures.shape == truth.shape == (len(scene), *truth.shape[1:])
         assert pictures[:, :4, :4].min() > 250, "white around the head"
         assert min(inside(pictures, truth)) > 0.95
@@ -134,10 +129,8 @@ def test_novel_views_are_rendered_from_the_hidden_cameras(
     serials = ("222200037", "222200039", "222200046")
     assert sorted(path.name for path in out.rglob("*.mp4")) == [f"cam_{serial}.mp4" for serial in serials]
     for serial in serials:
-        pictures, rate = frames_of(out / f"475/EXP-2-eyes/cam_{serial}.mp4")
-        assert rate == 73
-        truth, _ = frames_of(person / f"sequences/EXP-2-eyes/alpha_maps/cam_{serial}.mp4")
-        assert min(inside(pictures, truth)) > 0.95
+        mattes = person / f"sequences/EXP-2-eyes/alpha_maps/cam_{serial}.mp4"
+        assert min(inside(*film_of(out / f"475/EXP-2-eyes/cam_{serial}.mp4", mattes, 73))) > 0.95
     assert "a submission needs 388, 422, 443, 445 as well" in capsys.readouterr().err
 
 
@@ -152,7 +145,6 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFix
         ([], "needs the person's folder of the benchmark"),
         (["--benchmark", str(tmp_path)], "has no calibration/camera_params.json"),
         (["--benchmark", str(named)], "its name is not the number of a person"),
-        (["--benchmark", str(person), "--mattes", "head"], "--mattes: is not for --format nersemble-benchmark"),
         (["--benchmark", str(person), "--sh", "3"], "--sh: is not for --format nersemble-benchmark"),
         (["--benchmark", str(person)], "has no 'world_2_cam'"),
     ):

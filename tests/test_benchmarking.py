@@ -1,10 +1,12 @@
 """`mien bench render | train-step | scaling` writes rows, json and charts that say what was measured."""
 
+import itertools
 import json
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,12 +20,10 @@ from mien.face import load_face_model
 from mien.lab.benchmarking import device as device_benchmark
 from mien.lab.benchmarking import headgas_step, mono_step, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
-from mien.lab.benchmarking.charts import write_scaling_chart
 from mien.lab.benchmarking.scenes import head_scene
-from mien.lab.benchmarking.timing import BenchmarkRow, Timing, measure_machine, time_function
+from mien.lab.benchmarking.timing import BenchmarkRow, Timing, time_function
 from mien.render import rasterize
 from mien.training.trainer import step
-from needs import HAS_GPU
 
 pytestmark = pytest.mark.unchecked
 PEERS = Path(__file__).parent.parent / "benchmarks" / "peers"
@@ -37,12 +37,6 @@ def restore_threads() -> Iterator[None]:
     _native.set_thread_count(0)
 
 
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_benchmark, "COUNTS", (5, 20))
-    monkeypatch.setattr(render_benchmark, "SIZES", {"a": (40, 30), "b": (32, 32)})
-
-
 def test_timing_counts_every_run_and_orders_its_figures() -> None:
     runs: list[int] = []
     timing = time_function(lambda: runs.append(sum(range(10_000))), seconds=0.0, min_runs=5)
@@ -51,19 +45,18 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
     assert timing.cpu_ms > 0
 
 
-@pytest.mark.usefixtures("small")
-def test_scaling_as_json_with_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    chart = tmp_path / "chart.png"
+def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr(render_benchmark, "COUNTS", (5, 20))
+    monkeypatch.setattr(render_benchmark, "SIZES", {"a": (40, 30), "b": (32, 32)})
+    chart = tmp_path / "chart.svg"
     assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gflops"] > 0
     rows = [BenchmarkRow(**row) for row in shown["rows"]]
-    assert {(row.width, row.height) for row in rows} == {(40, 30), (32, 32)}
-    assert {row.gaussians for row in rows} == {5, 20}
-    assert {row.threads for row in rows} == set(render_benchmark.thread_counts())
-    for row in rows:
-        assert 0 < row.min_ms <= row.median_ms
-    assert chart.read_bytes().startswith(b"\x89PNG")
+    wanted = itertools.product(((40, 30), (32, 32)), (5, 20), render_benchmark.thread_counts())
+    assert {((row.width, row.height), row.gaussians, row.threads) for row in rows} == set(wanted)
+    assert all(0 < row.min_ms <= row.median_ms for row in rows)
+    assert all(f"{size}, 1 thread " in chart.read_text() for size in ("40x30", "32x32"))
 
 
 def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,9 +74,7 @@ def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPa
     [
         ("scaling --plot chart.jpg", ".png, .svg, .pdf"),
         ("train-step --parts --method headgas", "--parts --method headgas"),
-        ("render --seconds=-1", "--seconds -1: give a positive number"),
         ("train-step --seconds=0", "--seconds 0: give a positive number"),
-        ("scaling --seconds=nan", "--seconds nan: give a positive number"),
         ("scaling --seconds=inf", "--seconds inf: give a positive number"),
     ],
 )
@@ -92,34 +83,17 @@ def test_what_cannot_be_measured_is_told_at_once(line: str, told: str, capsys: p
     assert told in capsys.readouterr().err
 
 
-def test_a_chart_has_a_line_for_every_size(tmp_path: Path) -> None:
-    rows = [BenchmarkRow(1.0, 2.0, 1.0, "rasterize_forward", 10, 40, 30, threads, "avx2") for threads in (1, 2)]
-    write_scaling_chart(tmp_path / "a.svg", rows, measure_machine())
-    drawing = (tmp_path / "a.svg").read_text()
-    assert "40x30, 1 thread " in drawing
-    assert "40x30, 2 threads " in drawing
-
-
-class Clock:
-    """A clock that goes on by a millisecond whenever it is read."""
-
-    reads = 0
-
-    def perf_counter(self) -> float:
-        self.reads += 1
-        return self.reads / 1000
-
-
 def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """All that a step does is in some row, each native operation in its own, and nothing stays watched."""
-    clock = Clock()
+    reads: list[int] = []
+    clock = SimpleNamespace(perf_counter=lambda: (reads.append(1) or len(reads)) / 1000)
     monkeypatch.setattr(step_parts, "time", clock)
     monkeypatch.setattr(step_parts, "ROUND", 16)
     state, data, settings = step_parts.default_case(load_face_model(), 9_500, (96, 80))
     before = dict(vars(_native))
     rows = step_parts.step_parts(state, data, settings, seconds=0.001)
     # A step's first look at the clock ends nothing, nor do those before and after the round.
-    assert sum(row.ms for row in rows) == pytest.approx((clock.reads - 2) / step_parts.ROUND - 1)
+    assert sum(row.ms for row in rows) == pytest.approx((len(reads) - 2) / step_parts.ROUND - 1)
     found = {(row.phase, row.operation) for row in rows}
     rest = step_parts.REST
     assert len(found) == len(rows)
@@ -188,7 +162,7 @@ def test_peers_are_compared_in_one_run() -> None:
     assert {row["name"] for row in shown["rows"]} >= {"mien_native", "torch_tiles"}
 
 
-def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """The cases of a GPU run in float64 on the CPU, which executes all of their code but gsplat's."""
     monkeypatch.setattr(device_benchmark, "COUNTS", (60,))
     monkeypatch.setattr(device_benchmark, "SIZES", ((24, 16),))
@@ -197,13 +171,9 @@ def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: py
     names = ["rasterize_forward", "rasterize_forward_backward", "train_step", "pose_and_render"]
     assert [row.name for row in rows] == names
     assert all((row.gaussians, row.width, row.height) == (60, 24, 16) and row.min_ms > 0 for row in rows)
-
-
-def test_benchmarks_of_a_gpu_say_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
-    if torch.cuda.is_available():
-        pytest.skip(HAS_GPU)
-    assert main(["bench", "render", "--device", "cuda"]) == 2
-    assert "--device cuda" in capsys.readouterr().err
+    if not torch.cuda.is_available():
+        assert main(["bench", "render", "--device", "cuda"]) == 2
+        assert "--device cuda" in capsys.readouterr().err
 
 
 @pytest.mark.gpu
