@@ -39,16 +39,12 @@ def make_experiment(timesteps: int = 50, split: Split = "blocks", seed: int = 0)
     frames = [Frame(0, t, 0) for t in range(timesteps)]
     crops = np.tile(np.array([16, 8, 40, 56], np.int64), (timesteps, 1, 1))
     return Experiment(
-        avatar=avatar,
-        sequences=(sequence,),
-        faces=(face,),
-        face_source="as_tracked",
+        avatar=avatar, sequences=(sequence,), faces=(face,), face_source="as_tracked",
         scorings=(Scoring(sequence.scoring, crops),),
         training_frames=tuple(f for f in frames if not test[f.timestep]),
         held_out_frames=tuple(f for f in frames if test[f.timestep]),
-        split=split,
-        edges="filmed",  # they hold no background
-    )
+        split=split, edges="filmed",  # they hold no background
+    )  # fmt: skip
 
 
 def _motion(face: FaceParams) -> FaceParams:
@@ -74,74 +70,35 @@ def _paint(avatar: Avatar) -> None:
         store["sh_constant"].copy_(sh_from_rgb(rgb)[:, None])
 
 
-def drawn_sequence(avatar: Avatar, face: FaceParams, camera: Camera) -> Sequence:
+def drawn_sequence(avatar: Avatar, face: FaceParams, *cameras: Camera, name: str = "clip") -> Sequence:
     """Return the pictures of an avatar as a sequence with exact tracking."""
-    images = np.zeros((len(face), 1, SIZE, SIZE, 3), np.uint8)
-    alphas = np.zeros((len(face), 1, SIZE, SIZE), np.uint8)
+    images = np.zeros((len(face), len(cameras), SIZE, SIZE, 3), np.uint8)
+    alphas = np.zeros(images.shape[:-1], np.uint8)
     with torch.no_grad():
-        for t in range(len(face)):
-            rendering = rasterize(avatar.pose(face[t]).gaussians.timestep(0), camera, torch.zeros(3))
-            alphas[t, 0] = (rendering.alpha * 255).round().numpy()
-            images[t, 0] = to_uint8(rendering.image / rendering.alpha.clamp_min(1e-3)[..., None])
+        for t, c in np.ndindex(images.shape[:2]):
+            rendering = rasterize(avatar.pose(face[t]).gaussians.timestep(0), cameras[c], torch.zeros(3))
+            alphas[t, c] = (rendering.alpha * 255).round().numpy()
+            images[t, c] = to_uint8(rendering.image / rendering.alpha.clamp_min(1e-3)[..., None])
     capture = Capture(
-        name="clip",
-        camera_ids=("0",),
-        fps=25.0,
-        timestamps=np.arange(len(face)) / 25.0,
-        images=images,
-        mattes=alphas,
-        landmarks=np.zeros((len(face), 1, 478, 2), np.float32),
-        valid=np.ones((len(face), 1), bool),
-        principal_point=np.full((1, 2), SIZE / 2),
-        source={"file": "clip.mp4"},
-    )
+        name=name, camera_ids=("0",) if len(cameras) == 1 else ("front", "side"), fps=25.0,
+        timestamps=np.arange(len(face)) / 25.0, images=images, mattes=alphas,
+        landmarks=np.zeros((*images.shape[:2], 478, 2), np.float32), valid=np.ones(images.shape[:2], bool),
+        principal_point=np.full((len(cameras), 2), SIZE / 2), source={"file": f"{name}.mp4"},
+    )  # fmt: skip
     tracking = Tracking(
-        face_model="small",
-        face_model_hash=avatar.face_model.content_hash,
-        face=face,
+        face_model="small", face_model_hash=avatar.face_model.content_hash, face=face, cameras=cameras,
         valid=torch.ones(len(face), dtype=torch.bool),
-        cameras=(camera,),
-        neck_lines=torch.tensor([0.0, -1.0, 1000.0]).expand(len(face), 1, 3),
-        residuals=torch.linspace(0.5, 2.0, len(face))[:, None],
-    )
-    return Sequence("clip", capture, tracking, alphas)
+        neck_lines=torch.tensor([0.0, -1.0, 1000.0]).repeat(len(face), len(cameras), 1),
+        residuals=torch.linspace(0.5, 2.0, len(face))[:, None].repeat(1, len(cameras)),
+    )  # fmt: skip
+    return Sequence(name, capture, tracking, alphas)
 
 
 def two_cameras(experiment: Experiment, name: str) -> Sequence:
     """Return the experiment's sequence under another name, with a second camera that looks from the side."""
-    sequence = experiment.sequences[0]
-    first = sequence.tracking.cameras[0]
-    second = orbit(first, torch.tensor([0.0, 0.0, -0.5]), 0.5)
-    capture = sequence.capture
-    images, mattes = (np.repeat(array, 2, axis=1) for array in (capture.images, capture.mattes))
-    with torch.no_grad():
-        for timestep in range(capture.timesteps):
-            posed = experiment.avatar.pose(experiment.faces[0][timestep]).gaussians.timestep(0)
-            rendering = rasterize(posed, second, torch.zeros(3))
-            mattes[timestep, 1] = (rendering.alpha * 255).round().numpy()
-            images[timestep, 1] = to_uint8(rendering.image / rendering.alpha.clamp_min(1e-3)[..., None])
-    tracking = sequence.tracking
-    return Sequence(
-        name,
-        replace(
-            capture,
-            name=name,
-            camera_ids=("front", "side"),
-            images=images,
-            mattes=mattes,
-            landmarks=np.repeat(capture.landmarks, 2, axis=1),
-            valid=np.repeat(capture.valid, 2, axis=1),
-            principal_point=np.repeat(capture.principal_point, 2, axis=0),
-            source={"file": f"{name}.mp4"},
-        ),
-        replace(
-            tracking,
-            cameras=(first, second),
-            neck_lines=tracking.neck_lines.repeat(1, 2, 1),
-            residuals=tracking.residuals.repeat(1, 2),
-        ),
-        mattes,
-    )
+    (first,) = experiment.sequences[0].tracking.cameras
+    side = orbit(first, torch.tensor([0.0, 0.0, -0.5]), 0.5)
+    return drawn_sequence(experiment.avatar, experiment.faces[0], first, side, name=name)
 
 
 def write_sequence(root: Path, experiment: Experiment, sequence: Sequence) -> Path:

@@ -7,20 +7,20 @@ from torch import Tensor
 
 from mien.face import FaceModel, Landmarks
 from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS
+from toy_scene import sphere
 
 
 def make_small_face_model(identities: int = 6, expressions: int = 8, seed: int = 0) -> FaceModel:
     """Return a model of about 750 vertices, with landmarks, irises, and a first expression that turns a jaw joint."""
     random = torch.Generator().manual_seed(seed)
-    skull, skull_faces = _sphere(28, 24, open_below=True)
+    skull, skull_faces = sphere(24, 28, kept=21, margin=0.05)  # open below
     skull = skull * torch.tensor([0.075, 0.11, 0.095])
-    ball, ball_faces = _sphere(10, 8, open_below=False)
+    ball, ball_faces = sphere(8, 10, margin=0.05)
     centers = torch.tensor([[0.032, 0.02, 0.075], [-0.032, 0.02, 0.075]])
     template = torch.cat([skull, *(ball * 0.013 + center for center in centers)])
     offsets = (0, len(skull), len(skull) + len(ball))
     faces = torch.cat([skull_faces + offsets[0], ball_faces + offsets[1], ball_faces + offsets[2]])
-    regions = torch.cat([torch.full((len(part),), index) for index, part in enumerate((skull_faces, ball_faces))])
-    regions = torch.cat([regions, torch.ones(len(ball_faces), dtype=torch.long)])
+    regions = (torch.arange(len(faces)) >= len(skull_faces)).long()
 
     weights = torch.zeros(len(template), 5)
     jaw = torch.sigmoid((-0.03 - skull[:, 1]) * 100) * torch.sigmoid((skull[:, 2] - 0.04) * 200)
@@ -75,17 +75,3 @@ def _smooth_basis(points: Tensor, count: int, size: float, random: torch.Generat
     seen = (points[:, 2:] > 0.03).expand_as(points).flatten()
     amount = torch.linalg.lstsq(rigid[seen], basis.flatten(1).T[seen]).solution
     return basis - (rigid @ amount).T.reshape(basis.shape)
-
-
-def _sphere(around: int, rings: int, open_below: bool) -> tuple[Tensor, Tensor]:
-    """Return a unit sphere of rings from top to bottom. If it is open, the lowest rings are left out."""
-    kept = rings - 3 if open_below else rings
-    polar = torch.linspace(0.05, math.pi - 0.05, rings)[:kept, None]
-    angle = torch.linspace(0, 2 * math.pi, around + 1)[:-1]
-    x, z = polar.sin() * angle.sin(), polar.sin() * angle.cos()
-    points = torch.stack([x, polar.cos().expand_as(x), z], dim=-1).reshape(-1, 3)
-    ring, column = torch.meshgrid(torch.arange(kept - 1), torch.arange(around), indexing="ij")
-    first, second = ring * around + column, ring * around + (column + 1) % around
-    below, beside = first + around, second + around
-    quads = torch.stack([first, below, beside, first, beside, second], dim=-1)
-    return points, quads.reshape(-1, 3)

@@ -18,7 +18,7 @@ from mien.training import Sequence
 
 def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
     """Return an ellipsoid head with two expressions (dropped lower half, swollen front), a neck and a derived jaw."""
-    template, faces = _sphere(rings, around)
+    template, faces = sphere(rings, around)
     template = template * torch.tensor([0.08, 0.11, 0.09])
     v = len(template)
     low = torch.sigmoid((-template[:, 1] - 0.02) * 80)
@@ -131,12 +131,16 @@ def _facing(vertices: Tensor, faces: Tensor) -> Tensor:
     return ((normal * (v0 + v1 + v2)).sum(-1) < 0).float()
 
 
-def _sphere(rings: int, around: int) -> tuple[Tensor, Tensor]:
-    polar = torch.linspace(0.15, math.pi - 0.15, rings)[:, None]
+def sphere(rings: int, around: int, kept: int = -1, margin: float = 0.15) -> tuple[Tensor, Tensor]:
+    """Return the vertices of a unit sphere of rings from top to bottom, and its triangles.
+
+    Only the first rings are kept if there are more. The holes at its poles have a radius of `margin`.
+    """
+    polar = torch.linspace(margin, math.pi - margin, rings)[:, None][: kept if kept > 0 else rings]
     angle = torch.linspace(0, 2 * math.pi, around + 1)[:-1]
     x, z = polar.sin() * angle.sin(), polar.sin() * angle.cos()
     points = torch.stack([x, polar.cos().expand_as(x), z], dim=-1).reshape(-1, 3)
-    ring, column = torch.meshgrid(torch.arange(rings - 1), torch.arange(around), indexing="ij")
+    ring, column = torch.meshgrid(torch.arange(len(polar) - 1), torch.arange(around), indexing="ij")
     first, second = ring * around + column, ring * around + (column + 1) % around
     quads = torch.stack([first, first + around, second + around, first, second + around, second], dim=-1)
     return points, quads.reshape(-1, 3)
