@@ -47,7 +47,6 @@ pytestmark = pytest.mark.unchecked
 SIZES = {(16, 24): 187, (24, 32): 95}
 EVERYTHING = Analysis("gaussian_avatars", "a paper", (Part("all", "All kinds", "test_analysis:part_of_everything"),))
 """An analysis with every kind of result."""
-TRAINED = ["--train", "--steps", "2", "--seconds", "0.01"]
 _plain = toy_scene.toy_face_model
 
 
@@ -71,11 +70,9 @@ def workspace(made_once: MadeOnce, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         return Path(shutil.copytree(made_once("toy_with_teeth", write_toy_workspace), tmp_path / "W"))
 
 
-def analyze(root: Path, *more: str) -> int:
-    return main(["analyze", "gaussian-avatars", str(root), *more])
-
-
-def record(root: Path) -> dict[str, Any]:
+def analyze(root: Path, *more: str) -> dict[str, Any]:
+    """Analyze a run, and return its record."""
+    assert main(["analyze", "gaussian-avatars", str(root), *more]) == 0
     return json.loads((root / "analysis/toy/analysis.json").read_text())
 
 
@@ -88,38 +85,35 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """All parts run, also those that train; every file is there; the runs of the workspace stay as they were."""
     before = tree_bytes(workspace)
-    assert analyze(workspace, *TRAINED, "--json") == 0
+    stored = analyze(workspace, "--train", "--steps", "2", "--seconds", "0.01", "--json")
     shown = capsys.readouterr()
-    content = json.loads(shown.out)
-    assert list(content["parts"]) == [part.name for part in ANALYSES["gaussian-avatars"].parts]
-    assert content["parts"] == record(workspace)["parts"]
+    parts = json.loads(shown.out)["parts"]
+    assert parts == stored["parts"]
+    assert list(parts) == [part.name for part in ANALYSES["gaussian-avatars"].parts]
     assert "scale: 2 trainings of 2 steps each, about" in shown.err
     assert "not measured" not in shown.err
     folder = workspace / "analysis/toy"
     page = (folder / "analysis.html").read_text()
     for part in ANALYSES["gaussian-avatars"].parts:
         assert escape(part.summary) in page
-        kept = content["parts"][part.name]
+        kept = parts[part.name]
         assert kept["findings"] or part.name == "teeth-trained"
         for entry in (*kept["charts"], *kept["pictures"]):
             assert (folder / entry["file"]).read_bytes().startswith(b"\x89PNG")
     assert not re.search(r"<script|<link|(?:src|href)=\"(?!data:)", page), "the page is one file"
-    rows = content["parts"]["speed"]["values"]["rows"]
-    assert [(row["width"], row["height"], row["paper_fps"]) for row in rows] == [(16, 24, 187), (24, 32, 95)]
+    rows = parts["speed"]["values"]["rows"]
+    assert {(row["width"], row["height"]): row["paper_fps"] for row in rows} == SIZES
     assert all(row["fps"] > 0 and row["peak_mb"] >= row["before_mb"] > 0 for row in rows)
-    trained = content["parts"]["scale"]["values"]["rows"]
-    assert len(trained) == 2
-    assert all(row["gaussians"] > 0 and row["head_psnr"] > 0 for row in trained)
-    teeth = content["parts"]["teeth"]["values"]
+    trained = parts["scale"]["values"]["rows"]
+    assert [row["gaussians"] > 0 and row["head_psnr"] > 0 for row in trained] == [True, True]
+    teeth = parts["teeth"]["values"]
     assert 0 < teeth["teeth_gaussians"] < teeth["gaussians"]
     after = tree_bytes(workspace)
     assert {name: after[name] for name in before} == before
 
 
-def test_nothing_is_measured_twice(
-    workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A stopped command keeps its rows; the same command measures nothing; other options measure again."""
+def test_nothing_is_measured_twice(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stopped command keeps its rows; the same command measures nothing; other options or avatars measure again."""
     measured: list[tuple[int, int]] = []
     real = speed.measure_drawing
 
@@ -131,36 +125,23 @@ def test_nothing_is_measured_twice(
 
     monkeypatch.setattr(speed, "measure_drawing", stop_at_second)
     asked = ("--parts", "speed", "growth", "--seconds", "0.01")
-    assert analyze(workspace, *asked) == 130
-    assert list(record(workspace)["parts"]) == ["growth"]
-    assert analyze(workspace, *asked) == 0
+    assert main(["analyze", "gaussian-avatars", str(workspace), *asked]) == 130
+    first = analyze(workspace, *asked)
     assert measured == [(16, 24), (24, 32), (24, 32)]
-    first = record(workspace)["parts"]
-    capsys.readouterr()
-    assert analyze(workspace, *asked) == 0
-    assert len(measured) == 3
-    assert record(workspace)["parts"] == first
-    assert "speed: measured before" in capsys.readouterr().err
-    assert analyze(workspace, "--parts", "speed", "--seconds", "0.02") == 0
-    assert len(measured) == 5
-    assert list(record(workspace)["parts"]) == ["growth", "speed"], "parts that are not asked for stay"
+    assert analyze(workspace, *asked)["parts"] == first["parts"]
     (workspace / "analysis/toy/speed.png").unlink()
-    assert analyze(workspace, "--parts", "speed", "--seconds", "0.02") == 0
+    analyze(workspace, *asked)
     assert (workspace / "analysis/toy/speed.png").is_file()
+    assert len(measured) == 3
+    other = analyze(workspace, "--parts", "speed", "--seconds", "0.02")
+    assert list(other["parts"]) == ["growth", "speed"], "parts that are not asked for stay"
     assert len(measured) == 5
-
-
-def test_a_new_avatar_is_measured_again(workspace: Path) -> None:
-    assert analyze(workspace, "--parts", "growth", "teeth") == 0
-    first = record(workspace)
     shutil.rmtree(workspace / "runs")
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(toy_scene, "toy_face_model", toy_with_teeth)
         patched.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, seed=7))
         write_toy_workspace(workspace)
-    assert analyze(workspace, "--parts", "growth") == 0
-    assert list(record(workspace)["parts"]) == ["growth"]
-    assert record(workspace)["avatar"] != first["avatar"]
+    assert list(analyze(workspace, "--parts", "growth")["parts"]) == ["growth"]
 
 
 def test_growth_of_known_curves(workspace: Path) -> None:
@@ -175,8 +156,7 @@ def test_growth_of_known_curves(workspace: Path) -> None:
     changed["step_ms"] = 10 + 20 * (changed["gaussians"] - 1000) / 7000
     changed["step_ms"][0] = torch.nan
     write_tensors(path, changed)
-    assert analyze(workspace, "--parts", "growth") == 0
-    part = record(workspace)["parts"]["growth"]
+    part = analyze(workspace, "--parts", "growth")["parts"]["growth"]
     assert part["values"]["gaussians_growth"] == pytest.approx(8)
     assert part["values"]["step_time_growth"] == pytest.approx(3, rel=0.02)
     assert "Step time grows 2.9 times while Gaussians grow 8.0 times" in part["findings"][0]
@@ -184,14 +164,13 @@ def test_growth_of_known_curves(workspace: Path) -> None:
         changed["gaussians"] = torch.linspace(100, peak, 40, dtype=torch.float64)
         write_tensors(path, changed)
         shutil.rmtree(workspace / "analysis")
-        assert analyze(workspace, "--parts", "growth") == 0
-        notes = record(workspace)["parts"]["growth"]["notes"]
+        notes = analyze(workspace, "--parts", "growth")["parts"]["growth"]["notes"]
         assert any("limit, --method.density.max-gaussians 400" in note for note in notes) == told
     changed["step_ms"][:] = torch.nan
     changed["step_ms"][0], changed["gaussians"][0] = 1.0, torch.nan
     write_tensors(path, changed)
     shutil.rmtree(workspace / "analysis")
-    assert analyze(workspace, "--parts", "growth") == 2
+    assert main(["analyze", "gaussian-avatars", str(workspace), "--parts", "growth"]) == 2
 
 
 def test_the_jaw_opens_and_teeth_go() -> None:
@@ -214,31 +193,11 @@ def test_the_jaw_opens_and_teeth_go() -> None:
 
 def test_a_run_without_teeth_says_so(made_once: MadeOnce, tmp_path: Path) -> None:
     workspace = Path(shutil.copytree(toy_workspace(made_once), tmp_path / "W"))
-    assert analyze(workspace, "--parts", "teeth", "teeth-trained") == 0
-    parts = record(workspace)["parts"]
+    parts = analyze(workspace, "--parts", "teeth", "teeth-trained")["parts"]
     assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
 
 
-def test_the_method_is_that_of_the_run_unless_it_is_named(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["analyze", str(workspace), "--parts", "growth"]) == 0
-    assert [*record(workspace)["parts"]] == ["growth"]
-    capsys.readouterr()
-    assert "gaussian-avatars" in complaint(capsys, "analyze", "headgaz", str(workspace))
-    assert complaint(capsys, "analyze", "gaussian-avatars").startswith("mien: gaussian-avatars: no such folder")
-    assert "takes a workspace" in complaint(capsys, "analyze", "headgas", str(workspace), "more")
-    edit_json(workspace / "runs/toy/config.json", lambda content: content["method"].update(kind="point_avatar"))
-    assert "has no analysis" in complaint(capsys, "analyze", str(workspace))
-
-
-def test_sequences_that_are_gone_cost_only_their_parts(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.rmtree(workspace / "sequences")
-    assert analyze(workspace, "--seconds", "0.01") == 0
-    assert "No frames were compared" in record(workspace)["parts"]["teeth"]["notes"][1]
-    capsys.readouterr()
-    assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "scale")
-
-
-def test_parts_of_another_method_give_charts_pictures_and_films(workspace: Path, tmp_path: Path) -> None:
+def test_parts_of_another_method(workspace: Path, tmp_path: Path) -> None:
     """The frame knows no method: an analysis of tables, charts, pictures and films is written and read again."""
     folder = tmp_path / "out"
     arguments = (EVERYTHING, EVERYTHING.parts, workspace / "runs/toy", (), folder, AnalysisOptions())
@@ -270,52 +229,53 @@ def part_of_everything(context: Any) -> PartResult:
     )
 
 
-def test_the_command_names_every_analysis_and_part(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["analyze", "--help"])
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+def test_parts_that_train_are_left_out_unless_asked_for() -> None:
     for analysis in ANALYSES.values():
-        assert all(part.name in str(Command.__doc__) and part.name in shown for part in analysis.parts)
         names = [part.name for part in analysis.parts]
-        assert len(set(names)) == len(names)
-        quick = [part.name for part in chosen_parts(analysis, (), False)]
-        assert quick == [part.name for part in analysis.parts if not part.trainings]
-        assert [part.name for part in chosen_parts(analysis, names[:1], True)] == [
-            part.name for part in analysis.parts if part.trainings or part.name == names[0]
-        ]
+        assert all(name in str(Command.__doc__) for name in names)
+        quick = [part.name for part in analysis.parts if not part.trainings]
+        assert [part.name for part in chosen_parts(analysis, (), False)] == quick
+        trained = [part.name for part in analysis.parts if part.trainings or part.name == names[0]]
+        assert [part.name for part in chosen_parts(analysis, names[:1], True)] == trained
 
 
 BAD = [
-    ("analyze gaussian-avatars gone", "gone: no such folder"),
-    ("analyze gaussian-avatars W --run none", "no run 'none'; there are: begun, other, toy"),
-    ("analyze gaussian-avatars W --run begun", "begun: its training was not finished; run the same `mien train`"),
-    ("analyze gaussian-avatars W --run other", "other: is a run of headgas, not of gaussian_avatars"),
-    ("analyze gaussian-avatars W --run toy --parts speed hair", "--parts hair: no such part; there are: growth, speed"),
-    ("analyze gaussian-avatars W --run toy --steps 0", "--steps 0: give a number from 1 to 1000000"),
-    ("analyze gaussian-avatars W --run toy --seconds nan", "--seconds nan: give a number from 0.01"),
-    ("analyze gaussian-avatars W --run toy --out /proc/a", "/proc/a: cannot be written"),
-    ("analyze gaussian-avatars W --run toy --out W/runs/toy/config.json", "is a file, but a folder"),
-    ("analyze nerf W", "nerf: has no analysis; choose one of gaussian-avatars"),
+    ("gaussian-avatars gone", "gone: no such folder"),
+    ("gaussian-avatars", "mien: gaussian-avatars: no such folder"),
+    ("headgas W more", "takes a workspace"),
+    ("gaussian-avatars W --run begun", "begun: its training was not finished; run the same `mien train`"),
+    ("gaussian-avatars W --run other", "other: is a run of headgas, not of gaussian_avatars"),
+    ("gaussian-avatars W --run toy --parts speed hair", "--parts hair: no such part; there are: growth, speed"),
+    ("gaussian-avatars W --run toy --seconds nan", "--seconds nan: give a number from 0.01"),
+    ("gaussian-avatars W --run toy --out W/runs/toy/config.json", "is a file, but a folder"),
+    ("headgaz W", "headgaz: has no analysis; choose one of gaussian-avatars"),
+    ("W --run foreign", "has no analysis"),
 ]
 
 
-def test_bad_input_is_told_in_one_line(
-    workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("begun", "other"):
+def test_bad_input_is_told_in_one_line(workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    for name, kind in (("begun", "gaussian_avatars"), ("other", "headgas"), ("foreign", "point_avatar")):
         (workspace / "runs" / name).mkdir()
         shutil.copy(workspace / "runs/toy/config.json", workspace / "runs" / name)
-    edit_json(workspace / "runs/other/config.json", lambda content: content["method"].update(kind="headgas"))
+        edit_json(
+            workspace / "runs" / name / "config.json", lambda content, kind=kind: content["method"].update(kind=kind)
+        )
     monkeypatch.chdir(workspace.parent)
     before = tree_bytes(workspace)
     for line, words in BAD:
-        assert words in complaint(capsys, *shlex.split(line)), line
+        assert words in complaint(capsys, "analyze", *shlex.split(line)), line
         assert tree_bytes(workspace) == before, line
+    # Sequences that are gone cost only their parts.
+    shutil.rmtree(workspace / "sequences")
+    assert main(["analyze", "W", "--run", "toy", "--seconds", "0.01"]) == 0
+    told = json.loads((workspace / "analysis/toy/analysis.json").read_text())["parts"]["teeth"]["notes"][1]
+    assert "No frames were compared" in told
+    capsys.readouterr()
+    assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", "W", "--run", "toy", "--parts", "scale")
 
 
 def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert analyze(workspace, "--parts", "growth") == 0
-    path = workspace / "analysis/toy/analysis.json"
+    expected, path = analyze(workspace, "--parts", "growth"), workspace / "analysis/toy/analysis.json"
     whole = path.read_bytes()
     for change in (
         lambda content: content["parts"]["growth"]["tables"].append(3),
@@ -325,12 +285,10 @@ def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.Ca
         path.write_bytes(whole)
         edit_json(path, change)
         capsys.readouterr()
-        told = complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "growth")
-        assert "analysis" in told
+        assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "growth")
     path.write_bytes(whole)
     edit_json(path, lambda content: content.update(paper={"2": []}, run=3))
-    assert analyze(workspace, "--parts", "growth") == 0
-    again, expected = (json.loads(text) for text in (path.read_bytes(), whole))
+    again = analyze(workspace, "--parts", "growth")
     assert [again[name] for name in ("run", "paper", "parts")] == [expected[name] for name in ("run", "paper", "parts")]
     capsys.readouterr()
     shutil.rmtree(workspace / "analysis")

@@ -29,12 +29,8 @@ from toy_scene import toy_camera, toy_face, toy_face_model
 from toy_workspace import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
-CONFIG = HeadGasConfig(
-    points=80,
-    features=4,
-    hidden=8,
-    density=GradientSettings(start=0.2, stop=0.8, rounds=3, grow_gradient=1e-4, opacity_resets=(), max_gaussians=150),
-)
+_GROWTH = GradientSettings(start=0.2, stop=0.8, rounds=3, grow_gradient=1e-4, opacity_resets=(), max_gaussians=150)
+CONFIG = HeadGasConfig(points=80, features=4, hidden=8, density=_GROWTH)
 FILMS = {"basis.mp4": 32, "layers.mp4": 75, "beyond-expression.mp4": 60, "beyond-view.mp4": 60}
 """Frames of each film: 16 for each of the two expressions in the first one."""
 
@@ -54,9 +50,7 @@ def _small_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(part, "SIDE", 32)
 
 
-@pytest.fixture
-def workspace(toy: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(toy, tmp_path / "W"))
+workspace = pytest.fixture(lambda toy, tmp_path: Path(shutil.copytree(toy, tmp_path / "W")))
 
 
 @pytest.fixture
@@ -74,14 +68,12 @@ def test_parts_without_training_write_pictures_and_films(workspace: Path) -> Non
     parts = analyze(workspace, "--seconds", "0.01")
     assert list(parts) == ["basis", "layers", "beyond", "sizes"]
     folder = workspace / "analysis/toy"
-    films = {entry["file"] for part in parts.values() for entry in part["films"]}
-    assert films == set(FILMS)
+    assert {entry["file"] for part in parts.values() for entry in part["films"]} == set(FILMS)
     assert {name: count_frames(folder / name) for name in FILMS} == FILMS
     pictures = {entry["file"] for part in parts.values() for entry in (*part["pictures"], *part["charts"])}
     assert {"basis.png", "layers-head.png", "layers-mouth.png", "beyond-view.png", "sizes.png"} <= pictures
     assert all((folder / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
-    names = [row["name"] for row in parts["basis"]["values"]["rows"]]
-    assert names == ["drop", "swell"]
+    assert [row["name"] for row in parts["basis"]["values"]["rows"]] == ["drop", "swell"]
     assert not parts["basis"]["values"]["neutral_added"]
     assert parts["beyond"]["values"]["factors"][-1] == 1.4
     rows = parts["sizes"]["values"]["rows"]
@@ -119,17 +111,11 @@ def test_rows_differ_only_in_what_they_say() -> None:
     assert rows["full"] == replace(config, variant="full")
 
 
-def gaussians_at(points: list[tuple[float, float, float]], opacities: list[float]) -> Gaussians:
-    n = len(points)
-    return Gaussians(
-        torch.tensor(points), torch.ones(n, 4), torch.ones(n, 3), torch.tensor(opacities), torch.zeros(n, 1, 3)
-    )
-
-
 def test_gaussians_are_removed_from_near_to_far() -> None:
     # The camera looks along -z. The third is faint, the fourth beside the picture, the fifth behind the camera.
-    points = [(0.0, 0.0, -2.0), (0.0, 0.1, -1.0), (0.0, 0.0, -0.5), (9.0, 0.0, -1.0), (0.0, 0.0, 1.0), (0.1, 0.0, -3.0)]
-    gaussians = gaussians_at(points, [1.0, 0.5, 0.001, 1.0, 1.0, 0.1])
+    points = torch.tensor([[0.0, 0, -2], [0, 0.1, -1], [0, 0, -0.5], [9, 0, -1], [0, 0, 1], [0.1, 0, -3]])
+    opacities = torch.tensor([1.0, 0.5, 0.001, 1.0, 1.0, 0.1])
+    gaussians = Gaussians(points, torch.ones(6, 4), torch.ones(6, 3), opacities, torch.zeros(6, 1, 3))
     order = layers.near_to_far(gaussians, toy_camera(64))
     assert order.tolist() == [1, 0, 5]
     assert layers.without_nearest(6, order, 0.0).all()
@@ -139,19 +125,22 @@ def test_gaussians_are_removed_from_near_to_far() -> None:
 def test_bases_with_negative_coefficients_start_at_the_person_at_rest() -> None:
     model, face = toy_face_model(), toy_face(5)[1]
     start, added = start_of_bases(face, model)
-    assert added == 0
-    assert not bool(start.expression.any())
+    assert (added, bool(start.expression.any())) == (0, False)
     assert torch.equal(start.joints, face.joints)
     signed = replace(model, expression_bounds=torch.tensor([[-1.0, 1.0], [0.0, 1.0]]))
-    start, added = start_of_bases(face, signed)
-    assert added == 1
-    assert start is face
+    assert start_of_bases(face, signed) == (face, 1)
 
 
 def test_the_training_range_is_that_of_the_avatar_or_of_its_sequences(context: Context) -> None:
-    filmed = trained_range(context)
+    filmed, model = trained_range(context), context.avatar.face_model
     assert context.avatar.filmed is not None
     assert torch.equal(filmed.highest, torch.from_numpy(context.avatar.filmed.highest[:2]))
+    norms = model.expression_basis.flatten(1).norm(dim=-1)
+    assert beyond.strongest_expression(context, filmed) == int((filmed.highest * norms).argmax())
+    assert beyond.strongest_expression(context, replace(filmed, highest=torch.tensor([-1.0, 0.001]))) == 1
+    face = context.avatar.subject
+    assert with_expression(face, 1, 1.4).expression[0].tolist() == [float(face.expression[0, 0]), pytest.approx(1.4)]
+    assert bool((busy_face(context).expression != face.expression).all())
     context.avatar.filmed = None
     tracked = trained_range(context)
     face = context.sequences[0].tracking.face
@@ -172,22 +161,6 @@ def test_the_camera_goes_where_the_head_sees_it_at_an_angle(context: Context) ->
     assert shown == pytest.approx([low - 30, low - 15, low, (low + high) / 2, high, high + 15, high + 30])
 
 
-def test_the_strongest_expression_moves_the_mesh_most(context: Context) -> None:
-    trained = trained_range(context)
-    norms = context.avatar.face_model.expression_basis.flatten(1).norm(dim=-1)
-    assert beyond.strongest_expression(context, trained) == int((trained.highest * norms).argmax())
-    never = replace(trained, highest=torch.tensor([-1.0, 0.001]))
-    assert beyond.strongest_expression(context, never) == 1
-
-
-def test_faces_change_only_in_their_expression(context: Context) -> None:
-    face = context.avatar.subject
-    changed = with_expression(face, 1, 1.4)
-    assert changed.expression[0].tolist() == [float(face.expression[0, 0]), pytest.approx(1.4)]
-    assert float(face.expression[0, 1]) < 1.4
-    assert bool((busy_face(context).expression != face.expression).all())
-
-
 def test_views_hold_the_head() -> None:
     model, face = toy_face_model(), toy_face(5)[0]
     camera = head_camera(model, face, toy_camera(64), 100)
@@ -198,10 +171,9 @@ def test_views_hold_the_head() -> None:
     assert float((pixels.amax(0) - pixels.amin(0)).max()) > 70
     # A face model without regions of a mouth gives the whole head.
     assert mouth_camera(model, face, toy_camera(64), 50).K[0, 0] < 0.6 * camera.K[0, 0]
-    gray = np.full((10, 40, 3), 128, np.uint8)
-    picture = labeled(gray, "text")
+    picture = labeled(np.full((10, 40, 3), 128, np.uint8), "text")
     assert picture.shape == (30, 40, 3)
-    assert (picture[20:] == gray).all()
+    assert (picture[20:] == 128).all()
     assert picture[:20].min() < 200
 
 

@@ -24,12 +24,12 @@ def test_a_point_on_the_surface_is_found_again():
     allowed[front] = True
     truth = front[torch.randint(len(front), (6,), generator=random)]
     weights = torch.tensor([6.0, 4.0, 2.0]) / 12
+    points = (model.template[model.faces[truth]] * weights[:, None]).sum(1)
     pixels, depths, targets = [], [], []
     for _ in range(12):
         turn = matrix_from_axis_angle(0.4 * (2 * torch.rand(3, generator=random) - 1))
         pose = rigid_transform(torch.diag(torch.tensor([1.0, -1.0, -1.0])) @ turn, torch.tensor([0.0, 0.0, 0.7]))
         camera = camera_from_fov(0.5, 512, 512, pose)
-        points = (model.template[model.faces[truth]] * weights[:, None]).sum(1)
         projected, depth = camera.project(model.template)
         pixels.append(projected)
         depths.append(depth)
@@ -40,17 +40,12 @@ def test_a_point_on_the_surface_is_found_again():
     for landmark in range(len(truth)):
         triangle, barycentric, error = best_point(views, model.faces, allowed, landmark, clamp=10.0)
         found = barycentric @ model.template[model.faces[triangle]]
-        torch.testing.assert_close(found, weights @ model.template[model.faces[truth[landmark]]], atol=1e-6, rtol=0)
+        torch.testing.assert_close(found, points[landmark], atol=1e-6, rtol=0)
         assert error < 1e-2
 
 
-def test_ibug_indices():
-    """300-W's points are 68 different ones, the subject's right first."""
-    assert len(IBUG68) == len(set(IBUG68)) == 68
-    # The subject's right comes first: MediaPipe's 33 is the outer corner of the right eye.
-    assert (IBUG68[36], IBUG68[45]) == (33, 263)
-
-
+assert len(IBUG68) == len(set(IBUG68)) == 68
+assert (IBUG68[36], IBUG68[45]) == (33, 263), "the subject's right comes first: 33 is the outer corner of that eye"
 PLACED = sorted({*LEFT_EYELIDS, *RIGHT_EYELIDS, *IBUG68[::4], *range(0, 478, 12)})
 """Landmarks that are placed. Each takes a search of its own, so some of them tell as much as all."""
 
@@ -71,33 +66,22 @@ def few():
 
 
 @pytest.mark.unchecked
-def test_few_pictures_agree_with_the_shipped_landmarks(few):
+def test_few_pictures_agree_with_the_shipped_landmarks(few, tmp_path, monkeypatch):
     model, landmarks, errors = few
     # 512 pixels show 0.34 m: 3 px are 2 mm.
     assert errors[PLACED].median() < 3.5
-    shipped = model.landmark_positions(model.template, "mediapipe")
-    again = landmarks["mediapipe"].positions(model.template, model.faces)
-    distance = (shipped - again).norm(dim=1)[PLACED]
+    points = landmarks["mediapipe"].positions(model.template, model.faces)
+    distance = (model.landmark_positions(model.template, "mediapipe") - points).norm(dim=1)[PLACED]
     assert distance.median() < 0.0015
     assert distance.quantile(0.95) < 0.005
-
-
-@pytest.mark.unchecked
-def test_landmarks_of_lids_are_not_inside_the_eyeballs(few):
-    """A picture alone cannot tell, since a hidden point looks as near."""
-    model, landmarks, _ = few
-    points = landmarks["mediapipe"].positions(model.template, model.faces)
+    # Landmarks of lids are not inside the eyeballs, which a picture cannot tell, since a hidden point looks as near.
     for name, lids in (("left_eye", LEFT_EYELIDS), ("right_eye", RIGHT_EYELIDS)):
         center = model.joint_template[model.joint_names.index(name)]
         ball = model.faces[model.region_mask("eyes", "irises")].unique()
         ball = ball[model.template[ball, 0] * center[0] > 0]
         radius = (model.template[ball] - center).norm(dim=1).median()
         assert ((points[list(lids)] - center).norm(dim=1) - radius).min() > -0.0015
-
-
-@pytest.mark.unchecked
-def test_written_landmarks_are_read_by_the_loader(few, tmp_path, monkeypatch):
-    model, landmarks, _ = few
+    # What is written is read by the loader.
     (tmp_path / "data").mkdir()
     path = tmp_path / "data" / "anny_landmarks.json"
     loading.write_landmarks(path, replace(model, landmarks=landmarks), "a command", 2.5)

@@ -6,7 +6,6 @@ import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -33,13 +32,13 @@ def bakes(monkeypatch, tmp_path):
     return counts
 
 
-def files(tmp_path):
-    return tmp_path / "face_models" / "small-r1-0.0.1.json", tmp_path / "face_models" / "small-r1-0.0.1.safetensors"
-
-
 def test_a_baked_model_is_read_as_it_was_baked_and_baked_once(bakes, tmp_path):
+    before = {info.name: info for info in available_face_models()}
+    assert not before["small"].baked
+    assert "CC0" in before["anny"].licence
     baked, read = load_face_model("small"), load_face_model("small")
     assert len(bakes) == 1
+    assert {info.name: info.baked for info in available_face_models()}["small"]
     assert read.content_hash == baked.content_hash
     for name in (*loading.TENSORS, *loading.LISTS, "name"):
         first, second = getattr(baked, name), getattr(read, name)
@@ -48,68 +47,52 @@ def test_a_baked_model_is_read_as_it_was_baked_and_baked_once(bakes, tmp_path):
             assert torch.equal(first, second)
         else:
             assert first == second
-    header = json.loads(files(tmp_path)[0].read_text())
+    (header,) = (json.loads(path.read_text()) for path in tmp_path.glob("face_models/small-r1-0.0.1.json"))
     assert (header["format"], header["version"]) == ("mien.face_model", 1)
 
 
-def truncate(path):
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def flip_a_bit(path):
-    content = bytearray(path.read_bytes())
-    # Two thirds in, where the bases are: the file is still a valid one.
-    content[len(content) * 2 // 3] ^= 64
-    path.write_bytes(bytes(content))
-
-
-def make_old(path):
-    path.write_text(path.read_text().replace('"version": 1', '"version": 0'))
+def flip_a_bit(content: bytes) -> bytes:
+    """Two thirds in, where the bases are: the file is still a valid one."""
+    place = len(content) * 2 // 3
+    return content[:place] + bytes([content[place] ^ 64]) + content[place + 1 :]
 
 
 def test_damaged_or_old_files_are_baked_again(bakes, tmp_path):
     baked = load_face_model("small")
-    header, tensors = files(tmp_path)
-    for file, damage in (
-        (header, truncate), (header, make_old), (header, Path.unlink), (tensors, truncate), (tensors, flip_a_bit),
-        (tensors, Path.unlink), (header, lambda p: p.write_text('{"format": "mien.face_model", "version": 1}')),
-    ):  # fmt: skip
+    for ending, damage in (
+        ("json", lambda content: content[:-100]),
+        ("json", lambda content: content.replace(b'"version": 1', b'"version": 0')),
+        ("json", lambda content: b'{"format": "mien.face_model", "version": 1}'),
+        ("json", None),
+        ("safetensors", lambda content: content[:-100]),
+        ("safetensors", flip_a_bit),
+        ("safetensors", None),
+    ):
+        path = tmp_path / f"face_models/small-r1-0.0.1.{ending}"
         bakes.clear()
-        damage(file)
-        for _ in range(2):
-            assert load_face_model("small").content_hash == baked.content_hash
-            assert len(bakes) == 1
-
-
-def test_many_threads_can_load_a_model_at_once(bakes):
-    with ThreadPoolExecutor(4) as pool:
-        hashes = list(pool.map(lambda _: load_face_model("small").content_hash, range(8)))
-    assert len(set(hashes)) == 1
-    assert load_face_model("small").content_hash == hashes[0]
-
-
-def test_list_of_models(bakes):
-    before = {info.name: info for info in available_face_models()}
-    assert not before["small"].baked
-    assert "CC0" in before["anny"].licence
-    load_face_model("small")
-    assert {info.name: info.baked for info in available_face_models()}["small"]
+        if damage is None:
+            path.unlink()
+        else:
+            path.write_bytes(damage(path.read_bytes()))
+        with ThreadPoolExecutor(4) as pool:
+            hashes = set(pool.map(lambda _: load_face_model("small").content_hash, range(4)))
+        assert hashes == {baked.content_hash}
+        bakes.clear()
+        assert load_face_model("small").content_hash == baked.content_hash
+        assert not bakes, "it was written again"
 
 
 def test_unknown_names_and_landmarks_of_another_mesh_are_refused():
     with pytest.raises(UserError, match="'flame2077'.*anny"):
         load_face_model("flame2077")
-    with pytest.raises(UserError, match="another mesh"):
-        loading.read_landmarks("anny", make_small_face_model())
-
-
-def test_hashes_tell_what_changed():
     model = make_small_face_model()
+    with pytest.raises(UserError, match="another mesh"):
+        loading.read_landmarks("anny", model)
+    # Hashes tell what changed.
     moved = replace(model, template=model.template + 1e-6)
     assert moved.content_hash != model.content_hash
     assert moved.topology_hash == model.topology_hash
-    turned = replace(model, faces=model.faces.roll(1, 1))
-    assert turned.topology_hash != model.topology_hash
+    assert replace(model, faces=model.faces.roll(1, 1)).topology_hash != model.topology_hash
 
 
 @pytest.mark.unchecked

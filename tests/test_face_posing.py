@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mien import _native
-from mien.camera import Camera, camera_from_fov
+from mien.camera import camera_from_fov
 from mien.face import FaceModel, FaceParams, head_poses, load_face_model, part_boxes
 from mien.rotation import matrix_from_axis_angle
 from small_face_model import make_small_face_model
@@ -64,17 +64,12 @@ def test_the_last_persons_shape_is_not_taken_for_anothers() -> None:
     face = random_face(model, 1).detach()
     first = model(face)
     assert torch.equal(model(face), first)
-    other = replace(face, identity=-face.identity)
-    torch.testing.assert_close(model(other), model.vertices_reference(other), atol=1e-6, rtol=0)
-    face.identity.mul_(2)
-    torch.testing.assert_close(model(face), model.vertices_reference(face), atol=1e-6, rtol=0)
-    without = replace(face, vertex_offsets=None)
-    torch.testing.assert_close(model(without), model.vertices_reference(without), atol=1e-6, rtol=0)
-
-
-def test_a_shape_looked_at_without_gradients_still_has_them() -> None:
-    model = chained_model()
-    face = random_face(model, 1).detach()
+    doubled = replace(face, identity=face.identity.clone())
+    model(doubled)
+    doubled.identity.mul_(2)
+    for other in (doubled, replace(face, identity=-face.identity), replace(face, vertex_offsets=None)):
+        torch.testing.assert_close(model(other), model.vertices_reference(other), atol=1e-6, rtol=0)
+    # A shape that was looked at without gradients still has them.
     assert face.vertex_offsets is not None
     shape = [face.identity.requires_grad_(), face.vertex_offsets.requires_grad_()]
     with torch.no_grad():
@@ -97,13 +92,6 @@ def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
     assert torch.equal(model(face[1])[0], results[0][0][1])
 
 
-def test_no_timestep_and_float64_can_be_posed() -> None:
-    model = make_small_face_model()
-    assert model(model.neutral(0)).shape == (0, len(model.template), 3)
-    double = model.to(torch.zeros((), dtype=torch.float64))
-    assert double(double.neutral()).dtype == torch.float64
-
-
 def test_head_poses_and_gradients_equal_the_reference() -> None:
     face = random_face(chained_model(), 7)
     rotation = torch.cat([face.head_rotation[:4], torch.tensor([[0.0, 0, 0], [1e-6, 0, 0], [3.0, 0, 1.0]])])
@@ -122,15 +110,13 @@ def test_head_poses_and_gradients_equal_the_reference() -> None:
 
 def test_more_blendshapes_than_the_core_takes_are_posed_by_the_reference() -> None:
     model = make_small_face_model()
-    many = 40 * len(model.expression_names)
-    model = replace(
-        model,
-        expression_basis=model.expression_basis.repeat(40, 1, 1),
-        expression_bounds=model.expression_bounds.repeat(40, 1),
-        expression_names=tuple(f"e{index}" for index in range(many)),
-        joint_rotation_basis=model.joint_rotation_basis.repeat(40, 1, 1),
-        joint_translation_basis=model.joint_translation_basis.repeat(40, 1, 1),
-    )  # fmt: skip
+    assert model(model.neutral(0)).shape == (0, len(model.template), 3)
+    double = model.to(torch.zeros((), dtype=torch.float64))
+    assert double(double.neutral()).dtype == torch.float64
+    bases = ("expression_basis", "expression_bounds", "joint_rotation_basis", "joint_translation_basis")
+    many = {name: torch.cat(40 * [getattr(model, name)]) for name in bases}
+    names = tuple(f"e{index}" for index in range(40 * len(model.expression_names)))
+    model = replace(model, **many, expression_names=names)
     face = random_face(model, 2)
     assert torch.equal(model(face), model.vertices_reference(face))
 
@@ -159,36 +145,24 @@ def placed(face_model: FaceModel, yaw: float = 0.0, shift: tuple[float, float, f
 def test_boxes_enclose_the_regions_with_a_margin(face_model: FaceModel, part: str, region: str) -> None:
     vertices = placed(face_model)
     points, _ = CAMERA.project(vertices[face_model.faces[face_model.region_mask(region)].unique()])
-    left, top, width, height = part_boxes(face_model, vertices, CAMERA)[part]
+    box = left, top, width, height = part_boxes(face_model, vertices, CAMERA)[part]
     seen_width = float(points[:, 0].max() - points[:, 0].min())
     assert 1.2 * seen_width < width < 1.5 * seen_width
     assert left < float(points[:, 0].min()) - 0.1 * seen_width
     assert top < float(points[:, 1].min()) - 0.1 * seen_width
     assert top + height > float(points[:, 1].max()) + 0.1 * seen_width
+    # They grow with the picture.
+    large = part_boxes(face_model, vertices, CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height))[part]
+    assert all(abs(2 * a - b) <= 2 for a, b in zip(box, large, strict=True))
 
 
 def test_parts_that_face_away_or_are_outside_are_missing(face_model: FaceModel) -> None:
     assert part_boxes(face_model, placed(face_model, yaw=0.8), CAMERA).keys() == {"eyes", "mouth"}
-    assert part_boxes(face_model, placed(face_model, yaw=math.pi / 2), CAMERA) == {}
-    assert part_boxes(face_model, placed(face_model, yaw=math.pi), CAMERA) == {}
-    assert part_boxes(face_model, placed(face_model, shift=(0, 0, 0.6)), CAMERA) == {}, "behind the camera"
-    assert part_boxes(face_model, placed(face_model, shift=(0.3, 0, -0.6)), CAMERA) == {}, "beside the picture"
-    assert part_boxes(face_model, placed(face_model, shift=(0, 0, -9)), CAMERA) == {}, "too far away"
-
-
-def test_boxes_are_cut_at_the_border(face_model: FaceModel) -> None:
-    boxes = part_boxes(face_model, placed(face_model, shift=(0.14, 0, -0.6)), CAMERA)
-    left, _, width, _ = boxes["mouth"]
-    assert left + width == CAMERA.width
-
-
-def test_a_model_without_regions_has_no_parts(face_model: FaceModel) -> None:
-    plain = replace(face_model, region_names=("skin", "a", "b"))
-    assert part_boxes(plain, placed(plain), CAMERA) == {}
-
-
-def test_boxes_grow_with_the_picture(face_model: FaceModel) -> None:
-    large: Camera = CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height)
-    small = part_boxes(face_model, placed(face_model), CAMERA)
-    for name, box in part_boxes(face_model, placed(face_model), large).items():
-        assert all(abs(2 * a - b) <= 2 for a, b in zip(small[name], box, strict=True))
+    for why, place in {
+        "sideways": {"yaw": math.pi / 2}, "away": {"yaw": math.pi}, "behind the camera": {"shift": (0, 0, 0.6)},
+        "beside the picture": {"shift": (0.3, 0, -0.6)}, "too far away": {"shift": (0, 0, -9)},
+    }.items():  # fmt: skip
+        assert part_boxes(face_model, placed(face_model, **place), CAMERA) == {}, why
+    left, _, width, _ = part_boxes(face_model, placed(face_model, shift=(0.14, 0, -0.6)), CAMERA)["mouth"]
+    assert left + width == CAMERA.width, "it is cut at the border"
+    assert part_boxes(replace(face_model, region_names=("skin", "a", "b")), placed(face_model), CAMERA) == {}
