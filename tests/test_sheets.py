@@ -11,6 +11,7 @@ import torch
 
 from mien.camera import Camera, camera_from_fov
 from mien.cli import main
+from mien.commands.stages import driving
 from mien.commands.stages.sheets import (
     TURNTABLE_TILES,
     Tile,
@@ -25,16 +26,18 @@ from mien.driving import ARKIT_NAMES
 from mien.face import FaceModel, load_face_model
 from mien.render.camera_paths import orbit
 from mien.runtime import Filmed
-from shared_things import MadeOnce, toy_workspace
+from shared_things import toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera
 
 CAMERA = toy_camera(32)
 
 
-@pytest.fixture
-def workspace(made_once: MadeOnce) -> Path:
-    return toy_workspace(made_once)
+workspace = pytest.fixture(toy_workspace)
+
+
+def _turntable(span: float = 90.0) -> list[Tile]:
+    return turntable_tiles(make_small_face_model().neutral(), CAMERA, torch.zeros(3), span)
 
 
 def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
@@ -58,43 +61,35 @@ def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
 def test_strengths_relative_to_what_was_filmed() -> None:
     model = make_small_face_model()
     count = len(model.expression_names)
-    bounds = torch.tensor([[0.0, 1.0]]).expand(count, 2).contiguous()
-    model, highest = replace(model, expression_bounds=bounds), np.linspace(0.2, 0.9, count + 3).astype(np.float32)
-    filmed = Filmed(
-        0 * highest, highest, np.eye(count + 3, dtype=np.float32), highest[:1], np.zeros((2, 2), np.float32)
-    )
+    model = replace(model, expression_bounds=torch.tensor([[0.0, 1.0]]).repeat(count, 1))
+    highest = np.linspace(0.2, 0.9, count + 3).astype(np.float32)
+    filmed = Filmed(0 * highest, highest, np.diag(highest), highest[:1], np.zeros((2, 2), np.float32))
     tiles = filmed_tiles(model, model.neutral(), CAMERA, filmed, 1.5)
     shown = [float(tile.face.expression.max()) for tile in tiles[1:]]
     assert shown == pytest.approx([min(1.5 * value, 1.0) for value in highest[:count][::-1].tolist()])
 
 
 def test_a_turntable_ends_at_half_of_its_angle_on_either_side() -> None:
-    face, center = make_small_face_model().neutral(), torch.zeros(3)
-    tiles = turntable_tiles(face, CAMERA, center, 120.0)
+    tiles, around = _turntable(120.0), _turntable(360.0)
     assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "front", "+60 degrees"]
     assert len(tiles) == TURNTABLE_TILES
-    torch.testing.assert_close(tiles[-1].camera.viewmat, orbit(CAMERA, center, torch.pi / 3).viewmat)
-    around = turntable_tiles(face, CAMERA, center, 360.0)
+    torch.testing.assert_close(tiles[-1].camera.viewmat, orbit(CAMERA, torch.zeros(3), torch.pi / 3).viewmat)
     assert not torch.allclose(around[0].camera.viewmat, around[-1].camera.viewmat, atol=0.1)
 
 
-def test_a_name_that_is_too_wide_is_written_smaller() -> None:
+def test_names_are_legible_and_gaps_have_the_colour_of_the_background() -> None:
     picture = np.zeros((20, 40, 3), np.uint8)
     named = named_picture(picture, "a name that is far too wide for its tile")
     assert np.array_equal(named[:20], picture)
     assert (named[20:] < 255).any()
     assert (named[20:, -2:] == 255).all(), "no letter is cut off"
-    tiles = turntable_tiles(make_small_face_model().neutral(), CAMERA, torch.zeros(3), 90.0)
-    assert draw_sheet(tiles, lambda face, camera: picture).shape[1] == TURNTABLE_TILES * 40 + (TURNTABLE_TILES - 1) * 4
-
-
-def test_a_sheet_fits_a_screen_its_names_are_legible_and_its_gaps_have_the_colour_of_the_background() -> None:
-    tiles = turntable_tiles(make_small_face_model().neutral(), CAMERA, torch.zeros(3), 90.0)
+    small = draw_sheet(_turntable(), lambda face, camera: picture)
+    assert small.shape[1] == TURNTABLE_TILES * 40 + (TURNTABLE_TILES - 1) * 4
     blue = (26, 32, 80)
     picture = np.full((512, 512, 3), blue, np.uint8)
-    sheet = draw_sheet(tiles, lambda face, camera: picture, blue)
+    sheet = draw_sheet(_turntable(), lambda face, camera: picture, blue)
     high = named_picture(picture, "-70 degrees").shape[0] - 512
-    assert sheet.shape == (3 * (512 + high) + 2 * 4, 3 * 512 + 2 * 4, 3)
+    assert sheet.shape == (3 * (512 + high) + 2 * 4, 3 * 512 + 2 * 4, 3), "it fits a screen"
     bar = sheet[512 : 512 + high, :512].astype(int)
     rows = np.flatnonzero(np.abs(bar - blue).sum(-1).max(1) > 300)
     assert np.ptp(rows) > 0.03 * 512, "letters are as large as their picture asks for, and light over a dark colour"
@@ -105,11 +100,12 @@ def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:
     """A ball below the middle of the picture is magnified, and the picture ends where it ended before."""
     gray = (90, 90, 90)
 
+    def wall(_: object, camera: Camera) -> np.ndarray:
+        return np.full((camera.height, camera.width, 3), gray, np.uint8)
+
     def ball(_: object, camera: Camera) -> np.ndarray:
-        at = camera.K @ torch.tensor([0.0, 0.1, 1.0])
-        drawn = np.full((camera.height, camera.width, 3), gray, np.uint8)
-        radius = round(0.05 * float(camera.K[0, 0]))
-        return cv2.circle(drawn, (round(float(at[0])), round(float(at[1]))), radius, (255, 0, 0), -1)
+        x, y = (round(float(at)) for at in (camera.K @ torch.tensor([0.0, 0.1, 1.0]))[:2])
+        return cv2.circle(wall(None, camera), (x, y), round(0.05 * float(camera.K[0, 0])), (255, 0, 0), -1)
 
     start = camera_from_fov(0.8, 200, 200, torch.eye(4))
     tiles = [Tile("one", make_small_face_model().neutral(), start)]
@@ -118,9 +114,7 @@ def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:
     assert 0.7 < max(np.ptp(np.flatnonzero(shown.any(axis))) / 200 for axis in (0, 1)) < 0.98
     corner = torch.linalg.inv(start.K) @ torch.tensor([100.0, 200.0, 1.0])
     assert float((near.K @ corner)[1]) >= 199.99, "the picture's lower border stays at the border or beyond"
-    assert (
-        nearer_tiles(tiles, lambda _, camera: np.full((camera.height, camera.width, 3), gray, np.uint8), gray) == tiles
-    )
+    assert nearer_tiles(tiles, wall, gray) == tiles
 
 
 @pytest.mark.parametrize("options", [["expressions"], ["filmed", "--strength", "1.5"], ["turntable", "--span", "180"]])
@@ -133,48 +127,39 @@ def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: lis
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
 
 
-def test_a_sheet_without_a_name_lies_in_the_runs_folder(
-    workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sheet_without_a_name_lies_in_the_runs_folder(workspace: Path, tmp_path: Path, capsys) -> None:
     """Other pictures need a name, because it says what they are."""
-    workspace = Path(shutil.copytree(workspace, tmp_path / "W"))
-    assert main(["render", str(workspace), "--size", "32", "--sheet", "turntable"]) == 0
-    (sheet,) = (workspace / "runs").glob("*/sheet_turntable.png")
+    render = ["render", str(shutil.copytree(workspace, tmp_path / "W")), "--size", "32"]
+    assert main([*render, "--sheet", "turntable"]) == 0
+    (sheet,) = (tmp_path / "W/runs").glob("*/sheet_turntable.png")
     assert f"{sheet}: 9 pictures" in capsys.readouterr().err
-    assert main(["render", str(workspace), "--size", "32"]) == 2
+    assert main(render) == 2
     assert "--out: is missing" in capsys.readouterr().err
 
 
-def test_what_is_beyond_the_film_is_told_and_softened(
-    workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_beyond_the_film_is_told_and_softened(workspace: Path, tmp_path: Path, capsys) -> None:
     still = ["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "32"]
-    assert main([*still, "--set", "drop=1"]) == 0
-    assert "beyond what was filmed, so it may look wrong: drop=1 (0.00 to" in capsys.readouterr().err
-    assert main([*still, "--set", "drop=0"]) == 0
-    assert "beyond what was filmed" not in capsys.readouterr().err
+    for value, told in ((1, True), (0, False)):
+        assert main([*still, "--set", f"drop={value}"]) == 0
+        words = "beyond what was filmed, so it may look wrong: drop=1 (0.00 to"
+        assert (words in capsys.readouterr().err) == told
 
 
-def test_a_driver_who_goes_far_is_softened_unless_asked(
-    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from mien.commands.stages import driving
-
-    looked_up, read = [], driving.read_tracked_driver
+def test_a_driver_who_goes_far_is_softened_unless_asked(workspace: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    read, draw = driving.read_tracked_driver, driving.draw
 
     def far(folders: list[Path], face_model: FaceModel) -> driving.Driver:
         driver = read(folders, face_model)
         turned = driver.face.head_rotation + torch.tensor([-1.0, 0.0, 0.0])
         return replace(driver, face=replace(driver.face, head_rotation=turned))
 
-    draw = driving.draw
     monkeypatch.setattr(driving, "read_tracked_driver", far)
-    monkeypatch.setattr(driving, "draw", lambda *given: looked_up.append(given[1].T_world_local) or draw(*given))
-    command = ["drive", str(workspace), "--by", str(workspace), "--out", str(tmp_path / "f.mp4"), "--size", "32"]
-    assert main(command) == 0
-    assert "5 of 5 frames go beyond what was filmed and are softened" in capsys.readouterr().err
-    kept, looked_up[:] = list(looked_up), []
-    assert main([*command[:-4], "--out", str(tmp_path / "g.mp4"), "--size", "32", "--unlimited"]) == 0
-    assert "softened" not in capsys.readouterr().err
-    for near, wild in zip(kept, looked_up, strict=True):
+    drive = ["drive", str(workspace), "--by", str(workspace), "--size", "32", "--out", str(tmp_path / "f.mp4")]
+    looked_up: dict[bool, list[torch.Tensor]] = {True: [], False: []}
+    for softens, seen in looked_up.items():
+        monkeypatch.setattr(driving, "draw", lambda *given, to=seen: to.append(given[1].T_world_local) or draw(*given))
+        assert main([*drive, *([] if softens else ["--unlimited"])]) == 0
+        told = capsys.readouterr().err
+        assert ("5 of 5 frames go beyond what was filmed and are softened" in told) == softens
+    for near, wild in zip(*looked_up.values(), strict=True):
         assert float(near[1, 2]) < float(wild[1, 2]) - 0.3, "the head looks up less"
