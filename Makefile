@@ -148,7 +148,7 @@ kills: setup
 # MUTATIONS tries that many of them, drawn by SEED.
 MUTATIONS ?=
 mutate: setup web-packages
-	PYTHONPATH=tests $(BIN)/python -m mutations --workers 2 --json out/mutate/verdicts.json $(if $(MUTATIONS),--sample $(MUTATIONS) --seed $(SEED))
+	PYTHONPATH=tests $(BIN)/python -m mutations --workers 2 $(if $(MUTATIONS),--sample $(MUTATIONS) --seed $(SEED))
 
 # pyright's wrapper asks the package index for a newer version unless it is told not to.
 lint: setup

@@ -7,13 +7,19 @@ torch's `forward`. No test uses a private name of mien: a test that does breaks 
 """
 
 import ast
+import importlib
 import io
+import pkgutil
 import re
 import sys
 import tokenize
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from types import FunctionType
+
+import mien
 
 MAY_NAME = {
     "src/mien/avatar/methods.py": "the list of methods",
@@ -84,78 +90,34 @@ def _line_of(place: str, text: str, method: MethodNames) -> int | None:
     )
 
 
-@dataclass
-class _Class:
-    """A class in the source."""
-
-    place: str
-    bases: tuple[str, ...]
-    """Full names, "mien.avatar.avatar.Avatar", of those bases that have one."""
-    is_protocol: bool
-    concrete: dict[str, int] = field(default_factory=dict)
-    """Line of each method that has a body of its own."""
-    abstract: dict[str, int] = field(default_factory=dict)
-    """Line of each abstract method."""
+_METHODS = (FunctionType, property, cached_property, classmethod, staticmethod)
 
 
-def override_faults(texts: Mapping[str, str]) -> Iterator[str]:
-    """Yield a message for each method that a class overrides although a base class implements it.
-
-    Args:
-        texts: Sources by their places, such as "src/mien/avatar/avatar.py".
-    """
-    classes: dict[str, _Class] = {}
-    doors: dict[str, str] = {}
-    for place, text in texts.items():
-        _read_classes(place, text, classes, doors)
-
-    def found(name: str) -> str | None:
-        seen: set[str] = set()
-        while name not in classes and name in doors and name not in seen:
-            seen.add(name)
-            name = doors[name]
-        return name if name in classes else None
-
-    def ancestors(name: str) -> Iterator[str]:
-        for base in map(found, classes[name].bases):
-            if base is not None:
-                yield base
-                yield from ancestors(base)
-
-    for name, one in classes.items():
-        for method, line in {**one.abstract, **one.concrete}.items():
-            over = next((base for base in ancestors(name) if method in classes[base].concrete), None)
-            if over is not None and not classes[over].is_protocol:
-                yield f"{one.place}:{line}: {name}.{method} overrides that of {over}, which is not abstract"
+def classes_of_mien() -> list[type]:
+    """Return every class in src/mien."""
+    names = [each.name for each in pkgutil.walk_packages(mien.__path__, "mien.") if not each.name.endswith("__main__")]
+    everything = [value for name in names for value in vars(importlib.import_module(name)).values()]
+    return list(
+        dict.fromkeys(one for one in everything if isinstance(one, type) and one.__module__.startswith("mien."))
+    )
 
 
-def _read_classes(place: str, text: str, classes: dict[str, _Class], doors: dict[str, str]) -> None:
-    """Add the classes of a file, and what its imports mean."""
-    path = Path(place).with_suffix("")
-    parts = path.parts[1 : -1 if path.name == "__init__" else None]
-    module = ".".join(parts)
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            for name in node.names:
-                doors[f"{module}.{name.asname or name.name}"] = f"{node.module}.{name.name}"
-        if isinstance(node, ast.Import):
-            for name in node.names:
-                doors[f"{module}.{name.asname or name.name}"] = name.name
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.ClassDef):
-            continue
-        bases = []
-        for base in node.bases:
-            head, _, tail = ast.unparse(base.value if isinstance(base, ast.Subscript) else base).partition(".")
-            known = doors.get(f"{module}.{head}", f"{module}.{head}")
-            bases.append(f"{known}.{tail}" if tail else known)
-        one = _Class(place, tuple(bases), any(base.endswith("Protocol") for base in bases))
-        for item in node.body:
-            if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef) and not re.fullmatch("__.*__", item.name):
-                marks = {ast.unparse(mark).split(".")[-1] for mark in item.decorator_list}
-                (one.abstract if "abstractmethod" in marks else one.concrete)[item.name] = item.lineno
-        classes[f"{module}.{node.name}"] = one
+def override_faults(classes: Iterable[type]) -> Iterator[str]:
+    """Yield a message for each method that a class overrides although a base class of its package implements it."""
+    for one in classes:
+        bases = [base for base in one.__mro__[1:] if base.__module__.split(".")[0] == one.__module__.split(".")[0]]
+        for name, method in vars(one).items():
+            if isinstance(method, _METHODS) and not re.fullmatch("__.*__", name):
+                over = next((base for base in bases if _implements(base, name)), None)
+                if over is not None:
+                    place = f"{one.__module__}.{one.__qualname__}.{name}"
+                    yield f"{place} overrides that of {over.__module__}.{over.__qualname__}, which is not abstract"
+
+
+def _implements(base: type, name: str) -> bool:
+    method = vars(base).get(name)
+    is_abstract = getattr(method, "__isabstractmethod__", False) or getattr(base, "_is_protocol", False)
+    return isinstance(method, _METHODS) and not is_abstract
 
 
 _PRIVATE = re.compile(r"_[a-zA-Z]\w*")
@@ -191,7 +153,7 @@ def main() -> int:
     python = {str(path): path.read_text() for path in sorted(Path("src/mien").rglob("*.py"))}
     scripts = {str(path): path.read_text() for path in sorted(Path("web/src").glob("*.ts"))}
     tests = {str(path): path.read_text() for path in sorted(Path("tests").rglob("*.py"))}
-    faults = [*naming_faults(python | scripts, method_names(), MAY_NAME), *override_faults(python)]
+    faults = [*naming_faults(python | scripts, method_names(), MAY_NAME), *override_faults(classes_of_mien())]
     faults += private_faults(tests)
     print("\n".join(faults) or f"Seams: {len(python | scripts | tests)} files checked; methods stay in their folders.")
     return bool(faults)

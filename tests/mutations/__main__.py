@@ -1,7 +1,6 @@
 """Mutate the code, one mistake at a time, and run the tests that should catch it: `make mutate`."""
 
 import argparse
-import json
 import os
 import random
 import re
@@ -12,8 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from mutations.cases import Case, read_cases
-from mutations.copies import MutationError, Verdict, Workshop
+from mutations.copies import Case, MutationError, Verdict, Workshop, read_cases
 
 CAUGHT_SHARE = 0.95
 """Share of the mutations that the tests must catch."""
@@ -24,7 +22,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="mutations", description=__doc__)
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose file or text has this")
     parser.add_argument("--workers", type=int, default=1, help="copies of the project that are mutated at once")
-    parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write all verdicts here")
     parser.add_argument("--sample", type=int, default=None, metavar="N", help="try only N of them, drawn by --seed")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
@@ -41,9 +38,6 @@ def main() -> int:
         return 2
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    if asked.json:
-        asked.json.parent.mkdir(parents=True, exist_ok=True)
-        asked.json.write_text(json.dumps([verdict.as_json() for verdict in verdicts], indent=1) + "\n")
     caught = sum(verdict.caught for verdict in verdicts)
     print(f"{caught} of {len(verdicts)} mutations are caught ({100 * caught / len(verdicts):.1f} %).")
     for verdict in verdicts:
@@ -54,22 +48,17 @@ def main() -> int:
 
 def _try_all(cases: list[Case], folder: Path, workers: int) -> list[Verdict]:
     """Try the cases in `workers` copies of the project, and print a line for each."""
-    workshops = [Workshop(folder / str(index)) for index in range(min(workers, len(cases)))]
-    free, done = list(workshops), 0
+    free = [Workshop(folder / str(index)) for index in range(min(workers, len(cases)))]
 
     def attempt(case: Case) -> Verdict:
-        nonlocal done
-        workshop = free.pop()
-        began = time.monotonic()
+        workshop, began = free.pop(), time.monotonic()
         verdict = workshop.attempt(case)
         free.append(workshop)
-        done += 1
-        word = "caught" if verdict.caught else "SURVIVES"
-        took, by = time.monotonic() - began, re.sub(r" - .*", "", verdict.by)
-        print(f"{done:3}/{len(cases)} {word:8} {took:4.0f} s  {case.file}: {case.new}  {by}", flush=True)
+        word, by = "caught" if verdict.caught else "SURVIVES", re.sub(r" - .*", "", verdict.by)
+        print(f"{word:8} {time.monotonic() - began:4.0f} s  {case.file}: {case.new}  {by}", flush=True)
         return verdict
 
-    with ThreadPoolExecutor(len(workshops)) as pool:
+    with ThreadPoolExecutor(len(free)) as pool:
         return list(pool.map(attempt, cases))
 
 

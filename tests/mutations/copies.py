@@ -1,15 +1,14 @@
-"""Copies of the project in which mutations are tried. The checkout itself is never changed."""
+"""The mutations of cases.toml, and copies of the project in which they are tried. The checkout is never changed."""
 
 import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mien import _native
-from mutations.cases import Case
 
 ROOT = Path(__file__).parents[2]
 _SITE = '''"""Imports mien from this copy: without the finder of the editable install."""
@@ -29,6 +28,26 @@ class MutationError(Exception):
 
 
 @dataclass(frozen=True)
+class Case:
+    """One mutation."""
+
+    file: str
+    """Path in the project."""
+    old: str
+    """The text, which is in the file exactly once."""
+    new: str
+    """The text that takes its place."""
+    tests: list[str]
+    """Files of tests that should catch it, without folder and ending."""
+
+
+def read_cases() -> list[Case]:
+    """Read all mutations."""
+    content = tomllib.loads(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
+    return [Case(**entry) for entry in content["case"]]
+
+
+@dataclass(frozen=True)
 class Verdict:
     """What became of a mutation."""
 
@@ -36,11 +55,6 @@ class Verdict:
     caught: bool
     by: str
     """The first test that failed, or why the code did not run; empty if the mutation survives."""
-
-    def as_json(self) -> dict[str, Any]:
-        """All fields as json has them."""
-        case = self.case
-        return {"file": case.file, "old": case.old, "new": case.new, "caught": self.caught, "by": self.by}
 
 
 class Workshop:
@@ -92,11 +106,9 @@ class Workshop:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "MIEN_THREADS": "1"}
         environment.setdefault("MIEN_TEST_DATA", str(ROOT.parent / "shared" / "data"))
         tests = [f"tests/{name}.py" for name in case.tests]
+        run = {"cwd": self.folder, "env": environment, "timeout": _LIMIT_SECONDS}
         try:
-            done = subprocess.run(
-                [*command, *tests], cwd=self.folder, env=environment, capture_output=True, text=True,
-                timeout=_LIMIT_SECONDS, check=False,
-            )  # fmt: skip
+            done = subprocess.run([*command, *tests], capture_output=True, text=True, check=False, **run)
         except subprocess.TimeoutExpired:
             return 1, "takes too long"
         failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
@@ -108,8 +120,8 @@ class Workshop:
         if not self.built:
             found = [sys.executable, "-m", "nanobind", "--cmake_dir"]
             nanobind = subprocess.run(found, capture_output=True, text=True, check=True).stdout.strip()
-            program, python = f"-DCMAKE_MAKE_PROGRAM={tools / 'ninja'}", f"-DPython_EXECUTABLE={sys.executable}"
-            configure = [str(tools / "cmake"), "-S", str(self.folder), "-B", str(build), "-G", "Ninja", program, python]
+            configure = [str(tools / "cmake"), "-S", str(self.folder), "-B", str(build), "-G", "Ninja"]
+            configure += [f"-DCMAKE_MAKE_PROGRAM={tools / 'ninja'}", f"-DPython_EXECUTABLE={sys.executable}"]
             configure += ["-DCMAKE_BUILD_TYPE=Release", f"-Dnanobind_DIR={nanobind}"]
             subprocess.run(configure, capture_output=True, check=True)
             self.built = True
