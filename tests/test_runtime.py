@@ -13,7 +13,6 @@ import torch
 from mien import runtime
 from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, bake_rig, make_portable
 from mien.errors import UserError
-from mien.face import FaceParams
 from mien.runtime.checks import baked_fault
 from mien.runtime.posing import run_network
 from plain_settings import plain_config
@@ -41,19 +40,16 @@ def export(avatar: Avatar, path: Path) -> runtime.Avatar:
     return runtime.load(path)
 
 
-def pose_as(avatar: runtime.Avatar, face: FaceParams) -> runtime.Gaussians:
-    return runtime.pose(avatar.portable.baked, runtime_face(face))
-
-
 @method
 def test_a_file_holds_the_avatar_and_the_subject(method: str, tmp_path: Path) -> None:
     """What training draws is compared in test_runtime_equality.py."""
     avatar = new_avatar(method)
-    portable = export(avatar, tmp_path / "a.mien")
-    np.testing.assert_allclose(portable.pose().means, pose_as(portable, avatar.subject).means)
-    assert (portable.expression_names, portable.joint_names) == (("drop", "swell"), ("neck",))
-    assert portable.portable.about.method == method
-    runtime.write_portable(tmp_path / "b.mien", portable.portable)
+    loaded = export(avatar, tmp_path / "a.mien")
+    subject = runtime.pose(loaded.portable.baked, runtime_face(avatar.subject))
+    np.testing.assert_allclose(loaded.pose().means, subject.means)
+    assert (loaded.expression_names, loaded.joint_names) == (("drop", "swell"), ("neck",))
+    assert loaded.portable.about.method == method
+    runtime.write_portable(tmp_path / "b.mien", loaded.portable)
     assert (tmp_path / "a.mien").read_bytes() == (tmp_path / "b.mien").read_bytes()
 
 
@@ -61,8 +57,7 @@ def test_names_and_their_mistakes(tmp_path: Path) -> None:
     portable = export(new_avatar(DEFAULT_METHOD), tmp_path / "toy.mien")
     rest = portable.face()
     face = portable.face({"drop": 0.7}, {"neck": (0.1, 0, 0)}, head_rotation=(0, 0.2, 0))
-    assert face.expression[0] == np.float32(0.7)
-    assert face.expression[1] == rest.expression[1]
+    assert face.expression.tolist() == [np.float32(0.7), rest.expression[1]]
     assert face.joints.tolist() == [[np.float32(0.1), 0, 0]]
     assert face.head_translation.tolist() == rest.head_translation.tolist()
     for wrong, part in (
@@ -79,7 +74,9 @@ def test_names_and_their_mistakes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["static", "skinned"])
 def test_linear_bases_add_to_the_raw_values(kind: str) -> None:
     """raw + sum of coefficient times basis, by hand, for records that no method writes yet."""
-    random, n, e = np.random.default_rng(0), 6, 2
+    face_model = toy_sequence(5, SIZE)[0]
+    rig = bake_rig(face_model, face_model.neutral())
+    random, n, e = np.random.default_rng(0), len(rig.template), 2
 
     def some(*shape: int) -> np.ndarray:
         return random.standard_normal(shape).astype(np.float32)
@@ -90,33 +87,24 @@ def test_linear_bases_add_to_the_raw_values(kind: str) -> None:
         bases = replace(bases, means=some(e, n, 3))
         record = runtime.Static(some(n, 3), attributes, ("drop", "swell"), bases=bases)
     else:
-        face_model = toy_sequence(5, SIZE)[0]
-        rig = bake_rig(face_model, face_model.neutral())
-        attributes = runtime.Attributes(*(part[np.arange(len(rig.template)) % n] for part in vars(attributes).values()))
-        moved = {name: b[:, np.arange(len(rig.template)) % n] for name, b in vars(bases).items() if b is not None}
-        bases = runtime.LinearBases(**moved)
         record = runtime.BlendSkinned(rig, attributes, bases=bases)
     assert baked_fault(record) is None
     face = runtime.Face(np.array([0.3, -0.7], np.float32), some(1, 3), some(3), some(3))
     found = runtime.pose(record, face)
 
-    def expected(name: str) -> np.ndarray:
-        return getattr(attributes, name) + sum(
-            w * b for w, b in zip(face.expression, getattr(bases, name), strict=True)
-        )
+    def expected(name: str, raw: object = attributes) -> np.ndarray:
+        return getattr(raw, name) + np.tensordot(face.expression, getattr(bases, name), 1)
 
     np.testing.assert_allclose(found.scales, np.exp(expected("log_scales")), rtol=1e-5)
     np.testing.assert_allclose(found.opacities, 1 / (1 + np.exp(-expected("opacity_logits"))), rtol=1e-5)
     np.testing.assert_allclose(found.sh, expected("sh"), rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(found.quats, attributes.quats)
-    if isinstance(record, runtime.Static):
-        assert bases.means is not None
-        moved = record.means + np.tensordot(face.expression, bases.means, 1)
-        np.testing.assert_allclose(found.means, moved, rtol=1e-5, atol=1e-6)
+    if kind == "static":
+        np.testing.assert_allclose(found.means, expected("means", record), rtol=1e-5, atol=1e-6)
 
 
 @torch.no_grad()
-def test_the_features_network_equals_its_reference_in_numpy(tmp_path: Path) -> None:
+def test_the_features_network_equals_its_reference_in_numpy_and_has_directions_that_fit(tmp_path: Path) -> None:
     whole = export(new_avatar("headgas", directions=2), tmp_path / "a.mien").portable
     assert isinstance(whole.baked, runtime.Static)
     network = whole.baked.network
@@ -127,44 +115,17 @@ def test_the_features_network_equals_its_reference_in_numpy(tmp_path: Path) -> N
         by_hand = run_network(network, np.zeros_like(whole.baked.means), face)
         np.testing.assert_allclose(by_hand[:, :-1].reshape(posed.sh.shape), posed.sh, rtol=0, atol=2e-6)
         np.testing.assert_allclose(1 / (1 + np.exp(-by_hand[:, -1])), posed.opacities, rtol=0, atol=5e-7)
-
-
-def test_directions_that_do_not_fit_are_told(tmp_path: Path) -> None:
-    whole = export(new_avatar("headgas", directions=2), tmp_path / "a.mien").portable
-    assert isinstance(whole.baked, runtime.Static)
-    network = whole.baked.network
-    assert network is not None
     along = network.along
     assert along is not None
     for wrong, part in (
-        (
-            replace(network, along=replace(along, rest=along.rest[1:], directions=along.directions[1:])),
-            "the shape of rest of its directions",
-        ),
-        (replace(network, along=replace(along, basis=np.repeat(along.basis, 9, 2))), "288 features, but"),
-        (replace(network, along=replace(along, basis=along.basis[1:])), "the shape of basis of its directions"),
-        (replace(network, along=None), "the input features, which does not fit its directions"),
+        (replace(along, rest=along.rest[1:], directions=along.directions[1:]), "the shape of rest of its directions"),
+        (replace(along, basis=np.repeat(along.basis, 9, 2)), "288 features, but"),
+        (replace(along, basis=along.basis[1:]), "the shape of basis of its directions"),
+        (None, "the input features, which does not fit its directions"),
     ):
+        baked = replace(whole.baked, network=replace(network, along=wrong))
         with pytest.raises(UserError, match=part):
-            runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=replace(whole.baked, network=wrong)))
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_damaged_files_are_told(seed: int, tmp_path: Path) -> None:
-    """Files that are cut short, or have a bit flipped anywhere, are reported in one line."""
-    path = tmp_path / "a.mien"
-    export(new_avatar(DEFAULT_METHOD), path)
-    random, content = np.random.default_rng(seed), bytearray(path.read_bytes())
-    if seed % 2:
-        # Half of the flips go into the header, which is a small part of the file.
-        content[random.integers(len(content) if seed % 4 == 1 else 4000)] ^= 1 << random.integers(8)
-    else:
-        del content[random.integers(len(content)) :]
-    path.write_bytes(content)
-    with pytest.raises(UserError) as told:
-        runtime.read_portable(path)
-    assert str(path) in str(told.value)
-    assert "\n" not in str(told.value)
+            runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=baked))
 
 
 def test_files_with_other_content_are_told(tmp_path: Path) -> None:
@@ -186,19 +147,20 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=part):
             runtime.write_portable(path, wrong)
     arrays = safetensors.numpy.load_file(path)
-    for version in (0, 2, 6, "1", None):
+    for version in (0, 2, "1", None):
         safetensors.numpy.save_file(arrays, path, {"mien": json.dumps({"format": "mien.baked", "version": version})})
         told = f"version {version!r}, expected 'mien.baked' version 1; export it again with `mien export`"
         with pytest.raises(UserError, match=re.escape(told)):
             runtime.load(path)
     safetensors.numpy.save_file(arrays, path)
-    with pytest.raises(UserError, match=r"is not a \.mien file; write one with `mien export"):
-        runtime.load(path)
-    (tmp_path / "b.mien").write_text(json.dumps({}))
-    with pytest.raises(UserError, match=r"is damaged, or not a \.mien file .*; write one with `mien export"):
-        runtime.load(tmp_path / "b.mien")
-    with pytest.raises(UserError, match="no such file; write one with `mien export"):
-        runtime.load(tmp_path / "none.mien")
+    (tmp_path / "b.mien").write_text("{}")
+    for name, told in (
+        ("a.mien", r"is not a \.mien file"),
+        ("b.mien", r"is damaged, or not a \.mien file .*"),
+        ("none.mien", "no such file"),
+    ):
+        with pytest.raises(UserError, match=f"{told}; write one with `mien export"):
+            runtime.load(tmp_path / name)
 
 
 def test_face_models_that_may_not_be_passed_on_are_not() -> None:
