@@ -48,9 +48,11 @@ def corners_at(timestep: int) -> torch.Tensor:
     return square + torch.tensor([0.01 * timestep, 0.0, 0.0])
 
 
-def film_rig(folder: Path, texture: np.ndarray) -> tuple[Path, Path]:
-    """Write the pictures of all cameras and their calibration; the back camera sees a plain board."""
-    side, entries = texture.shape[0], []
+@pytest.fixture(scope="module")
+def rig(test_data, tmp_path_factory):
+    """Pictures and calibration of all cameras; the back camera sees a plain board."""
+    folder, side, entries = tmp_path_factory.mktemp("rig"), 512, []
+    texture = cv2.resize(scan_texture(test_data), (side, side), interpolation=cv2.INTER_AREA)
     source = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
     for camera_id, camera in CAMERAS.items():
         place = folder / "pictures" / camera_id
@@ -67,13 +69,6 @@ def film_rig(folder: Path, texture: np.ndarray) -> tuple[Path, Path]:
     return folder / "pictures", write_rig(folder / "rig.json", *entries)
 
 
-@pytest.fixture(scope="module")
-def rig(test_data, tmp_path_factory):
-    """Pictures and calibration of the rig."""
-    texture = cv2.resize(scan_texture(test_data), (512, 512), interpolation=cv2.INTER_AREA)
-    return film_rig(tmp_path_factory.mktemp("rig"), texture)
-
-
 def capture_changed(rig, folder: Path, change: Callable[[list[dict]], list[dict]], **settings) -> Capture:
     """Capture with a changed calibration."""
     write_rig(folder / "rig.json", *change(json.loads(rig[1].read_text())["cameras"]))
@@ -83,6 +78,9 @@ def capture_changed(rig, folder: Path, change: Callable[[list[dict]], list[dict]
 
 @pytest.mark.unchecked
 def test_cameras_become_one_capture_with_the_head_at_one_scale(rig, tmp_path):
+    half = read_calibration(rig[1])[0].for_pictures(WIDTH // 2, HEIGHT // 2)
+    assert half.width == WIDTH // 2
+    torch.testing.assert_close(half.K[:2], CAMERAS["left"].K[:2] / 2)
     capture = capture_cameras([rig[0]], rig[1], tmp_path / "s" / "capture", "s", CaptureSettings(size=128))
     assert capture.camera_ids == tuple(CAMERAS)
     assert capture.images.shape == (FRAMES, 5, 128, 128, 3)
@@ -121,48 +119,40 @@ def test_same_command_reads_the_capture_back_and_an_interrupted_one_continues(ri
     assert len(calls) == done
 
 
-def test_offsets_pair_frames(rig, tmp_path):
-    def change(entries):
-        return [{**entry, "offset": int(entry["id"] == "middle")} for entry in entries]
-
-    shifted = capture_changed(rig, tmp_path, change, max_frames=FRAMES - 1)
-    assert shifted.timesteps == FRAMES - 1
-    assert [shifted.source["cameras"][name]["first_frame"] for name in ("left", "middle")] == [0, 1]
-
-
 @pytest.mark.parametrize("camera", ["middle", "top"])
 def test_unequal_lengths_are_refused_before_faces_are_searched(rig, tmp_path, monkeypatch, camera):
-    """A camera has an offset, or lacks a picture."""
-    monkeypatch.setattr("mien.capture.from_cameras.survey_source", lambda *_: pytest.fail("faces were searched"))
-    pictures = tmp_path / "pictures"
+    """A camera has an offset, or lacks a picture. Fewer frames pair those of all cameras."""
+    pictures, out = tmp_path / "pictures", tmp_path / "out" / "capture"
     shutil.copytree(rig[0], pictures)
     entries = json.loads(rig[1].read_text())["cameras"]
     if camera == "middle":
         entries[1]["offset"] = 1
     else:
         (pictures / camera / f"{FRAMES - 1}.png").unlink()
-    write_rig(tmp_path / "rig.json", *entries)
-    with pytest.raises(
-        UserError, match=f"camera {camera} has 2 frames, but camera left has 3; .* --capture.max-frames 2"
-    ):
-        capture_cameras([pictures], tmp_path / "rig.json", tmp_path / "out" / "capture", "s", SMALL)
+    calibration = write_rig(tmp_path / "rig.json", *entries)
+    refusal = f"camera {camera} has 2 frames, but camera left has 3; .* --capture.max-frames 2"
+    with monkeypatch.context() as patched:
+        patched.setattr("mien.capture.from_cameras.survey_source", lambda *_: pytest.fail("faces were searched"))
+        with pytest.raises(UserError, match=refusal):
+            capture_cameras([pictures], calibration, out, "s", SMALL)
     assert not (tmp_path / "out").exists()
+    capture = capture_cameras([pictures], calibration, out, "s", replace(SMALL, max_frames=2))
+    first_frames = [capture.source["cameras"][name]["first_frame"] for name in ("left", "middle")]
+    assert (capture.timesteps, first_frames) == (2, [0, int(camera == "middle")])
 
 
-def scaled(entry: dict, factor: float) -> dict:
-    viewmat = np.array(entry["viewmat"])
-    viewmat[:3, 3] *= factor
-    return {**entry, "viewmat": viewmat.tolist()}
-
-
-def turned_away(entry: dict) -> dict:
-    """A camera that looks the other way, as one with OpenGL's axes does."""
-    return {**entry, "viewmat": (np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.array(entry["viewmat"])).tolist()}
+def viewed(entry: dict, change: Callable[[np.ndarray], np.ndarray]) -> dict:
+    return {**entry, "viewmat": change(np.array(entry["viewmat"])).tolist()}
 
 
 def first(**changes: object) -> Callable[[list[dict]], list[dict]]:
     """Return a function that changes the entry of the first camera."""
     return lambda entries: [{**entries[0], **changes}, *entries[1:]]
+
+
+THOUSAND = np.diag([1000.0, 1000, 1000, 1])
+BACKWARDS = np.diag([-1.0, 1, -1, 1])
+"""Turns a camera to the other side, as one with OpenGL's axes looks."""
 
 
 @pytest.mark.parametrize(
@@ -180,11 +170,13 @@ def first(**changes: object) -> Callable[[list[dict]], list[dict]]:
         (first(offset=-1), "offset -1 is not a number of frames"),
         (first(id="../x"), "cannot be an id"),
         (first(offset=FRAMES), f"its offset of {FRAMES} leaves no frame of .*left"),
-        (lambda e: [e[0], turned_away(e[1]), *e[2:]], "middle finds a face, but the other cameras see the head behind"),
+        (lambda e: [e[0], viewed(e[1], lambda m: BACKWARDS @ m), *e[2:]],
+         "middle finds a face, but the other cameras see the head behind"),
         (lambda e: [], "has no list `cameras`"),
-        (lambda e: [scaled(entry, 1000.0) for entry in e], "the face is .* m wide, but it should be about 0.15"),
+        (lambda e: [viewed(entry, lambda m: THOUSAND @ m @ np.linalg.inv(THOUSAND)) for entry in e],
+         "the face is .* m wide, but it should be about 0.15"),
     ],
-)
+)  # fmt: skip
 def test_calibration_that_does_not_fit_is_refused(rig, tmp_path, change, message):
     with pytest.raises(UserError, match=message) as found:
         capture_changed(rig, tmp_path, change, max_frames=1)
@@ -199,13 +191,16 @@ def test_camera_that_disagrees_is_reported(rig, tmp_path, capsys):
     assert "warning: camera left sees the face" in capsys.readouterr().err
 
 
+def boxes_of(point: torch.Tensor, cameras: list[Camera]) -> np.ndarray:
+    """Return boxes of 60 pixels around a point in two pictures of all cameras."""
+    middles = np.stack([camera.project(point)[0].numpy() for camera in cameras])
+    return np.concatenate([middles - 30, middles + 30], axis=-1)[None].repeat(2, axis=0)
+
+
 def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
     cameras = list(CAMERAS.values())
     true = torch.tensor([0.02, 0.03, 0.05])
-    boxes = np.full((2, 5, 4), np.nan)
-    for index, camera in enumerate(cameras):
-        middle, side = camera.project(true)[0].numpy(), 60.0
-        boxes[:, index] = np.concatenate([middle - side / 2, middle + side / 2])
+    boxes = boxes_of(true, cameras)
     boxes[0, 4] += 80  # the back camera mistakes something else
     boxes[1, :4] = np.nan
     path = find_head_path(boxes, cameras)
@@ -218,16 +213,10 @@ def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
 
 def test_cameras_that_agree_under_no_mistake_are_told_to_check_their_names():
     cameras = list(CAMERAS.values())[:4]
-    boxes = _boxes_of(torch.tensor([0.02, 0.03, 0.05]), cameras)
+    boxes = boxes_of(torch.tensor([0.02, 0.03, 0.05]), cameras)
     boxes += np.array([0, 400, -400, 900])[:, None] * np.array([0, 1, 0, 1])
     with pytest.raises(UserError, match="check first that each video or folder has the name of its own camera's id"):
         find_head_path(boxes, cameras)
-
-
-def _boxes_of(point: torch.Tensor, cameras: list[Camera], timesteps: int = 2) -> np.ndarray:
-    """Return boxes of 60 pixels around a point in the pictures of all cameras."""
-    middles = np.stack([camera.project(point)[0].numpy() for camera in cameras])
-    return np.concatenate([middles - 30, middles + 30], axis=-1)[None].repeat(timesteps, axis=0)
 
 
 def test_command_line_names_what_does_not_fit(rig, tmp_path, capsys):
@@ -246,24 +235,11 @@ def test_command_line_names_what_does_not_fit(rig, tmp_path, capsys):
     assert not (tmp_path / "out" / "sequences").exists()
 
 
-def test_calibration_reads_back(rig):
-    cameras = read_calibration(rig[1])
-    assert [camera.camera_id for camera in cameras] == list(CAMERAS)
-    half = cameras[0].for_pictures(WIDTH // 2, HEIGHT // 2)
-    assert half.width == WIDTH // 2
-    torch.testing.assert_close(half.K[:2], CAMERAS["left"].K[:2] / 2)
-
-
 def test_a_reading_is_found_in_the_pictures(rig, tmp_path):
     """Matrices from camera to world with OpenGL's axes, in the world of the left camera."""
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     world = np.linalg.inv(CAMERAS["left"].viewmat.numpy()) @ flip
-
-    def change(entries):
-        inverse = [np.linalg.inv(flip @ np.array(entry["viewmat"]) @ world).tolist() for entry in entries]
-        return [{**entry, "viewmat": viewmat} for entry, viewmat in zip(entries, inverse, strict=True)]
-
     message = "no two cameras ever .*; the matrices go from camera to world with OpenGL's"
     with pytest.raises(UserError, match=message) as error:
-        capture_changed(rig, tmp_path, change)
+        capture_changed(rig, tmp_path, lambda e: [viewed(one, lambda m: np.linalg.inv(flip @ m @ world)) for one in e])
     assert "cannot tell" not in str(error.value)

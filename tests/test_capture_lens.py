@@ -88,18 +88,9 @@ def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -
     assert abs(found_dots(given.plate[..., 2]) - DOTS).max() < 0.05
     assert abs(found_dots(given.mattes.matte(0, whole_picture(WIDTH, HEIGHT, WIDTH))) - DOTS).max() < 0.05
     assert abs(given.landmarks[0, : len(DOTS)] - DOTS).max() < 0.01
-
-
-def test_small_pictures_are_straightened_alike() -> None:
-    lens = Lens(CAMERA, tuple(BARREL))
-    whole, half = lens.straighten(dotted(filmed(DOTS))), cv2.resize(dotted(filmed(DOTS)), None, fx=0.5, fy=0.5)
-    large = cv2.resize(lens.straighten(half.astype(np.uint8)), (WIDTH, HEIGHT))
-    assert abs(found_dots(whole) - found_dots(large)).max() < 0.2
-
-
-@pytest.mark.parametrize("nothing", [None, [], [0, 0, 0, 0], [[0.0] * 5]])
-def test_a_lens_that_does_not_distort_changes_nothing(tmp_path: Path, nothing: object) -> None:
-    assert lens_of(tmp_path, nothing) is None
+    half = cv2.resize(picture, None, fx=0.5, fy=0.5)
+    large = cv2.resize(lens.straighten(half), (WIDTH, HEIGHT))
+    assert abs(found_dots(lens.straighten(picture)) - found_dots(large)).max() < 0.2, "small pictures"
 
 
 def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> None:
@@ -108,45 +99,35 @@ def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> No
         lens = lens_of(tmp_path, [[number] for number in numbers])
         assert lens is not None
         assert lens.coefficients == tuple(numbers)
+    for harmless in (
+        *({"distortion": nothing} for nothing in (None, [], [0, 0, 0, 0], [[0.0] * 5])), {"dist": [0, 0, 0, 0]},
+        {"model": "Sony A7"}, {"distance": 3}, {"distortion_model": "plumb_bob"}, {"fisheye": False},
+    ):  # fmt: skip
+        assert read_calibration(write_rig(tmp_path / "rig.json", {**ENTRY, **harmless}))[0].lens is None, harmless
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"distortion": [0.1, 0.2, 0.3]}, "distortion has 3 coefficients; give 4, 5, 8, 12 or 14 in OpenCV's order"),
-        ({"distortion": [0.1] * 6}, "distortion has 6 coefficients"),
         ({"distortion": 0.1}, "distortion has 1 coefficients"),
         ({"distortion": [0.1, float("nan"), 0, 0]}, "NaN"),
-        ({"distortion": ["a", 0, 0, 0]}, "is not a list of numbers"),
         ({"distortion": {"k1": 0.1}}, "is not a list of numbers"),
         ({"distortion": [-9.0, 0, 0, 0]}, "folds the picture over itself; check the order"),
         ({"distortion": [1e200, 0, 0, 0, 0]}, "folds the picture"),
         ({"distortion": BARREL, "K": [[300, 5, 150], [0, 310, 125], [0, 0, 1]]}, "OpenCV's model has no skew"),
-        *(
-            ({name: BARREL}, f"{name} describes a lens in a way that mien does not read; .* as a list `distortion`")
-            for name in ("dist", "dist_coeffs", "distCoeffs", "distortion_coefficients", "Distortion", "D", "kc",
-                         "radial_distortion", "coefficients", "lens_distortion")
-        ),
+        ({"distCoeffs": BARREL}, "distCoeffs describes a lens in a way that mien does not read; .* as a list `dist"),
+        ({"radial_distortion": BARREL}, "radial_distortion describes a lens"),
+        ({"D": BARREL}, "D describes a lens"),
         ({"k1": -0.2}, "k1 describes a lens"),
         ({"distortion": BARREL, "fisheye": True}, "fisheye describes a lens"),
         ({"distortion": [0.1, 0, 0, 0], "model": "OPENCV_FISHEYE"}, "model describes a lens"),
-        ({"camera_model": "kannala_brandt"}, "camera_model describes a lens"),
-        ({"distortion_model": "equidistant"}, "distortion_model describes a lens"),
     ],
-)  # fmt: skip
+)
 def test_other_descriptions_are_refused(tmp_path: Path, change: dict, message: str) -> None:
-    path = write_rig(tmp_path / "rig.json", {**ENTRY, **change})
     with pytest.raises(UserError, match=message) as error:
-        read_calibration(path)
+        read_calibration(write_rig(tmp_path / "rig.json", {**ENTRY, **change}))
     assert "\n" not in str(error.value)
-
-
-def test_other_words_are_no_distortion(tmp_path: Path) -> None:
-    for harmless in (
-        {"dist": [0, 0, 0, 0]}, {"model": "PINHOLE"}, {"model": "Sony A7"}, {"lens": "50 mm"}, {"distance": 3},
-        {"distortion_model": "plumb_bob"}, {"fisheye": False}, {"note": "x"},
-    ):  # fmt: skip
-        assert read_calibration(write_rig(tmp_path / "rig.json", {**ENTRY, **harmless}))[0].lens is None, harmless
 
 
 def test_distortion_of_all_cameras_and_of_camera_paths_is_refused(tmp_path: Path) -> None:

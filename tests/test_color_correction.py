@@ -46,9 +46,6 @@ def test_colors_follow_the_formula(terms: int) -> None:
         exchanged = matrix.copy()
         exchanged[:, [one, one + 1]] = matrix[:, [one + 1, one]]
         assert np.abs(found - expected(picture, exchanged)).max() > 2, f"terms {one} and {one + 1}"
-
-
-def test_black_white_and_greys_stay_without_a_correction() -> None:
     greys = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
     assert (ColorCorrection(np.eye(3)).apply(greys) == greys).all()
     assert ColorCorrection(-np.eye(3)).apply(greys).max() == 0
@@ -76,7 +73,6 @@ def test_pictures_and_plates_are_corrected_and_mattes_are_not(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        (np.eye(3)[:2].tolist(), "is not three rows of numbers"),
         ([[1, 0, 0], [0, 1, 0], [0, 0]], "is not three rows of numbers"),
         ([[1, 0, 0], [0, 1, 0], [0, 0, 1e30]], "is not three rows of numbers"),
         ([[], [], []], "has 0 terms for each channel"),
@@ -90,56 +86,36 @@ def test_other_matrices_are_refused(tmp_path: Path, given: object, told: str) ->
         read_calibration(rig)
 
 
-def asked_of(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Replace the capture. Return a list that gets the corrections of the cameras, by their ids, for each capture."""
+def test_the_option_leaves_colors_as_filmed(tmp_path: Path, monkeypatch, capsys) -> None:
+    """A person without the file is captured so as well. A file that cannot be used stops only those who want it."""
     asked: list[dict[str, Any]] = []
 
     def capture(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
         asked.append({each.camera_id: each.colors for each in read_calibration(calibration)})
         out.mkdir(parents=True)
 
+    def told(person: Path, out: str, *options: str, code: int = 0) -> str:
+        assert main(["import", str(person), "--out", str(tmp_path / out), *options]) == code
+        return capsys.readouterr().err
+
     monkeypatch.setattr(import_footage, "capture_cameras", capture)
-    return asked
-
-
-def test_the_option_leaves_colors_as_filmed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = asked_of(monkeypatch)
     corrections = {serial: color_charts.correction(index) for index, serial in enumerate(SERIALS)}
     person = write_nersemble(tmp_path / "017", SERIALS, colors=corrections)
-    assert main(["import", str(person), "--out", str(tmp_path / "a")]) == 0
-    told = capsys.readouterr().err
-    assert "  colour correction: by calibration/color_calibration.json; --no-color-correction leaves it out" in told
-    (found,) = asked
-    assert {serial: each.matrix.tolist() for serial, each in found.items()} == {
-        serial: matrix.tolist() for serial, matrix in corrections.items()
-    }
-    without = ["import", str(person), "--no-color-correction"]
-    assert main([*without, "--out", str(tmp_path / "b")]) == 0
-    assert "  colour correction: left out (--no-color-correction)" in capsys.readouterr().err
-    assert asked[1] == dict.fromkeys(SERIALS)
-    # A file that cannot be used is in the way of those alone who want it.
+    by_file = "  colour correction: by calibration/color_calibration.json; --no-color-correction leaves it out"
+    assert by_file in told(person, "a")
+    for serial, found in asked[0].items():
+        np.testing.assert_array_equal(found.matrix, corrections[serial])
+    assert "  colour correction: left out (--no-color-correction)" in told(person, "b", "--no-color-correction")
     file = person / "calibration/color_calibration.json"
     for content, reason in (
         ({FRONTAL: corrections[FRONTAL].tolist()}, "has no correction of the camera 222200036; copy the files"),
         ({serial: np.zeros((3, 6)).tolist() for serial in SERIALS}, "'222200036': has 6 terms for each channel"),
     ):
         file.write_text(json.dumps(content))
-        assert main(["import", str(person), "--out", str(tmp_path / "c")]) == 2
-        assert f"mien: {file}: {reason}" in capsys.readouterr().err
+        assert f"mien: {file}: {reason}" in told(person, "c", code=2)
         assert not list(tmp_path.glob("c/sequences/*/*"))
-    assert main([*without, "--out", str(tmp_path / "c")]) == 0
-
-
-def test_a_person_without_the_file_is_captured_as_filmed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = asked_of(monkeypatch)
-    person = write_nersemble(tmp_path / "017", SERIALS)
-    assert main(["import", str(person), "--out", str(tmp_path / "a"), "--dry-run"]) == 0
-    told = capsys.readouterr().err
-    assert "  missing or not used: colour correction (calibration/color_calibration.json): cameras differ" in told
-    assert "  colour correction:" not in told
-    assert main(["import", str(person), "--out", str(tmp_path / "a")]) == 0
-    assert asked == [dict.fromkeys(SERIALS)]
+    told(person, "c", "--no-color-correction")
+    without = told(write_nersemble(tmp_path / "018", SERIALS), "d")
+    assert "  missing or not used: colour correction (calibration/color_calibration.json): cameras differ" in without
+    assert "  colour correction:" not in without
+    assert asked[1:] == [dict.fromkeys(SERIALS)] * 3

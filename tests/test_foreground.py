@@ -65,11 +65,10 @@ def _everywhere(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
 
 
 def _mean(colors: np.ndarray, weights: np.ndarray, window: int) -> np.ndarray:
-    sums = [
-        cv2.boxFilter(part, cv2.CV_64F, (window, window), normalize=False, borderType=cv2.BORDER_REFLECT)
-        for part in (colors * weights[..., None].astype(np.float64), weights.astype(np.float64))
-    ]
-    return sums[0].astype(np.float32) / np.maximum(sums[1], 1).astype(np.float32)[..., None]
+    how = {"normalize": False, "borderType": cv2.BORDER_REFLECT}
+    weights = weights.astype(np.float64)
+    colors, total = (cv2.boxFilter(p, -1, (window, window), **how) for p in (colors * weights[..., None], weights))
+    return colors.astype(np.float32) / np.maximum(total, 1).astype(np.float32)[..., None]
 
 
 @pytest.mark.parametrize("size", [(60, 44), (90, 300)])
@@ -86,7 +85,15 @@ def test_estimates_at_soft_pixels_alone_are_those_of_whole_pictures(size: tuple[
     assert np.array_equal(colors, expected.reshape(-1, 3)[place])
 
 
-def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch: pytest.MonkeyPatch) -> None:
+def counted(monkeypatch) -> list[int]:
+    """Return a list that grows with each picture that training cleans."""
+    cleaned: list[int] = []
+    seam = "mien.training.footage.sequence.soft_colors"
+    monkeypatch.setattr(seam, lambda *pictures: cleaned.append(1) or soft_colors(*pictures))
+    return cleaned
+
+
+def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch) -> None:
     """The cut at the neck is no edge of the person; the scored mask only says what is shown."""
     _, sequence = toy_sequence(2, 32)
     cut = np.array(sequence.scoring)
@@ -96,13 +103,7 @@ def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch: pyt
     image, matte = (np.array(part[1, 0]) for part in (sequence.capture.images, sequence.capture.mattes))
     assert soft_pixels(matte).any()
     expected = composite(foreground_colors(image, matte), cut[1, 0], background)
-    cleaned: list[int] = []
-
-    def counted(*pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        cleaned.append(1)
-        return soft_colors(*pictures)
-
-    monkeypatch.setattr("mien.training.footage.sequence.soft_colors", counted)
+    cleaned = counted(monkeypatch)
     for keep in (True, False):
         targets = Targets(sequence, 0, cleaned=True)
         cleaned.clear()
@@ -117,15 +118,8 @@ def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch: pyt
 
 @pytest.mark.unchecked
 @pytest.mark.parametrize("edges", ["filmed", "cleaned"])
-def test_training_reads_the_setting(edges: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_reads_the_setting(edges, tmp_path: Path, monkeypatch) -> None:
     face_model, sequence = toy_sequence(6, 32)
-    asked: list[int] = []
-
-    def counted(*pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        asked.append(1)
-        return soft_colors(*pictures)
-
-    monkeypatch.setattr("mien.training.footage.sequence.soft_colors", counted)
-    settings = replace(train_toy.SETTINGS, edges=edges)  # type: ignore[arg-type]
-    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
+    asked = counted(monkeypatch)
+    train([sequence], face_model, train_toy.CONFIG, replace(train_toy.SETTINGS, edges=edges), tmp_path)
     assert bool(asked) == (edges == "cleaned")

@@ -13,9 +13,7 @@ from web_case import drawn_head
 DEGREES = np.degrees(1.0)
 
 
-@pytest.fixture
-def avatar() -> runtime.Avatar:
-    return runtime.Avatar(drawn_head(1500))
+avatar = pytest.fixture(lambda: runtime.Avatar(drawn_head(1500)))
 
 
 def aside(avatar: runtime.Avatar, degrees: float) -> runtime.Avatar:
