@@ -1,17 +1,17 @@
 """A guard around what has to be the same bits on every processor: arithmetic whose order is a library's fails in it.
 
-What it sees, in the thread that enters it:
+It sees, in the thread that enters it:
 
 - torch, by its dispatcher: matrix products (`@`, einsum and layers are lowered to them), decompositions, solvers,
   convolutions, and sums over more than `FEW` elements;
-- numpy: an `@` that is reached in a function of mien or of a test; `np.matmul`, `np.dot`, `np.inner`, `np.vdot` by
-  name; the method `dot`; everything of `np.linalg` and `np.einsum`, also when numpy
-  itself calls it (`np.polyfit`, ...); OpenCV's products and solvers.
+- numpy: an `@` that is reached in a function of mien or of a test; products by name (`np.matmul`, ...); the method
+  `dot`; everything of `np.linalg` and `np.einsum`, also when numpy itself calls it (`np.polyfit`, ...); OpenCV's
+  products and solvers.
 
-What it does not see: the inside of the native core and of OpenCV's filters; other threads; what runs when a module is
-imported; numpy's functions that were imported by name (`from numpy import dot`: ruff's style keeps them out). numpy's
-sums are allowed, since their order is that of one source for all processors, and so are functions such as `exp`, whose
-last bit may differ: tolerances allow for it.
+It does not see the inside of the native core and of OpenCV's filters, other threads, what runs when a module is
+imported, and numpy's functions that were imported by name (ruff's style keeps them out). numpy's sums are allowed,
+since their order is that of one source for all processors, and so are functions such as `exp`, whose last bit may
+differ: tolerances allow for it.
 """
 
 import dis
@@ -76,23 +76,18 @@ def exact_guard() -> Iterator[None]:
 
 
 class _TorchGuard(TorchDispatchMode):
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None) -> Any:
         name = str(func.overloadpacket.__name__)
         is_linalg = name.lstrip("_").startswith("linalg_") and name not in _ALLOWED_LINALG
         if name in _PRODUCTS or is_linalg:
             raise InexactError(f"torch's {name}: a product or decomposition in a library's order")
         out = func(*args, **(kwargs or {}))
-        if name in _SUMS and _added(args[0], out) > FEW:
-            raise InexactError(f"torch's {name} over {_added(args[0], out)} elements: a sum in a library's order")
+        if name in _SUMS:
+            result = out[0] if isinstance(out, tuple) else out
+            added = args[0].numel() // max(result.numel(), 1)
+            if added > FEW:
+                raise InexactError(f"torch's {name} over {added} elements: a sum in a library's order")
         return out
-
-
-def _added(source: Any, out: Any) -> int:
-    """Count the elements that are added into each element of the result."""
-    result = out[0] if isinstance(out, tuple) else out
-    return source.numel() // max(result.numel(), 1) if result.numel() != source.numel() else FEW
 
 
 def _refusing(name: str) -> Callable[..., Any]:

@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,8 @@ from typing import Any
 class Forked:
     """A process with its output in files, which behaves as `subprocess.Popen` where tests need it."""
 
-    def __init__(self, pid: int, folder: Path, ended: Path):
-        self.pid = pid
-        self._folder, self._ended = folder, ended
+    def __init__(self, pid: int, folder: Path):
+        self.pid, self._folder = pid, folder
 
     @property
     def stdout(self) -> str:
@@ -41,22 +40,17 @@ class Forked:
 
     def poll(self) -> int | None:
         """Return the exit code, or minus the number of the signal that ended the process; None while it runs."""
-        return int(self._ended.read_text()) if self._ended.exists() else None
+        ended = self._folder / "ended"
+        return int(ended.read_text()) if ended.exists() else None
 
     def wait(self, timeout: float = 600) -> int:
-        """Wait for the end, and return what `poll` does.
-
-        Raises:
-            TimeoutError: it has not ended after `timeout` seconds. It is killed.
-        """
-        waits = 0.0
-        while (code := self.poll()) is None:
-            if waits > timeout:
-                self.kill()
-                raise TimeoutError(f"process {self.pid} has not ended:\n{self.stdout}\n{self.stderr}")
+        """Wait for the end, and return what `poll` does. A process that runs for `timeout` seconds is killed."""
+        for _ in range(round(100 * timeout)):
+            if (code := self.poll()) is not None:
+                return code
             time.sleep(0.01)
-            waits += 0.01
-        return code
+        self.kill()
+        raise TimeoutError(f"process {self.pid} has not ended:\n{self.stdout}\n{self.stderr}")
 
     def send_signal(self, number: int) -> None:
         """Send a signal, if the process still runs."""
@@ -99,15 +93,10 @@ class ForkServer:
         path: Sequence[Path] = (),
         exits: bool = False,
     ) -> Forked:
-        """Start a process that calls a function with arguments that json can carry.
+        """Start a process that calls a function, as in "module:name", with arguments that json can carry.
 
-        Args:
-            function: Where it is, as in "module:name"; modules of tests are found.
-            arguments: Its arguments.
-            cwd: The folder of the process; that of the tests without it.
-            env: Variables that are set on top of today's.
-            path: Folders in which Python finds more modules and packages, as PYTHONPATH names them.
-            exits: Whether what the function returns is the exit code.
+        Modules of tests are found, and those in the folders of `path`. Without `cwd`, its folder is that of the tests,
+        and the variables of `env` are set on top of today's. `exits` says that what it returns is the exit code.
         """
         self._count += 1
         folder = self._folder / str(self._count)
@@ -119,7 +108,7 @@ class ForkServer:
         assert self._server.stdin is not None
         assert self._server.stdout is not None
         print(json.dumps(request), file=self._server.stdin, flush=True)
-        return Forked(int(self._server.stdout.readline()), folder, folder / "ended")
+        return Forked(int(self._server.stdout.readline()), folder)
 
 
 def run_forked(server: ForkServer, *words: object, **options: Any) -> "subprocess.CompletedProcess[str]":
@@ -176,18 +165,9 @@ def _become(request: dict[str, Any]) -> None:
         os.dup2(os.open(Path(request["folder"]) / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), number)
     sys.argv = ["mien", *map(str, request["arguments"][0])] if request["exits"] else [request["function"]]
     module, name = request["function"].split(":")
-
-    def run() -> object:
-        result = getattr(importlib.import_module(module), name)(*request["arguments"])
-        return result if request["exits"] else 0
-
-    end_after(run)
-
-
-def end_after(run: Callable[[], object]) -> None:
-    """Call a function that returns an exit code, and end this fork as Python ends a process."""
     try:
-        _end(run())
+        result = getattr(importlib.import_module(module), name)(*request["arguments"])
+        _end(result if request["exits"] else 0)
     except SystemExit as stop:
         _end(stop.code)
     except KeyboardInterrupt:

@@ -28,6 +28,7 @@ NO_NAMESPACE = "no right to make a network namespace"
 NO_ENGINE = "no engine of clusters"
 NO_TASKS_VISION = "no @mediapipe/tasks-vision in web/node_modules"
 
+_OF_NODE = (NO_VALIDATOR, NO_THREE_VRM, NO_SPLAT_TRANSFORM, NO_TASKS_VISION)
 _REMEDIES = {
     NO_ENGINE: "run `make batch-engines`; for Slurm, start one with tests/slurm_here.sh and set SLURM_CONF",
     NO_GPU: "run `make gpu` on a machine with an NVIDIA GPU and the CUDA toolkit",
@@ -38,23 +39,17 @@ _REMEDIES = {
     NO_PROC: "run them on Linux",
     NO_PACKAGE: "run `make setup`; some packages exist on some platforms only",
     NO_INSTRUCTIONS: "run them on one that has",
-    NO_NODE_PACKAGES: "run `make web-packages`",
-    NO_VALIDATOR: "run `make web-packages`",
-    NO_THREE_VRM: "run `make web-packages`",
-    NO_SPLAT_TRANSFORM: "run `make web-packages`",
-    NO_TASKS_VISION: "run `make web-packages`",
+    **dict.fromkeys((NO_NODE_PACKAGES, *_OF_NODE), "run `make web-packages`"),
     NO_NODE: "install Node.js 20 or newer with npm, then run `make web-packages`",
     NO_CHROMIUM: "run `apt-get install chromium`, or set MIEN_CHROMIUM to a Chromium's path",
     NO_WEBGPU: "install Chromium 156 or newer, whose WebGPU can run in software",
     HAS_GPU: "run them with CUDA_VISIBLE_DEVICES=",
 }
-
-
 _EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_MOUNT, NO_NAMESPACE, NO_INSTRUCTIONS, NO_ENGINE)
 """Reasons that lie in the machine alone. Others mean an incomplete set-up; MIEN_STRICT makes them an error."""
 _AREAS = {
     "pages in a browser": (NO_CHROMIUM, NO_WEBGPU),
-    "the web runtime": (NO_NODE, NO_NODE_PACKAGES, NO_VALIDATOR, NO_SPLAT_TRANSFORM, NO_THREE_VRM, NO_TASKS_VISION),
+    "the web runtime": (NO_NODE, NO_NODE_PACKAGES, *_OF_NODE),
     "real footage": (NO_TEST_DATA,),
     "GPUs": (NO_GPU,),
 }
@@ -81,7 +76,7 @@ def use_instructions(isa: str) -> None:
 
 def skipped_lines(reasons: Iterable[str]) -> list[str]:
     """Say what was not tested, then count the skipped tests by reason: one line each, with the remedy."""
-    counts = Counter(map(_reason, reasons))
+    counts = Counter(reason.removeprefix("Skipped: ") for reason in reasons)
     if not counts:
         return ["No test was skipped."]
     areas = [area for area, starts in _AREAS.items() if any(reason.startswith(starts) for reason in counts)]
@@ -95,8 +90,5 @@ def skipped_lines(reasons: Iterable[str]) -> list[str]:
 
 def unexpected(reasons: Iterable[str]) -> list[str]:
     """Return the reasons that a complete set-up does not have, sorted."""
-    return sorted({reason for reason in map(_reason, reasons) if not reason.startswith(_EVERYWHERE)})
-
-
-def _reason(told: str) -> str:
-    return told.removeprefix("Skipped: ")
+    plain = {reason.removeprefix("Skipped: ") for reason in reasons}
+    return sorted(reason for reason in plain if not reason.startswith(_EVERYWHERE))

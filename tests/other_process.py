@@ -29,7 +29,7 @@ class Holder:
 
     @contextmanager
     def holding(self, *places: Path) -> Iterator[None]:
-        self._ask(json.dumps([str(place) for place in places]), "held")
+        self._ask(json.dumps(list(map(str, places))), "held")
         try:
             yield
         finally:
@@ -37,8 +37,8 @@ class Holder:
                 self._ask("", "free")
 
     def _ask(self, line: str, answer: str) -> None:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
+        assert self.process.stdin
+        assert self.process.stdout
         print(line, file=self.process.stdin, flush=True)
         assert self.process.stdout.readline() == f"{answer}\n"
 

@@ -14,12 +14,12 @@ import re
 import sys
 import tokenize
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import FunctionType
 
 import mien
+from mien.avatar.methods import METHODS
 
 MAY_NAME = {
     "src/mien/avatar/methods.py": "the list of methods",
@@ -40,54 +40,33 @@ OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}
 """Files of a method itself."""
 
 
-@dataclass(frozen=True)
-class MethodNames:
-    """The names of a method in code."""
-
-    name: str
-    classes: tuple[str, ...]
-    """Its class of avatars, and that of its settings."""
-
-
-def method_names() -> list[MethodNames]:
-    """Return the names of mien's methods."""
-    from mien.avatar.methods import METHODS
-
-    return [
-        MethodNames(name, (method.avatar_class.split(":")[1], method.config.__name__))
-        for name, method in METHODS.items()
-    ]
-
-
-def naming_faults(texts: Mapping[str, str], methods: list[MethodNames], may_name: Mapping[str, str]) -> Iterator[str]:
-    """Yield a message for each file that names a method and may not, and for each of `may_name` that names none.
+def naming_faults(texts: Mapping[str, str]) -> Iterator[str]:
+    """Yield a message for each file that names a method and may not, and for each of `MAY_NAME` that names none.
 
     A method's name counts anywhere in a file, also in comments. Its classes count in code alone, since papers that
     docstrings cite are written like them.
     """
-    idle = set(may_name)
+    idle = set(MAY_NAME)
     for place, text in texts.items():
-        for method in methods:
-            line = _line_of(place, text, method)
-            if line is None or place.startswith(tuple(own.format(method.name) for own in OWN)):
+        for name, method in METHODS.items():
+            line = _line_of(place, text, name, (method.avatar_class.split(":")[1], method.config.__name__))
+            if line is None or place.startswith(tuple(own.format(name) for own in OWN)):
                 continue
             idle.discard(place)
-            if place not in may_name:
-                yield f"{place}:{line}: names the method {method.name}; ask what it is needed for of the avatar itself"
+            if place not in MAY_NAME:
+                yield f"{place}:{line}: names the method {name}; ask what it is needed for of the avatar itself"
     yield from (f"tests/seams.py: {place} names no method any more; take it out of MAY_NAME" for place in sorted(idle))
 
 
-def _line_of(place: str, text: str, method: MethodNames) -> int | None:
-    """The first line that names the method."""
-    found = re.search(rf"\b{method.name}\b", text)
+def _line_of(place: str, text: str, name: str, classes: tuple[str, ...]) -> int | None:
+    """The first line that names a method, or its classes in code."""
+    found = re.search(rf"\b{name}\b", text)
     if found is not None:
         return text.count("\n", 0, found.start()) + 1
-    if not place.endswith(".py") or not any(one in text for one in method.classes):
+    if not place.endswith(".py") or not any(one in text for one in classes):
         return None
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    return next(
-        (token.start[0] for token in tokens if token.type == tokenize.NAME and token.string in method.classes), None
-    )
+    return next((token.start[0] for token in tokens if token.type == tokenize.NAME and token.string in classes), None)
 
 
 _METHODS = (FunctionType, property, cached_property, classmethod, staticmethod)
@@ -153,7 +132,7 @@ def main() -> int:
     python = {str(path): path.read_text() for path in sorted(Path("src/mien").rglob("*.py"))}
     scripts = {str(path): path.read_text() for path in sorted(Path("web/src").glob("*.ts"))}
     tests = {str(path): path.read_text() for path in sorted(Path("tests").rglob("*.py"))}
-    faults = [*naming_faults(python | scripts, method_names(), MAY_NAME), *override_faults(classes_of_mien())]
+    faults = [*naming_faults(python | scripts), *override_faults(classes_of_mien())]
     faults += private_faults(tests)
     print("\n".join(faults) or f"Seams: {len(python | scripts | tests)} files checked; methods stay in their folders.")
     return bool(faults)

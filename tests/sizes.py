@@ -48,10 +48,10 @@ def cpp_faults(path: Path, text: str) -> Iterator[str]:
     for _ in range(3):  # arguments within arguments
         plain = _blanked(_TEMPLATE_ARGUMENTS, plain)
     for found in _HEAD.finditer(plain):
-        parameters = [one for one in found[2].split(",") if len(one.split()) > 1]
-        if len(parameters) > MOST_PARAMETERS and found[1] not in ("if", "for", "while", "switch"):
+        count = sum(len(one.split()) > 1 for one in found[2].split(","))
+        if count > MOST_PARAMETERS and found[1] not in ("if", "for", "while", "switch"):
             line = plain.count("\n", 0, found.start()) + 1
-            yield f"{path}:{line}: {found[1]} has {len(parameters)} parameters; at most {MOST_PARAMETERS}"
+            yield f"{path}:{line}: {found[1]} has {count} parameters; at most {MOST_PARAMETERS}"
 
 
 def _blanked(pattern: re.Pattern[str], text: str) -> str:

@@ -15,11 +15,8 @@ import numpy as np
 import pytest
 
 from forked import ForkServer
-from mien.capture.video import write_video
 from mien.cli import COMMANDS, main
 from mien.commands.help_text import readable
-from mien.commands.options import check_driver
-from mien.errors import UserError
 from mien.files import write_atomically
 
 Told = pytest.CaptureFixture[str]
@@ -78,29 +75,20 @@ PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'n
     ("arguments", "words"),
     [
         ("create a.mp4 --uot here", ("did you mean --out?",)),
-        ("render here --out a.png --sett smile=1", ("did you mean --set?",)),
         ("export --webcm here --out a.html", ("did you mean --webcam?",)),  # tyro takes the folder for its value
-        ("create a.mp4 --helpp", ("did you mean --help?",)),
         ("train here --training.step 3", ("did you mean --steps?",)),
         ("create --method headgas --step 3 --out here a.mp4", ("did you mean --steps?",)),
-        ("bench quality --captures beard --oput here", ("did you mean --out?",)),
         ("render here --out a.mp4 --siez 3", ("--siez", "did you mean --size?", "see mien render --help")),
-        ("crate", ("no sub-command 'crate'",)),
         ("create", ("--out DIR", "see mien create --help")),
         ("render DIR --out a.png --set jawOpen=1 --set=eyeBlinkLeft=1", ("--set is given twice",)),
         ("demo --out demo --out=", ("--out= is empty",)),  # as a path, the current folder (found by the fuzzer, seed 5)
         ("train here --method.appearance nonsense", ("nonsense", "features", "see mien train --help-all")),
         ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
-        ("create none.mp4 --out here --steps -3", ("--steps -3",)),
         ("create none.mp4 --out here --method nerf", ("instead of 'nerf'",)),
-        ("create a.mp4 --out here --preset fast", ("'fast'", "draft")),
-        ("export here --out", ("--out",)),
         ("track here --tracking.keyframes -1", ("--tracking.keyframes -1",)),
         ("bench nothing", ("nothing", "render, train-step, scaling, quality, compare")),
         # Choices in the order of their declaration, without None, which cannot be typed.
-        ("evaluate x --protocol nope", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'nope'; see mien",)),
         ("evaluate x --protocol None", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'None'; see mien",)),
-        ("export x --out y --sh 7", ("mien: --sh: give one of '0', '1', '2', '3' instead of '7'; see mien",)),
         ("capture x --out y --capture.turn 45", ("--capture.turn: give one of '0', '90', '180', '270' instead of",)),
     ],
 )
@@ -117,36 +105,15 @@ def test_wrong_arguments_are_told_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_video(tmp_path: Path, capsys: Told) -> None:
-    assert "none.mp4" in complaint(capsys, "create", tmp_path / "none.mp4", "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("command", ["create", "capture"])
 def test_file_that_is_no_video(tmp_path: Path, capsys: Told, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     """It is refused before anything heavy is loaded, so that nobody waits for the answer."""
     monkeypatch.setattr(f"mien.commands.{command}.Command.run", lambda command: pytest.fail("the work began"))
     (tmp_path / "letter.mp4").write_text("Dear reader")
     (tmp_path / "face.mp4").write_bytes(cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes())
-    for name, told in (("letter.mp4", "letter.mp4"), ("face.mp4", "face.mp4: is a picture; give a video")):
-        assert told in complaint(capsys, command, tmp_path / name, "--out", tmp_path / "out")
-
-
-def test_bad_driver_and_bad_colour_are_refused_before_any_work(tmp_path: Path, capsys: Told) -> None:
-    """They are refused although the workspace is empty, because they are looked at before it is."""
-    letter = tmp_path / "letter.mp4"
-    letter.write_text("Dear reader")
-    with pytest.raises(UserError, match=r"letter\.mp4: cannot be read as a video"):
-        check_driver(letter, None)
-    message = complaint(capsys, "render", tmp_path, "--sheet", "turntable", "--background", "darkblue")
-    assert "--background darkblue" in message
-
-
-def test_video_without_a_face(tmp_path: Path, capsys: Told) -> None:
-    frame = np.random.default_rng(0).integers(0, 255, (96, 96, 3), dtype=np.uint8)
-    write_video(tmp_path / "wall.mp4", [frame] * 5, 25.0)
-    message = complaint(capsys, "create", tmp_path / "wall.mp4", "--out", tmp_path / "out")
-    assert re.search(r"wall\.mp4.*face", message)
+    for name, told in (("none.mp4", ""), ("letter.mp4", ""), ("face.mp4", ": is a picture; give a video")):
+        assert f"{name}{told}" in complaint(capsys, command, tmp_path / name, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("command", ["track", "train", "evaluate", "export --out a.ply", "render --out a.mp4"])
@@ -156,18 +123,15 @@ def test_workspace_that_is_not_there(command: str, tmp_path: Path, capsys: Told)
     assert "not a mien workspace" in complaint(capsys, name, tmp_path, *out)
 
 
-def test_damaged_capture(tmp_path: Path, capsys: Told) -> None:
-    capture = tmp_path / "sequences" / "clip" / "capture"
-    capture.mkdir(parents=True)
-    (capture / "capture.json").write_text('{"format": "mien.capture", "ver')
-    assert re.search("capture.json.*run `mien capture` again", complaint(capsys, "track", tmp_path))
-
-
-def test_a_capture_that_is_gone_is_named(tmp_path: Path, capsys: Told) -> None:
-    (tmp_path / "sequences" / "me" / "tracking").mkdir(parents=True)
+def test_a_capture_that_is_damaged_or_gone_is_named(tmp_path: Path, capsys: Told) -> None:
+    me = tmp_path / "sequences" / "me"
+    (me / "tracking").mkdir(parents=True)
     told = complaint(capsys, "track", tmp_path)
     assert "the capture of me is missing" in told
     assert f"mien capture VIDEO --out {tmp_path} --name me" in told
+    (me / "capture").mkdir()
+    (me / "capture/capture.json").write_text('{"format": "mien.capture", "ver')
+    assert re.search("capture.json.*run `mien capture` again", complaint(capsys, "track", tmp_path))
 
 
 def test_a_bug_keeps_its_traceback_in_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told) -> None:

@@ -1,17 +1,22 @@
-"""What pages tell users to type, to open and to import exists; what docs/api.md names is stable (public_api.json)."""
+"""What pages name exists, docs/api.md names what is stable (public_api.json), and the site shows a living avatar."""
 
 import importlib
 import inspect
 import json
 import re
+import sys
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
+from forked import ForkServer
 from mien.avatar import METHODS
 from mien.cli import COMMANDS, main
+from mien.export import write_page
+from web_case import browse, drawn_head, served, violations
 
 ROOT = Path(__file__).parent.parent
 _OUTSIDE_DOCS = ("README.md", "CONTRIBUTING.md", "examples/README.md", "native/README.md")
@@ -70,8 +75,8 @@ def test_options_that_pages_name_exist(capsys: pytest.CaptureFixture[str]) -> No
     assert sorted((page, name) for page, name in named if name not in known) == []
 
 
-HERE = Path(__file__).parent
-STABLE: dict[str, list[str] | None] = json.loads((HERE / "public_api.json").read_text(encoding="utf-8"))
+API = PROSE[ROOT / "docs" / "api.md"]
+STABLE: dict[str, list[str] | None] = json.loads((ROOT / "tests/public_api.json").read_text(encoding="utf-8"))
 """Full name -> the parameters of a function, in their order, with "=" after those that may be left out; None for what
 is no function."""
 
@@ -79,9 +84,8 @@ is no function."""
 def parameters(value: Any) -> list[str] | None:
     if not inspect.isfunction(value):
         return None
-    optional = inspect.Parameter.empty
     found = inspect.signature(value).parameters.values()
-    return [each.name + ("" if each.default is optional else "=") for each in found]
+    return [each.name + ("" if each.default is each.empty else "=") for each in found]
 
 
 @pytest.mark.parametrize("name", STABLE)
@@ -90,30 +94,88 @@ def test_a_stable_name_is_there_and_takes_what_it_took(name: str) -> None:
     room = importlib.import_module(module)
     assert own in getattr(room, "__all__", [own]), f"{module} does not list {own} in __all__"
     before, now = STABLE[name], parameters(getattr(room, own))
-    if before is None:
-        assert now is None
+    if before is None or now is None:
+        assert before == now
         return
-    assert now is not None
-    assert now[: len(before)] == before, (
-        "a stable function changed its parameters; keep them, or release a major version"
-    )
+    told = "a stable function changed its parameters; keep them, or release a major version"
+    assert now[: len(before)] == before, told
     assert all(each.endswith("=") for each in now[len(before) :]), "a new parameter needs a default"
 
 
-def test_every_name_that_the_page_imports_is_stable() -> None:
-    page = (HERE.parent / "docs" / "api.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+def test_every_name_that_the_api_page_imports_is_stable_and_it_lists_them_all() -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```", API, re.MULTILINE | re.DOTALL)
     imports = re.findall(r"^from (mien[\w.]*) import (.+)$", "\n".join(blocks), re.MULTILINE)
     named = {f"{module}.{name.strip()}" for module, names in imports for name in names.split(",")}
     assert len(named) > 15
     assert sorted(named - set(STABLE)) == []
-
-
-def test_the_page_lists_every_stable_name() -> None:
-    page = (HERE.parent / "docs" / "api.md").read_text(encoding="utf-8")
-    table = page[page.index("## What is stable") :]
+    table = API[API.index("## What is stable") :]
     assert [name for name in STABLE if f"`{name.rpartition('.')[2]}`" not in table] == []
+    assert (ROOT / "src" / "mien" / "py.typed").is_file()
 
 
-def test_the_package_has_types() -> None:
-    assert (HERE.parent / "src" / "mien" / "py.typed").is_file()
+MOST = 1_200_000
+"""Bytes that the avatar of the first page may have."""
+FRAMES = "document.querySelectorAll('iframe.living').length"
+ALIVE = """(async () => {
+  const frame = document.querySelector("iframe.living");
+  frame.loading = "eager";
+  frame.scrollIntoView();
+  for (let i = 0; i < 300 && !frame.contentWindow?.mien; ++i) await new Promise((done) => setTimeout(done, 100));
+  const viewer = await frame.contentWindow.mien;
+  return [frame.getAttribute("src"), frame.title, viewer.avatar.expression_names.length];
+})()"""
+
+
+@pytest.fixture(scope="module")
+def builder() -> ModuleType:
+    """The program behind `make docs`."""
+    pytest.importorskip("sphinx")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "docs" / "site")
+        return importlib.import_module("build")
+
+
+def test_a_large_avatar_is_made_smaller_or_left_out(builder: ModuleType, tmp_path: Path, monkeypatch, capsys) -> None:
+    avatar, aside = tmp_path / "me.html", tmp_path / "site" / "avatar.html"
+    assert builder.small_page(avatar, aside) is None
+    assert "is made by `make demo`" in capsys.readouterr().out
+    for size, page in ((MOST, avatar), (MOST + 1, None)):
+        avatar.write_bytes(b" " * size)
+        assert builder.small_page(avatar, aside) == page
+        builder.copy_pages(tmp_path / "pages", page is not None)
+        assert ('src="avatar.html"' in (tmp_path / "pages" / "index.md").read_text()) == (page is not None)
+    assert "has more than 1,200,000 bytes" in capsys.readouterr().out
+    (tmp_path / "sequences" / "demo").mkdir(parents=True)
+    asked: list[list[str]] = []
+    for code, page in ((0, aside), (2, None)):
+        monkeypatch.setattr(builder, "mien", lambda words, code=code: asked.append(words) or code)
+        assert builder.small_page(avatar, aside) == page
+    assert asked[0][:6] == ["export", str(tmp_path), "--out", str(aside), "--largest", "1.2"]
+
+
+def build_first_page(folder: str) -> None:
+    """Build the site with nothing but titles on its other pages; `make docs` in CI builds all."""
+    sys.path.insert(0, str(ROOT / "docs" / "site"))
+    builder = importlib.import_module("build")
+    pages, out = Path(folder, "pages"), Path(folder, "site")
+    builder.copy_pages(pages, living=True)
+    for page in (*pages.rglob("*.md"), pages / "reference.md"):
+        if page != pages / "index.md":
+            page.write_text(f"---\norphan: true\n---\n# {page.stem}\n")
+    assert builder.sphinx_build(["-b", "html", "-q", "-c", str(ROOT / "docs" / "site"), str(pages), str(out)]) == 0
+    builder.mend(out)
+
+
+def test_the_first_page_is_alive_and_everybody_can_read_it(fork_server: ForkServer, tmp_path: Path) -> None:
+    """A drawn head is on it. It is built in a process of its own, whose annotations sphinx changes."""
+    pytest.importorskip("sphinx")
+    process = fork_server.call("test_docs:build_first_page", str(tmp_path))
+    assert process.wait() == 0, process.stderr
+    write_page(tmp_path / "site" / "avatar.html", drawn_head(500))
+    with served(tmp_path / "site") as address:
+        told = browse(f"{address}/index.html", [FRAMES, ALIVE], (1280, 800))
+        frames, (source, title, expressions) = told["results"]
+        assert (frames, source, title) == (1, "avatar.html", "A drawn person as a living avatar")
+        assert expressions > 40
+        for size, device in (((1280, 800), []), ((390, 844), ["dark", "touch"])):
+            assert violations(f"{address}/index.html", size, device) == []

@@ -1,62 +1,70 @@
-"""A short version of the demo runs: video, capture, tracking, training, report; then every use of the avatar."""
+"""A short demo, every use of its avatar, every command without a network, the examples and the code of docs/api.md."""
 
+import fcntl
 import json
+import re
+import runpy
 import shutil
+import socket
+import struct
+import sys
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from batch_stub import PROGRAM
 from conftest import MadeOnce
-from demo_case import DEMO, FRAMES, make_demo
+from demo_case import DEMO, FRAMES, VIDEO, leave_network, make_demo, skip_if_online
 from forked import ForkServer, run_forked
-from mien import runtime
+from fuzzing.kills import TRACK
+from mien import runtime, tracking
 from mien.avatar import DEFAULT_METHOD
 from mien.capture.video import probe_video
-from mien.cli import main
+from mien.cli import COMMANDS, main
 from mien.export import read_ply
-from web_case import chromium, violations
+from mien.face import add_face_model
+from mien.tracking import PhotometricSettings, TrackingSettings
+from toy_scene import toy_face_model
+from toy_workspace import write_toy_workspace
+from viewer_alone import page_of
+from web_case import chromium, drawn_head, violations
 
-pytestmark = pytest.mark.unchecked
+pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
 RUN = Path("runs") / DEFAULT_METHOD
 
 
 @pytest.fixture(scope="module")
-def workspace(made_once: MadeOnce, fork_server: ForkServer) -> Path:
+def demo(made_once: MadeOnce, fork_server: ForkServer) -> Path:
     return made_once("demo", partial(make_demo, fork_server))
 
 
-def test_demo_beats_both_baselines(workspace: Path) -> None:
-    metrics = json.loads((workspace / RUN / "metrics.json").read_text())
+def test_demo_beats_both_baselines_and_leaves_what_people_look_at(demo: Path) -> None:
+    metrics = json.loads((demo / RUN / "metrics.json").read_text())
     assert (metrics["format"], metrics["version"]) == ("mien.metrics", 1)
     entry = metrics["protocols"]["self_reenactment"]
-    assert entry["split"] == "blocks"
-    assert entry["frames"] == 2
+    assert (entry["split"], entry["frames"], metrics["training"]["steps"]) == ("blocks", 2, int(DEMO[-1]))
     best = max(baseline["head"]["psnr"] for baseline in entry["baselines"].values())
     assert entry["head"]["psnr"] > best + 1
-    assert metrics["training"]["steps"] == int(DEMO[-1])
-
-
-def test_demo_leaves_what_people_look_at(workspace: Path) -> None:
-    page = (workspace / RUN / "report.html").read_text(encoding="utf-8")
+    page = (demo / RUN / "report.html").read_text(encoding="utf-8")
     assert "<h1>" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
-    assert probe_video(workspace / "sequences/synthetic/tracking/overlay.mp4").frames == FRAMES
-    assert probe_video(workspace / "me.mp4").frames == 10
-    assert (workspace / "me.html").stat().st_size > 100_000
+    assert probe_video(demo / "sequences/synthetic/tracking/overlay.mp4").frames == FRAMES
+    assert probe_video(demo / "me.mp4").frames == 10
+    assert (demo / "me.html").stat().st_size > 100_000
 
 
-def test_everybody_can_read_the_reports(workspace: Path, tmp_path: Path) -> None:
+def test_everybody_can_read_the_reports(demo: Path, tmp_path: Path) -> None:
     chromium()
-    assert main(["evaluate", str(workspace), "--compare", "--out", str(tmp_path / "compare.html")]) == 0
-    tracked = workspace / "sequences/synthetic/tracking/report.html"
-    for page in (workspace / RUN / "report.html", tracked, tmp_path / "compare.html"):
+    assert main(["evaluate", str(demo), "--compare", "--out", str(tmp_path / "compare.html")]) == 0
+    tracked = demo / "sequences/synthetic/tracking/report.html"
+    for page in (demo / RUN / "report.html", tracked, tmp_path / "compare.html"):
         for size, device in (((1280, 800), []), ((390, 844), ["dark", "touch"])):
             assert violations(page, size, device) == [], (page, device)
 
 
-def test_the_same_command_finds_everything_done(workspace: Path, fork_server: ForkServer, tmp_path: Path) -> None:
-    shutil.copytree(workspace, tmp_path / "demo")
+def test_the_same_command_finds_everything_done(demo: Path, fork_server: ForkServer, tmp_path: Path) -> None:
+    shutil.copytree(demo, tmp_path / "demo")
     avatar = tmp_path / "demo" / RUN / "avatar" / "avatar.safetensors"
     before = avatar.stat().st_mtime_ns
     done = run_forked(fork_server, "demo", "--out", tmp_path / "demo", *DEMO)
@@ -66,38 +74,189 @@ def test_the_same_command_finds_everything_done(workspace: Path, fork_server: Fo
         assert work not in done.stderr
 
 
-def test_using_the_avatar(workspace: Path, tmp_path: Path) -> None:
-    avatar = str(workspace)
-    assert main(["export", avatar, "--out", str(tmp_path / "open.ply"), "--set", "jawOpen=0.6"]) == 0
-    assert len(read_ply(tmp_path / "open.ply")) > 1000
-    assert main(["render", avatar, "--out", str(tmp_path / "still.png"), "--size", "64"]) == 0
-    assert main(["render", avatar, "--out", str(tmp_path / "aside.png"), "--size", "64", "--yaw", "30"]) == 0
-    assert (tmp_path / "aside.png").read_bytes() != (tmp_path / "still.png").read_bytes()
-    assert main(["export", avatar, "--out", str(tmp_path / "me.mien")]) == 0
-    assert runtime.load(tmp_path / "me.mien").render()[1].max() > 0.5
-    series = ["--series", "synthetic", "--every", "5"]
-    assert main(["export", avatar, "--out", str(tmp_path / "talk.ply"), *series]) == 0
-    assert len(list(tmp_path.glob("talk_*.ply"))) == 3
-    clear = ["--background", "transparent", "--size", "64"]
-    assert main(["render", avatar, "--out", str(tmp_path / "f"), "--path", "sway", "--frames", "2", *clear]) == 0
-    assert len(list((tmp_path / "f").iterdir())) == 2
+def test_using_the_avatar(demo: Path, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('[{"blendshapes": {"jawOpen": 0.5}}, {"blendshapes": {}}]')
-    by = ["--by", str(tmp_path / "a.json")]
-    assert main(["drive", avatar, *by, "--out", str(tmp_path / "d.webm"), *clear]) == 0
-    assert main(["render", avatar, "--out", str(tmp_path / "turn.mp4"), "--size", "64", "--frames", "6"]) == 0
+    for line in (
+        "export {me} --out {out}/open.ply --set jawOpen=0.6",
+        "export {me} --out {out}/me.mien",
+        "export {me} --out {out}/talk.ply --series synthetic --every 5",
+        "render {me} --out {out}/still.png --size 64",
+        "render {me} --out {out}/aside.png --size 64 --yaw 30",
+        "render {me} --out {out}/f --path sway --frames 2 --background transparent --size 64",
+        "render {me} --out {out}/turn.mp4 --size 64 --frames 6",
+        "drive {me} --by {out}/a.json --out {out}/d.webm --background transparent --size 64",
+        "drive {me} --by {me} --out {out}/driven.mp4 --size 64",
+    ):
+        assert main(line.format(me=demo, out=tmp_path).split()) == 0, line
+    assert len(read_ply(tmp_path / "open.ply")) > 1000
+    assert (tmp_path / "aside.png").read_bytes() != (tmp_path / "still.png").read_bytes()
+    assert runtime.load(tmp_path / "me.mien").render()[1].max() > 0.5
+    assert (len(list(tmp_path.glob("talk_*.ply"))), len(list((tmp_path / "f").iterdir()))) == (3, 2)
     assert probe_video(tmp_path / "turn.mp4").frames == 6
-    assert main(["drive", avatar, "--by", avatar, "--out", str(tmp_path / "driven.mp4"), "--size", "64"]) == 0
     assert probe_video(tmp_path / "driven.mp4").frames == FRAMES
 
 
-def test_bad_requests_to_an_avatar(workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, part in (
-        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawopen=1"], "no expression 'jawopen'"),
-        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--set", "jawOpen=wide"], "is not a number"),
-        (["export", str(workspace), "--out", str(tmp_path / "a.ply"), "--run", "other"], "no run 'other'"),
-        (["render", str(workspace), "--out", str(tmp_path / "a.gif")], "cannot write .gif"),
-        (["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "100000"], "--size 100000"),
-    ):
-        assert main(arguments) == 2
-        assert part in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
+OF_A_VIDEO = {
+    "capture": "{video} --out {out}/captured",
+    "track": "{out}/captured " + " ".join(TRACK),
+    "align": "{out}/captured --alignment.template-steps 2 --alignment.iterations 1",
+    "create": "{video} --out {out}/captured --preset draft --steps 2 --alignment.when never " + " ".join(TRACK),
+    "batch": "{table} --out {out}/batch --program {stub}",
+}
+OF_A_RUN = {
+    "train": "{toy} --run third --steps 2 --split tail",
+    "evaluate": "{toy} --run toy",
+    "analyze": "gaussian-avatars {toy} --run toy --parts speed --seconds 0.01",
+    "study": "make {toy} --out {out}/study.html --seconds 0.2 --side 64 --runs toy third",
+    "render": "{toy} --run toy --out {out}/still.png",
+    "drive": "{toy} --run toy --by {toy} --out {out}/driven.mp4",
+    "export": "{demo} --out {out}/me.html",
+    "import": "{exported} --out {out}/imported",
+    "face-models": "--json",
+    "bench": "render --seconds 0.01 --json",
+    "licenses": "--json",
+    "plugins": "--json",
+}
+"""Lines of every command but two: `demo` makes the subject, and `view` has a test of its own."""
+_FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
+
+
+@pytest.fixture(scope="module")
+def offline(demo: Path) -> Path:
+    """The demo, if it was made without a network."""
+    skip_if_online(demo)
+    return demo
+
+
+def run_all(server: ForkServer, lines: dict[str, str], **given: object) -> None:
+    words = [[command, *(word.format(**given) for word in line.split())] for command, line in lines.items()]
+    done = server.call("demo_case:run_offline", words)
+    assert done.wait() == 0, done.stderr
+    told = [line for line in done.stdout.splitlines() if line.startswith("CODE")]
+    assert told == [f"CODE {name} 0" for name in lines], done.stderr
+
+
+def test_no_command_needs_a_network(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
+    assert {*OF_A_VIDEO, *OF_A_RUN, "demo", "view"} == set(COMMANDS)
+    video = offline / VIDEO
+    (tmp_path / "table.csv").write_text(f"video\n{video}\n")
+    table, stub = tmp_path / "table.csv", " ".join(PROGRAM)
+    run_all(fork_server, OF_A_VIDEO, video=video, out=tmp_path, table=table, stub=stub)
+
+
+def test_no_command_needs_a_network_once_there_is_a_run(
+    offline: Path, fork_server: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy, exported = tmp_path / "toy", tmp_path / "exported"
+    write_toy_workspace(toy, timesteps=20)
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
+    add_face_model(toy_face_model(), tmp_path / "toy.npz", "none")
+    lines = {"export": "{toy} --out {exported} --format gaussian-avatars"}
+    run_all(fork_server, lines, toy=toy, exported=exported)
+    run_all(fork_server, OF_A_RUN, demo=offline, toy=toy, exported=exported, out=tmp_path)
+
+
+def test_a_capture_by_litert_is_made_without_a_network(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
+    pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
+    line = "{video} --out {out} --capture.detector litert --capture.max-frames 2"
+    run_all(fork_server, {"capture": line}, video=offline / VIDEO, out=tmp_path)
+
+
+def test_the_viewer_needs_no_network_but_the_loopback(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
+    runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
+    viewer = fork_server.call("test_end_to_end:view_alone", str(tmp_path / "me.mien"))
+    assert viewer.wait() == 0, viewer.stderr
+    assert "<html" in viewer.stdout
+
+
+def view_alone(avatar: str) -> None:
+    """Raise the loopback of a new network namespace, show an avatar, and print the viewer's page."""
+    assert leave_network()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        asked = struct.pack("16sH14x", b"lo", 0)
+        _, flags = struct.unpack("16sH14x", fcntl.ioctl(any_socket, _FLAGS, asked))
+        fcntl.ioctl(any_socket, _SET_FLAGS, struct.pack("16sH14x", b"lo", flags | _UP))
+    print(page_of([sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]))
+
+
+ROOT = Path(__file__).parents[1]
+SUBJECT = "out/examples/subject"
+
+
+def run_script(name: str, folder: Path, *arguments: str) -> None:
+    """Run a script as Python does, in a folder."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(folder)
+        patched.setattr(sys, "argv", [name, *arguments])
+        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("examples")
+    run_script("03_synthetic_capture.py", folder, "--out", SUBJECT, "--seconds", "0.24", "--size", "64")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path) -> Path:
+    run_script("05_train_and_evaluate.py", folder, SUBJECT, "--steps", "20", "--gaussians", "9000")
+    return folder
+
+
+@pytest.fixture
+def short_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `mien.tracking.track` take few keyframes and steps where it is given no settings."""
+    pixels = PhotometricSettings(keyframes=4, sizes=(64, 64), texture_size=128, shared_steps=1)
+    few = TrackingSettings(keyframes=4, photometric=pixels)
+    monkeypatch.setattr(tracking, "track", partial(tracking.track, settings=few))
+
+
+def test_gaussians_are_fitted_and_a_face_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_script("01_fit_gaussians.py", tmp_path, "--out", "fit.png", "--steps", "60")
+    errors = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if line.startswith("step")]
+    assert errors[-1] < 0.3 * errors[0]
+    assert (tmp_path / "fit.png").is_file()
+    run_script("02_face_model.py", tmp_path, "--out", "face.png", "--size", "64")
+    assert "jawOpen" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("short_tracking")
+def test_capture_and_track(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # A drawn head with lines over it is still a face.
+    overlay = f"{SUBJECT}/sequences/synthetic/tracking/overlay.mp4"
+    run_script("04_capture_and_track.py", folder, overlay, "--out", "out/examples/me", "--max-frames", "6")
+    assert "landmark residual" in capsys.readouterr().out
+    assert (folder / "out/examples/me/sequences/overlay/tracking/overlay.mp4").is_file()
+
+
+def test_training_by_the_example_and_by_the_command_gives_the_same_bytes(trained: Path) -> None:
+    runs = trained / SUBJECT / "runs"
+    metrics = json.loads((runs / "example/metrics.json").read_text())
+    assert metrics["protocols"]["self_reenactment"]["head"]["psnr"] > 0
+    options = ("--run", "by_command", "--steps", "20", "--method.density.max-gaussians", "9000")
+    assert main(["train", str(trained / SUBJECT), *options]) == 0
+    for name in ("avatar/avatar.safetensors", "avatar/avatar.json", "face_track.safetensors"):
+        assert (runs / "example" / name).read_bytes() == (runs / "by_command" / name).read_bytes(), name
+    one, other = (json.loads((runs / name / "config.json").read_text()) for name in ("example", "by_command"))
+    assert all(one[part] == other[part] for part in ("method", "settings", "data"))
+
+
+def test_the_avatar_is_drawn_driven_and_run_without_torch(trained: Path) -> None:
+    run_script("06_render_expressions.py", trained, SUBJECT, "--run", "example", "--out", "e.png", "--size", "48")
+    run_script("07_drive.py", trained, SUBJECT, "--by", SUBJECT, "--run", "example", "--out", "driven.mp4")
+    for name in ("e.png", "driven.mp4"):
+        assert (trained / name).stat().st_size > 1000
+    assert main(["export", str(trained / SUBJECT), "--run", "example", "--out", str(trained / "avatar.mien")]) == 0
+    run_script("08_runtime.py", trained, "avatar.mien", "--out", "frames", "--frames", "3", "--size", "48")
+    assert len(list((trained / "frames").glob("*.png"))) == 3
+
+
+@pytest.mark.usefixtures("short_tracking")
+def test_api_page(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) == 10
+    monkeypatch.chdir(folder)
+    exec("\n".join(blocks), {"__name__": "__main__"})
+    assert "Gaussians" in capsys.readouterr().out

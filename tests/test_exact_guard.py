@@ -13,7 +13,6 @@ from mien.avatar import DEFAULT_METHOD
 from mien.files import file_digest, write_json
 from mien.gaussians import Gaussians
 from mien.lab.synthetic import RECIPES, SyntheticScene
-from mien.lab.synthetic.light import Visibility
 from mien.render import rasterize
 from mien.training import trainer
 from mien.training.footage.frames import FrameOrder, background_at, training_frames
@@ -30,55 +29,33 @@ PLAIN = replace(
 )  # fmt: skip
 T, A = torch.ones(5, 5), np.ones((5, 5))
 LEARNT = torch.ones(5, 5, requires_grad=True)
-
-
-@pytest.mark.parametrize(
-    "inexact",
-    [
-        lambda: torch.mm(T, T), lambda: torch.einsum("ij,jk->ik", T, T), lambda: T[None].bmm(T[None]),
-        lambda: T.mv(T[0]), lambda: T[0].dot(T[0]), lambda: torch.nn.functional.linear(T, T),
-        lambda: torch.linalg.svd(T),
-        lambda: torch.linalg.eigh(T), lambda: torch.linalg.solve(T + torch.eye(5), T), lambda: torch.linalg.qr(T),
-        lambda: T.sum(), lambda: T.mean(0), lambda: T.norm(), lambda: T.softmax(-1), lambda: torch.cdist(T, T),
-        lambda: torch.conv2d(T[None, None], T[None, None, :2, :2]), lambda: LEARNT.matmul(T),
-        lambda: np.matmul(A, A), lambda: np.dot(A, A), lambda: A.dot(A), lambda: np.einsum("ij,jk->ik", A, A),
-        lambda: np.linalg.norm(A[0]), lambda: np.linalg.svd(A), lambda: np.linalg.lstsq(A, A, rcond=None),
-        lambda: np.tensordot(A, A), lambda: np.polyfit(np.arange(5), A[0], 1), lambda: np.convolve(A[0], A[0]),
-        lambda: np.inner(A, A), lambda: A @ A, lambda: T @ T, lambda: cv2.gemm(A, A, 1.0, A, 0.0),
-    ],
+INEXACT = (
+    lambda: torch.mm(T, T), lambda: torch.einsum("ij,jk->ik", T, T), lambda: T[0].dot(T[0]), lambda: LEARNT.matmul(T),
+    lambda: torch.nn.functional.linear(T, T), lambda: torch.linalg.svd(T), lambda: torch.linalg.solve(T + 9, T),
+    lambda: T.sum(), lambda: T.mean(0), lambda: T.norm(), lambda: T.softmax(-1), lambda: torch.cdist(T, T),
+    lambda: torch.conv2d(T[None, None], T[None, None, :2, :2]), lambda: A @ A, lambda: T @ T,
+    lambda: np.matmul(A, A), lambda: np.dot(A, A), lambda: A.dot(A), lambda: np.einsum("ij,jk->ik", A, A),
+    lambda: np.linalg.norm(A[0]), lambda: np.linalg.lstsq(A, A, rcond=None), lambda: np.tensordot(A, A),
+    lambda: np.polyfit(np.arange(5), A[0], 1), lambda: np.convolve(A[0], A[0]), lambda: cv2.gemm(A, A, 1.0, A, 0.0),
 )  # fmt: skip
-def test_the_guard_refuses(inexact):
-    inexact()
-    with pytest.raises(InexactError), exact_guard():
-        inexact()
 
 
-def test_the_guard_lets_pass_what_has_one_order():
+def test_the_guard_refuses_what_has_several_orders_and_lets_pass_what_has_one():
+    for inexact in INEXACT:
+        with pytest.raises(InexactError), exact_guard():
+            inexact()
+        inexact()  # all is as before
     with exact_guard():
         assert torch.equal(T * 2 + T, 3 * T)
         assert float((T[:, :3] * T[:, :3]).sum(-1)[0]) == 3
         assert exact.product(A, A)[0, 0] == 5
         assert A.sum() == 25
-    assert np.matmul(A, A)[0, 0] == 5  # all is as before
-    assert float(torch.mm(T, T)[0, 0]) == 5
 
 
-def test_drawing_has_no_product_of_a_library(monkeypatch):
+def test_drawing_has_no_product_of_a_library():
     scene = SyntheticScene(PLAIN, 3)
     with exact_guard():
         scene.frame(1)
-    light = Visibility.shadow
-
-    def by_numpy(self: Visibility, lighting, R):
-        return light(self, lighting, R @ np.eye(3, dtype=np.float32))
-
-    def by_torch(self: Visibility, lighting, R):
-        return light(self, lighting, torch.mm(torch.from_numpy(R), torch.eye(3)).numpy())
-
-    for worse in (by_numpy, by_torch):
-        monkeypatch.setattr(Visibility, "shadow", worse)
-        with pytest.raises(InexactError), exact_guard():
-            scene.frame(1)
 
 
 def test_native_rasterizer_adds_up_by_itself():
@@ -95,10 +72,7 @@ def test_native_rasterizer_adds_up_by_itself():
 
 
 def test_a_step_of_training_adds_up_by_itself():
-    """A training step of an avatar uses no inexact sum, from the pose to the optimiser.
-
-    The first step fills the caches.
-    """
+    """From the pose to the optimiser. The first step fills the caches."""
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     settings = plain_run(steps=100, split="none", background="random", record_every=100)
     state = trainer.start([sequence], face_model, plain_config(DEFAULT_METHOD), settings, torch.zeros(()))

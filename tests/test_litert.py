@@ -5,7 +5,6 @@ import io
 import itertools
 import re
 import zipfile
-from dataclasses import replace
 from importlib import resources
 from importlib.util import find_spec
 
@@ -28,7 +27,6 @@ from mien.picture_files import write_png
 from mien.tracking.landmarks import read_response
 
 pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
-_CORNERS = (33, 263)
 
 
 @pytest.fixture(scope="module")
@@ -39,16 +37,18 @@ def drawn() -> np.ndarray:
 
 def apart(one: np.ndarray, other: np.ndarray) -> float:
     """Return the mean distance of landmarks, in distances between the eyes' outer corners."""
-    eyes = np.linalg.norm(one[_CORNERS[0]] - one[_CORNERS[1]])
+    eyes = np.linalg.norm(one[33] - one[263])
     return float(np.linalg.norm(one - other, axis=-1).mean() / eyes)
 
 
-def test_landmarks_are_those_of_mediapipe_on_a_drawn_face(drawn):
+def test_landmarks_and_mattes_are_those_of_mediapipe_on_a_drawn_face(drawn):
     with LandmarkDetector(False, "mediapipe") as own, LandmarkDetector(False, "litert") as other:
         assert apart(own.detect(drawn)[0], other.detect(drawn)[0]) < 0.03
     with MeshReader(1, False, "mediapipe") as own, MeshReader(1, False, "litert") as other:
         deep, also = own.read(drawn)[0, :, 2], other.read(drawn)[0, :, 2]
     assert np.corrcoef(deep, also)[0, 1] > 0.98
+    with Segmenter("mediapipe") as own, Segmenter("litert") as other:
+        assert np.abs(own.segment(drawn) - other.segment(drawn)).mean() < 0.01
 
 
 @pytest.mark.parametrize("clip", ["d3", "d6", "d9", "d14", "d18", "s18", "wojtek"])
@@ -89,32 +89,21 @@ def test_landmarks_turn_with_the_picture(drawn):
     assert apart(one[0], np.column_stack([256 - two[0, :, 1], two[0, :, 0]])) < 0.02
 
 
-def test_mattes_are_those_of_mediapipe(drawn):
-    with Segmenter("mediapipe") as own, Segmenter("litert") as other:
-        assert np.abs(own.segment(drawn) - other.segment(drawn)).mean() < 0.01
-
-
-def test_litert_serves_where_mediapipe_is_missing(monkeypatch):
-    assert backend.choose_detector() == "mediapipe"
-    missing = {"mediapipe"}
-    monkeypatch.setattr(backend, "find_spec", lambda name: None if name in missing else find_spec(name))
-    assert backend.choose_detector() == "litert"
-    with pytest.raises(ModuleNotFoundError, match="mediapipe"):
-        backend.choose_detector("mediapipe")
-
-
-def test_a_capture_by_litert_is_another_capture(drawn, tmp_path):
+def test_litert_serves_where_mediapipe_is_missing_and_its_captures_are_others(drawn, tmp_path, monkeypatch):
     """Keys of captures by mediapipe are those from before the setting; by litert they differ."""
-    (tmp_path / "clip").mkdir()
-    write_png(tmp_path / "clip" / "0.png", drawn)
+    write_png(tmp_path / "0.png", drawn)
     jobs = {
-        choice: open_job(tmp_path / "clip", replace(CaptureSettings(), detector=choice), None, False)
+        choice: open_job(tmp_path, CaptureSettings(detector=choice), None, False)
         for choice in ("auto", "mediapipe", "litert")
     }
     assert jobs["auto"].key == jobs["mediapipe"].key != jobs["litert"].key
-    assert [backend.detector_of(backend.detector_entry(job.detector)) for job in jobs.values()] == [
-        "mediapipe", "mediapipe", "litert",
-    ]  # fmt: skip
+    entries = [backend.detector_of(backend.detector_entry(job.detector)) for job in jobs.values()]
+    assert entries == ["mediapipe", "mediapipe", "litert"]
+    assert backend.choose_detector() == "mediapipe"
+    monkeypatch.setattr(backend, "find_spec", lambda name: None if name == "mediapipe" else find_spec(name))
+    assert backend.choose_detector() == "litert"
+    with pytest.raises(ModuleNotFoundError, match="mediapipe"):
+        backend.choose_detector("mediapipe")
 
 
 def test_networks_are_the_published_ones():

@@ -1,9 +1,11 @@
-"""A lock is held by one process at a time, names its holder to others, and leaves nothing behind."""
+"""A lock is held by one process at a time and names it; readers beside writers see the old or the new files."""
 
+import ctypes
 import errno
 import fcntl
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -11,15 +13,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from capture_helpers import assert_same_capture, random_capture
 from mien import locks
+from mien.capture import read_capture, write_capture
 from mien.errors import CannotWriteError, UserError
-from mien.locks import BeingWrittenError, check_free, hold, holder_of, lock_file, read_holder
+from mien.files import replace_folder
+from mien.locks import BeingWrittenError, check_free, hold, holder_of, lock_file, read_beside_writers, read_holder
+from mien.tracking import read_tracking, write_tracking
 from other_process import Holder
+from toy_scene import toy_face_model, toy_tracking
 
 
 def test_one_holds_and_the_other_is_told(other: Holder, tmp_path: Path) -> None:
@@ -32,6 +41,11 @@ def test_one_holds_and_the_other_is_told(other: Holder, tmp_path: Path) -> None:
         assert part in words
     with hold(place), pytest.raises(BeingWrittenError, match=f"process {os.getpid()} on"), hold(place):
         pass
+    free = place.with_name("a")
+    with other.holding(place), pytest.raises(BeingWrittenError, match="r: is being written"), hold(place, free):
+        pass
+    with hold(free):
+        assert holder_of(place) is None, "several places are held all or none"
 
 
 def test_nothing_stays_of_a_lock(tmp_path: Path) -> None:
@@ -47,14 +61,6 @@ def test_nothing_stays_of_a_lock(tmp_path: Path) -> None:
     one, other = (tmp_path / ("n" * 250 + end) for end in "12")
     with hold(one), hold(other):
         assert lock_file(one) != lock_file(other), "long names have locks of their own"
-
-
-def test_several_places_are_held_all_or_none(other: Holder, tmp_path: Path) -> None:
-    with other.holding(tmp_path / "b"):
-        with pytest.raises(BeingWrittenError, match="b: is being written"), hold(tmp_path / "b", tmp_path / "a"):
-            pass
-        with hold(tmp_path / "a"):
-            pass
 
 
 def test_the_lock_of_a_killed_process_is_free_at_once(mortal: Holder, tmp_path: Path, monkeypatch) -> None:
@@ -200,7 +206,7 @@ def test_a_lock_whose_file_was_removed_is_not_taken_for_the_new_one(tmp_path: Pa
     """Threads that lock in turns never hold it together."""
     inside, most = [0], [0]
 
-    def visit() -> None:
+    def visit(_: int) -> None:
         visits = 0
         while visits < 60:
             try:
@@ -213,10 +219,118 @@ def test_a_lock_whose_file_was_removed_is_not_taken_for_the_new_one(tmp_path: Pa
             except BeingWrittenError:
                 time.sleep(0.001)
 
-    threads = [threading.Thread(target=visit) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(visit, range(4)))
     assert most[0] == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_of_damage_asks_who_writes(other: Holder, tmp_path: Path) -> None:
+    calls: list[int] = []
+
+    def damaged() -> None:
+        calls.append(len(calls))
+        raise UserError("damaged; make it again")
+
+    def read() -> None:
+        read_beside_writers(damaged, [tmp_path], [tmp_path / "r"])
+
+    with pytest.raises(UserError, match="^damaged; make it again$"):
+        read()
+    assert len(calls) == 1, "nobody writes, so it is not read again"
+    with hold(tmp_path / "r"), pytest.raises(UserError, match="^damaged"):  # this very command
+        read()
+    with other.holding(tmp_path / "r"):
+        with pytest.raises(BeingWrittenError, match=rf"process {other.pid} .*; try again when it is done$"):
+            read()
+        assert len(calls) == 2 + 5, "readers look again a few times, and do not wait"
+
+
+def test_a_reader_reads_again_what_was_replaced_meanwhile(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    file.write_text("0")
+
+    def read() -> str:
+        before = file.read_text()
+        if before == "0":
+            file.with_name("b").write_text("1")
+            file.with_name("b").replace(file)  # as a writer would
+            raise UserError("does not fit")
+        return before
+
+    assert read_beside_writers(read, [tmp_path], [tmp_path / "r"]) == "1"
+
+
+def test_a_tracking_that_is_half_replaced(other: Holder, tmp_path: Path) -> None:
+    folder, new = tmp_path / "sequences" / "clip" / "tracking", tmp_path / "new"
+    for place, timesteps in ((folder, 4), (new, 5)):
+        write_tracking(place, toy_tracking(toy_face_model(), timesteps, 32))
+    with other.holding(folder.parent):
+        assert len(read_tracking(folder).valid) == 4
+        shutil.copy(new / "tracking.safetensors", folder)
+        with pytest.raises(BeingWrittenError, match=f"clip: is being written .*process {other.pid}"):
+            read_tracking(folder)
+        shutil.copy(new / "tracking.json", folder)
+        assert len(read_tracking(folder).valid) == 5
+
+
+def test_readers_beside_writers_see_the_old_or_the_new(tmp_path: Path) -> None:
+    path, captures = tmp_path / "capture", [random_capture(timesteps=2 + index, seed=index) for index in range(2)]
+    write_capture(path, captures[0])
+    stop, was_read, written, seen = threading.Event(), threading.Event(), [1], set()
+
+    def rewrite() -> None:
+        while not stop.is_set():
+            write_capture(path, captures[len(written) % 2])
+            written.append(1)
+            was_read.wait()  # so that no reader meets writers five times in a row, however slow it is
+            was_read.clear()
+
+    with ThreadPoolExecutor(1) as pool:
+        writer = pool.submit(rewrite)
+        try:
+            while len(written) < 30 and not writer.done():
+                found = read_capture(path)
+                was_read.set()
+                seen.add(found.timesteps)
+                assert_same_capture(found, captures[found.timesteps - 2])
+        finally:
+            stop.set()
+            was_read.set()
+    writer.result()
+    assert seen == {2, 3}
+
+
+def test_replaced_folders_are_never_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def folder(name: str, content: str) -> Path:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_text(content)
+        return tmp_path / name
+
+    place = folder("place", "0")
+    seen: list[bool] = []
+    original = Path.rename
+    monkeypatch.setattr(Path, "rename", lambda self, to: (seen.append(place.exists()), original(self, to))[1])
+    replace_folder(place, folder("new", "1"))
+    assert ((place / "file").read_text(), seen) == ("1", []), "exchanged, not renamed"
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: object())  # a system that cannot exchange two names
+    replace_folder(place, folder("new", "2"))
+    assert (place / "file").read_text() == "2"
+    replace_folder(tmp_path / "other", folder("new", "3"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "place"]
+
+
+def test_a_cache_that_another_reader_makes_is_made_elsewhere(other: Holder, tmp_path: Path) -> None:
+    path, capture = tmp_path / "capture", random_capture()
+    write_capture(path, capture)
+    (path / "cache" / "stamp.json").unlink()
+    (path / "cache" / ".making-left").mkdir()  # by a process that was killed
+    mapped = np.memmap(path / "cache" / "frames.u8", np.uint8, "r")
+    before = mapped.copy()
+    with other.holding(path / "cache" / "frames.u8"):
+        assert_same_capture(read_capture(path), capture)
+        assert not (path / "cache" / "stamp.json").exists()
+    (path / "cache" / "frames.u8").write_bytes(b"\0" * len(before))  # damaged, and mapped by a reader
+    assert_same_capture(read_capture(path), capture)
+    assert (mapped == 0).all(), "the file under a reader's map stays as it was"
+    assert sorted(entry.name for entry in (path / "cache").iterdir()) == ["frames.u8", "mattes.u8", "stamp.json"]

@@ -1,7 +1,6 @@
 """Long clips take bounded memory: each test fails if all of a sequence's pictures are held at once."""
 
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from bounded_memory import MIB, allocating_at_most
 from capture_helpers import random_capture
 from mien import picture_files
 from mien.capture import read_capture, write_capture
-from mien.picture_files import PictureStack, map_pictures
+from mien.picture_files import map_pictures
 from mien.tracking import make_scoring, read_scoring, track, write_scoring
 from mien.tracking.fitting import solver
 from mien.tracking.landmarks import LandmarkModel, stages, term
@@ -23,10 +22,9 @@ from tracking_case import capture_of, make_tracking_case
 
 
 @pytest.fixture
-def tiny_limit(monkeypatch: pytest.MonkeyPatch) -> int:
+def _tiny_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Limit the memory of mapped pictures to a mebibyte."""
     monkeypatch.setattr(picture_files, "MAX_KEPT_BYTES", MIB)
-    return MIB
 
 
 def mapped_bytes() -> int:
@@ -38,36 +36,37 @@ def mapped_bytes() -> int:
     return int(line.split()[1]) << 10
 
 
-def largest_share(pictures: np.ndarray, read: Callable[[np.ndarray], object]) -> int:
+def largest_share(pictures: np.ndarray) -> int:
     """Return the growth of the mapped pages while every picture is read."""
-    before = mapped_bytes()
-    most = 0
+    before, most = mapped_bytes(), 0
     for index in np.ndindex(pictures.shape[:2]):
-        read(pictures[index])
+        pictures[index].sum()
         most = max(most, mapped_bytes() - before)
     return most
 
 
-def test_a_map_gives_its_pages_back(tmp_path: Path, tiny_limit: int) -> None:
-    file = tmp_path / "pictures.u8"
-    shape = (64, 1, 512, 512)
+@pytest.mark.usefixtures("_tiny_limit")
+def test_a_map_gives_its_pages_back(tmp_path: Path) -> None:
+    file, shape = tmp_path / "pictures.u8", (64, 1, 512, 512)
     file.write_bytes(bytes(range(256)) * (64 << 10))
-    pictures = map_pictures(file, shape)
-    assert largest_share(pictures, np.sum) < 6 * MIB
-    assert largest_share(np.memmap(file, np.uint8, "r", shape=shape), np.sum) > 12 * MIB, "the test sees what is held"
-    np.testing.assert_array_equal(pictures, np.memmap(file, np.uint8, "r", shape=shape))
-    assert largest_share(pictures[:, 0][:, None], np.sum) < 6 * MIB, "views count, too"
+    pictures, held = map_pictures(file, shape), np.memmap(file, np.uint8, "r", shape=shape)
+    assert largest_share(pictures) < 6 * MIB
+    assert largest_share(held) > 12 * MIB, "the test sees what is held"
+    np.testing.assert_array_equal(pictures, held)
+    assert largest_share(pictures[:, 0][:, None]) < 6 * MIB, "views count, too"
 
 
-def test_captures_are_looked_at_without_being_held(tmp_path: Path, tiny_limit: int) -> None:
+@pytest.mark.usefixtures("_tiny_limit")
+def test_captures_are_looked_at_without_being_held(tmp_path: Path) -> None:
     write_capture(tmp_path / "capture", random_capture(timesteps=40, height=256, width=300))
-    capture = read_capture(tmp_path / "capture")
-    assert capture.images.nbytes > 16 * MIB
-    assert largest_share(capture.images, np.sum) < 6 * MIB
+    images = read_capture(tmp_path / "capture").images
+    assert images.nbytes > 16 * MIB
+    assert largest_share(images) < 6 * MIB
 
 
+@pytest.mark.usefixtures("_tiny_limit")
 @pytest.mark.unchecked
-def test_scoring_is_made_written_and_read_without_being_held(tmp_path: Path, tiny_limit: int) -> None:
+def test_scoring_is_made_written_and_read_without_being_held(tmp_path: Path) -> None:
     model, face = _upright(64)
     short, long = (capture_of(torch.full((timesteps, 478, 2), 100.0)) for timesteps in (2, 64))
     expected = make_scoring(short, _tracking(model, face[:2]), model)
@@ -79,26 +78,10 @@ def test_scoring_is_made_written_and_read_without_being_held(tmp_path: Path, tin
         read = read_scoring(tmp_path / "scoring", "of this capture")
     assert read.masks.nbytes == 16 * MIB
     assert mapped_bytes() - before < 6 * MIB
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scoring", "short"], (
-        "files for the time being have no name"
-    )
+    left = sorted(entry.name for entry in tmp_path.iterdir())
+    assert left == ["scoring", "short"], "files for the time being have no name"
     np.testing.assert_array_equal(read.masks, made.masks)
     np.testing.assert_array_equal(read.masks[7], expected.masks[1])
-
-
-def test_few_pictures_stay_in_memory_and_many_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pictures = np.random.default_rng(0).integers(0, 256, (3, 2, 20, 31), dtype=np.uint8)
-    arrays = []
-    for kept in (1 << 20, 100):
-        monkeypatch.setattr(picture_files, "MAX_KEPT_BYTES", kept)
-        stack = PictureStack(pictures.shape, tmp_path)
-        for timestep, camera in ((2, 1), (0, 0), (1, 1), (0, 1), (1, 0), (2, 0)):
-            stack.write(timestep, camera, pictures[timestep, camera])
-        arrays.append(stack.array())
-    assert [isinstance(array, np.memmap) for array in arrays] == [False, True]
-    for array in arrays:
-        np.testing.assert_array_equal(array, pictures)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.unchecked
@@ -139,11 +122,9 @@ def test_the_chain_holds_the_factors_of_one_segment(monkeypatch: pytest.MonkeyPa
         return factor
 
     monkeypatch.setattr(torch.linalg, "cholesky", watched)
-    random = torch.Generator().manual_seed(0)
-    blocks, size = 19, 3
-    root = torch.randn(blocks, size, size, generator=random, dtype=torch.float64)
+    random, blocks, size = torch.Generator().manual_seed(0), 19, 3
+    root, upper = torch.randn(2, blocks, size, size, generator=random, dtype=torch.float64)
     own = root @ root.mT + 5 * torch.eye(size, dtype=torch.float64)
-    upper = torch.randn(blocks, size, size, generator=random, dtype=torch.float64)
     right = torch.randn(blocks, size, generator=random, dtype=torch.float64)
     dense = torch.block_diag(*own)
     for index in range(blocks - 1):

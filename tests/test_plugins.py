@@ -1,91 +1,298 @@
-"""A package of a stranger adds a method, a format and a dataset, each by its recipe in CONTRIBUTING.md."""
+"""A package of a stranger adds a method, a format, a dataset and an engine by the recipes in CONTRIBUTING.md."""
 
+import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from random import Random
+from subprocess import CompletedProcess
 
+import numpy as np
 import pytest
+import torch
 
+from batch_stub import PROGRAM
 from forked import ForkServer
+from fuzzing import uses
 from mien.avatar import METHODS, has_method, method_named, method_names, method_of
 from mien.avatar.methods import Method
+from mien.batch import Batch
+from mien.capture import read_capture_hash
 from mien.cli import main
+from mien.datasets import Dataset, TrackedSequence, datasets, write_sequence
 from mien.errors import UserError
-from test_new_dataset import cache, puppet, write
+from mien.face import Landmarks, add_face_model
+from mien.formats import Format, formats
+from mien.plugins import plugins
+from mien.tracking import scoring_exists
+from mien.training import read_sequence
+from shared_things import toy_workspace
 from toy_package import blocks, entry_points, help_of, install, mien
-from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
+from toy_scene import toy_face_model, toy_sequence
 
-__all__ = ["cache"]
-RECIPES = ("Add a method", "Add a format", "Add a dataset")
+RECIPES = ("Add a method", "Add a format", "Add a dataset", "Add an engine")
+WORDS = ("mesh_points", "xyz", "puppet", "in_turn")
 
-
-def install_toys(folder: Path) -> None:
-    """Install `mien_toys`: what the three recipes make, in one module, under names that mien may not have."""
-    method = blocks(RECIPES[0], "python")[:-1]
-    (ending,) = re.findall(r"`(METHOD = [^`]*)`", " ".join(Path("CONTRIBUTING.md").read_text("utf-8").split()))
-    code = [
-        *method,
-        f"from mien.avatar import Method\n{ending}\n",
-        *(blocks(each, "python")[0] for each in RECIPES[1:]),
-    ]
-    points = re.sub(r"= mien_\w+:", "= mien_toys:", "".join(entry_points(each) for each in RECIPES))
-    for word in ("mesh_points", "xyz", "puppet"):
-        points = points.replace(f"{word} =", f"{word}9 =")
-    text = "\n".join(code).replace("mien_mesh_points:", "mien_toys:")
-    text = text.replace('"xyz"', '"xyz9"').replace('".xyz"', '".xyz9"').replace('"puppet"', '"puppet9"')
-    install(folder, "mien_toys", text.replace('".puppet"', '".puppet9"'), points)
-
-
-def test_one_package_adds_one_of_each(fork_server: ForkServer, tmp_path: Path, cache: str) -> None:  # noqa: F811
-    """Footage is imported by its dataset, an avatar is trained by its method and exported in its format."""
-    install_toys(tmp_path)
-    out, me = str(tmp_path / "out"), tmp_path / "me.xyz9"
-    path = str(write(tmp_path / "me.puppet9", puppet()))
-    lines = (
-        ("import", path, "--out", out, "--face-model", "mine"),
-        ("train", out, "--method", "mesh_points9", "--method.start-scale", "0.01", "--steps", "2", "--split", "tail"),
-        ("export", out, "--out", str(me)),
-        ("export", out, "--out", str(tmp_path / "me.mien")),
-        ("export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "again.xyz9")),
-    )
-    for line in lines:
-        done = mien(fork_server, tmp_path, *line, MIEN_CACHE=cache)
-        assert done.returncode == 0, done.stderr
-    assert len(me.read_text().splitlines()) == len(toy_face_model().template)
-    assert (tmp_path / "again.xyz9").read_text() == me.read_text()
-    assert '"kind": "mesh_points9"' in (Path(out) / "runs/mesh_points9/avatar/avatar.json").read_text()
-    assert "textured_mesh, mesh_points9 (compared" in help_of(fork_server, tmp_path, "train")
-    assert ".xyz9 files get numbers" in help_of(fork_server, tmp_path, "export")
-    wrong = mien(fork_server, tmp_path, "train", out, "--method", "nerf").stderr
-    names = "gaussian_avatars, headgas, mono_gaussian_avatar, point_avatar, textured_mesh, mesh_points9"
-    assert f"give one of {names} instead" in wrong
-    # Without the package, its avatar is refused with the remedy.
-    gone = mien(fork_server, Path(out), "export", out, "--out", str(tmp_path / "b.ply"))
-    assert gone.returncode == 2
-    assert "no method 'mesh_points9'; give one of" in gone.stderr
-    assert "or install the package that adds it" in gone.stderr
+Mien = Callable[..., CompletedProcess[str]]
+workspace = pytest.fixture(toy_workspace)
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("place") / "W"
-    write_toy_workspace(folder)
+def toys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Install `mien_toys`: what the recipes make, in one module, under names that mien may not have."""
+    folder = tmp_path_factory.mktemp("toys")
+    method = blocks(RECIPES[0], "python")[:-1]
+    (ending,) = re.findall(r"`(METHOD = [^`]*)`", " ".join(Path("CONTRIBUTING.md").read_text("utf-8").split()))
+    others = [blocks(each, "python")[0] for each in RECIPES[1:]]
+    text = "\n".join([*method, f"from mien.avatar import Method\n{ending}\n", *others])
+    points = re.sub(r"= mien_\w+:", "= mien_toys:", "".join(entry_points(each) for each in RECIPES))
+    for word in WORDS:
+        text = re.sub(rf'"(\.?){word}"', rf'"\g<1>{word}9"', text).replace(f"mien_{word}:", "mien_toys:")
+        points = points.replace(f"{word} =", f"{word}9 =")
+    install(folder, "mien_toys", text, points)
     return folder
 
 
-BROKEN = "[mien.formats]\nnone9 = mien_none9:IT\n[mien.datasets]\nnone9 = mien_none9:IT\n"
-"""Entry points of a package whose module cannot be imported."""
+@pytest.fixture(scope="module")
+def cached(fork_server: ForkServer, toys: Path, tmp_path_factory: pytest.TempPathFactory) -> Mien:
+    """Return a function that runs a command with that package, and with the toy face model `mine`."""
+    cache, bare = tmp_path_factory.mktemp("cache"), toy_face_model()
+    marks = Landmarks(torch.arange(478) % len(bare.faces), torch.full((478, 3), 1 / 3))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MIEN_CACHE", str(cache))
+        add_face_model(replace(bare, name="mine", landmarks={"mediapipe": marks}), Path("/mine.npz"), "0")
+    return partial(mien, fork_server, toys, MIEN_CACHE=str(cache))
+
+
+def puppet() -> dict[str, np.ndarray]:
+    """Return the arrays of a puppet, whose camera looks from the side and has no pixel of symmetry."""
+    _, sequence = toy_sequence(5, 32)
+    camera, face = sequence.tracking.cameras[0], sequence.tracking.face
+    K = np.array([[40.0, 0, 15], [0, 36.0, 17.5], [0, 0, 1]])
+    return {
+        "images": sequence.capture.images[:, 0], "mattes": sequence.capture.mattes[:, 0], "K": K,
+        "viewmat": camera.viewmat.numpy(), "expression": face.expression.numpy(),
+        "head_rotation": face.head_rotation.numpy() + np.array([0.1, 0.3, -0.2], np.float32),
+        "head_translation": face.head_translation.numpy(),
+    }  # fmt: skip
+
+
+def write(path: Path, arrays: dict[str, np.ndarray]) -> str:
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=True, **arrays)  # pyright: ignore[reportArgumentType]
+    return str(path)
+
+
+def assert_imported(folder: Path, path: str, arrays: dict[str, np.ndarray]) -> None:
+    """Compare a sequence with the puppet that it was imported from."""
+    sequence = read_sequence(folder)
+    assert np.array_equal(sequence.capture.images[:, 0], arrays["images"])
+    assert np.array_equal(sequence.capture.mattes[:, 0], arrays["mattes"])
+    # The writer's own projection in float64, with the mesh posed by the plain formulas.
+    model, fields = toy_face_model(), ("expression", "head_rotation", "head_translation")
+    exact = model.to(torch.zeros((), dtype=torch.float64))
+    given = {name: torch.from_numpy(arrays[name]).double() for name in fields}
+    posed = exact.vertices_reference(replace(exact.neutral(5), **given))
+    seen = posed.numpy() @ arrays["viewmat"][:3, :3].T.astype(float) + arrays["viewmat"][:3, 3]
+    expected = (seen @ arrays["K"].T)[..., :2] / seen[..., 2:]
+    found = sequence.tracking.cameras[0].project(model(sequence.tracking.face))[0]
+    assert np.abs(found.numpy() - expected).max() < 1e-3
+    assert scoring_exists(folder / "scoring", read_capture_hash(folder / "capture"))
+    assert sequence.scoring.any()
+    assert (sequence.scoring <= sequence.capture.mattes).all()
+    settings = sequence.tracking.settings
+    assert settings["imported"] == {"dataset": "puppet9", "from": path}
+    assert len(settings["fingerprint"]) == 16
+
+
+def test_footage_is_imported_an_avatar_trained_and_exported(
+    cached: Mien, fork_server: ForkServer, tmp_path: Path
+) -> None:
+    arrays, out, me = puppet(), str(tmp_path / "out"), tmp_path / "me.xyz9"
+    path = write(tmp_path / "me.puppet9", arrays)
+    export, of_file = ("export", out, "--out"), ("export", str(tmp_path / "me.mien"), "--out")
+    imports = ("import", path, "--out", out, "--face-model", "mine")
+    for line in (
+        imports,
+        ("train", out, "--method", "mesh_points9", "--method.start-scale", "0.01", "--steps", "2", "--split", "tail"),
+        (*export, str(me)),
+        (*export, str(tmp_path / "me.mien")),
+        (*export, str(tmp_path / "talk.xyz9"), "--series", "me"),
+        (*of_file, str(tmp_path / "again.xyz9")),
+    ):
+        done = cached(*line)
+        assert done.returncode == 0, done.stderr
+        assert line != imports or "me.puppet9: a puppet" in done.stderr
+    assert_imported(Path(out) / "sequences/me", path, arrays)
+    assert [each.name for each in (Path(out) / "sequences").iterdir() if not each.name.endswith(".lock")] == ["me"]
+    assert len(me.read_text().splitlines()) == len(toy_face_model().template)
+    assert (tmp_path / "again.xyz9").read_text() == me.read_text()
+    assert len(list(tmp_path.glob("talk_*.xyz9"))) == 5
+    assert '"kind": "mesh_points9"' in (Path(out) / "runs/mesh_points9/avatar/avatar.json").read_text()
+    (tmp_path / "a.txt").touch()
+    names = "gaussian_avatars, headgas, mono_gaussian_avatar, point_avatar, textured_mesh, mesh_points9"
+    for line, told in (
+        (imports, "sequences/me: is there already; delete it"),
+        (
+            ("import", path, "--out", str(tmp_path / "b"), "--run", "a"),
+            "holds sequences, which are no run; leave --run",
+        ),
+        (("import", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b")), "; give one of gaussian-avatars ("),
+        (("import", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b")), "puppet9 (a .puppet9 file)"),
+        ((*export, str(tmp_path / "a.xyz9"), "--sh", "3"), "only a .ply has a degree"),
+        ((*export, str(tmp_path / "a.abc")), " or .xyz9, or --format"),
+        (("train", out, "--method", "nerf"), f"give one of {names} instead"),
+    ):
+        refused = cached(*line)
+        assert refused.returncode == 2
+        assert told in refused.stderr
+    # Without the package, its avatar is refused with the remedy.
+    gone = mien(fork_server, tmp_path, *export, str(tmp_path / "b.ply"))
+    assert gone.returncode == 2
+    assert re.search("no method 'mesh_points9'; give one of .*, or install the package that adds it", gone.stderr)
+
+
+def test_an_engine_runs_rows(fork_server: ForkServer, toys: Path, tmp_path: Path) -> None:
+    table = make_table(tmp_path)
+    on = ("batch", table, "--out", str(tmp_path / "out"), "--program", " ".join(PROGRAM), "--on")
+    done = mien(fork_server, toys, *on, "in_turn9")
+    assert done.returncode == 0, done.stderr
+    assert "2 to do on in_turn9" in done.stderr
+    batch = Batch(tmp_path / "out")
+    assert [batch.is_done(row) for row in batch.read_plan()] == [True, True]
+    listed = json.loads(mien(fork_server, toys, "plugins", "--json").stdout)["engines"]
+    assert listed["own"] == ["local", "slurm", "ray"]
+    added = [(each["name"], each["package"], each["fault"]) for each in listed["added"]]
+    assert added == [("in_turn9", "mien-toys", None)]
+    for command, shown in (
+        ("batch", "local, slurm, ray, in_turn9"),
+        ("train", "textured_mesh, mesh_points9 (compared"),
+        ("export", ".xyz9 files get numbers"),
+    ):
+        assert shown in help_of(fork_server, toys, command)
+    for more, told in (
+        (
+            ("in_turn9", "--partition", "long"),
+            "--partition: changes nothing for a batch that runs on in_turn9; leave it",
+        ),
+        (("rya",), "no engine 'rya'; give one of local, slurm, ray, in_turn9"),
+    ):
+        refused = mien(fork_server, toys, *on, *more)
+        assert (refused.returncode, told in refused.stderr) == (2, True)
+
+
+def make_table(folder: Path) -> str:
+    """Write a table of two videos, and return its path."""
+    (folder / "a.mp4").write_bytes(b"a video")
+    (folder / "table.csv").write_text("name,video\nann,a.mp4\nbob,a.mp4\n")
+    return str(folder / "table.csv")
+
+
+FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], object], str]] = {
+    "missing": (lambda a: a.pop("K"), "has no 'K'"),
+    "model": (lambda a: a.update(expression=np.zeros((5, 9), np.float32)), "'expression' has the shape [5, 9]"),
+    "pickle": (lambda a: a.update(K=np.array([{}], object)), "'K': holds object, not plain numbers"),
+    "nan": (lambda a: a.update(expression=np.full((5, 2), np.nan, np.float32)), "expression holds NaN"),
+    "mirrored": (lambda a: a.update(K=a["K"] * [[-1], [1], [1]]), "camera '0' is not valid (focal lengths -40 and 36"),
+    "behind": (lambda a: a.update(viewmat=np.eye(4)), "in frame 0 the head is behind every camera"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_damage_of_a_dataset_is_told_in_one_line_and_leaves_nothing(cached: Mien, fault: str, tmp_path: Path) -> None:
+    arrays = puppet()
+    damage, told = FAULTS[fault]
+    damage(arrays)
+    path, out = write(tmp_path / "me.puppet9", arrays), tmp_path / "out"
+    done = cached("import", path, "--out", str(out), "--face-model", "mine")
+    assert done.returncode == 2, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("mien: ")]
+    assert told in line
+    assert path in line
+    assert [each for each in out.rglob("*") if each.is_file() and not each.name.endswith(".lock")] == []
+
+
+def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
+    """The reader's own checks may be too few. Nothing is left, and the message names the place that was read."""
+    model, toy = toy_sequence(5, 32)
+    capture = replace(toy.capture, timestamps=toy.capture.timestamps[::-1].copy())
+    dataset = Dataset("toy", "a toy", "sequences", lambda path: None, lambda path, model: [])
+    folder = tmp_path / "sequences/clip"
+    with pytest.raises(UserError, match=r"^me \(clip\): timestamps holds impossible numbers; copy the files"):
+        write_sequence(folder, TrackedSequence(capture, toy.tracking, model), dataset, Path("me"))
+    assert list((tmp_path / "sequences").iterdir()) == []
+    write_sequence(folder, TrackedSequence(toy.capture, toy.tracking, model), dataset, Path("me"))
+    assert [path.name for path in (tmp_path / "sequences").iterdir()] == ["clip"]
+    uses.use_sequences(tmp_path, [TrackedSequence(toy.capture, toy.tracking, model)], Random(0))
+    assert (tmp_path / "I/sequences/toy/scoring/scoring.json").is_file()
+
+
+def test_without_packages_names_and_endings_are_told_apart(tmp_path: Path) -> None:
+    words = [word for each in formats() for word in (*each.endings, each.name)]
+    assert len(words) == len(set(words))
+    assert all(bool(each.endings) != (each.holds == "folder") for each in formats())
+    assert [each.name for each in formats() if each.reads_avatars] == ["mien", "glb"]
+    assert len({each.name for each in datasets()}) == len(datasets())
+    (tmp_path / "a.txt").touch()
+    for path in (tmp_path, tmp_path / "a.txt", tmp_path / "gone", Path("/dev/null")):
+        assert [each.name for each in datasets() if each.recognises(path) is not None] == []
+    assert plugins("mien.datasets", Dataset) == plugins("mien.formats", Format) == {}
+
+
+DATASET = "from mien.datasets import Dataset\nIT = Dataset({!r}, 'twice', 'avatar', lambda path: {}, print)\n"
+ENGINE = "from mien.batch import Engine\nIT = Engine('mien_none9:run', packages={})\n"
+EXPORT, IMPORT, BATCH = (
+    "export {run} --out {here}/a.none9",
+    "import {here}/F --out {here}/O",
+    "batch {table} --on none9",
+)
+WRONG = (
+    ("formats", "IT = 1", EXPORT, "and it is no Format; update or uninstall mien-none9"),
+    (
+        "formats",
+        "from mien.formats.format import Format\nIT = Format('none9', 'pose', print, ('.ply',))",
+        EXPORT,
+        "the format 'none9': .ply is taken by another format",
+    ),
+    ("datasets", "IT = 1", IMPORT, "and it is no Dataset; update or uninstall mien-none9"),
+    ("datasets", DATASET.format("gaussian-avatars", "''"), IMPORT, "'none9': gaussian-avatars is taken by another"),
+    ("datasets", DATASET.format("none9", "''"), IMPORT, "recognised as gaussian-avatars and none9; choose one with"),
+    ("datasets", DATASET.format("none9", "path.no"), IMPORT, "/F: the dataset 'none9' fails (AttributeError("),
+    ("engines", "IT = 1", BATCH, "mien_none9:IT: mien-none9 adds it to mien.engines, and it is no Engine"),
+    ("engines", ENGINE.format("()"), BATCH, "mien: mien_none9:run: cannot be imported (AttributeError("),
+    (
+        "engines",
+        ENGINE.format("('none8',)"),
+        BATCH,
+        "--on none9: needs the module none8, which is not installed; install",
+    ),
+)
+
+
+@pytest.mark.parametrize(("group", "code", "line", "told"), WRONG)
+def test_a_package_that_is_wrong_is_named(
+    fork_server: ForkServer, workspace: Path, tmp_path: Path, group: str, code: str, line: str, told: str
+) -> None:
+    install(tmp_path, "mien_none9", code, f"[mien.{group}]\nnone9 = mien_none9:IT\n")
+    (tmp_path / "F").mkdir()
+    (tmp_path / "F/point_cloud.ply").touch()
+    table = f"{make_table(tmp_path)} --out {tmp_path / 'O'}"
+    words = line.format(run=workspace, here=tmp_path, table=table).split()
+    done = mien(fork_server, tmp_path, *words)
+    assert done.returncode == 2
+    assert told in done.stderr
+    assert "none8" not in told or not (tmp_path / "O").exists()
 
 
 @pytest.mark.parametrize("code", ["from mien.formats import NO_SUCH_NAME as IT", "raise SystemExit(3)"])
-def test_a_broken_package_is_named_and_everything_else_works(
-    fork_server: ForkServer, workspace: Path, tmp_path: Path, code: str
+def test_a_package_that_cannot_be_imported_is_named_and_everything_else_works(
+    fork_server: ForkServer, toys: Path, workspace: Path, tmp_path: Path, code: str
 ) -> None:
-    install(tmp_path, "mien_none9", code, BROKEN)
-    (good,) = blocks(RECIPES[1], "python")
-    install(tmp_path, "mien_xyz9", good.replace("xyz", "xyz9"), entry_points(RECIPES[1]).replace("xyz", "xyz9"))
-    (tmp_path / "F").mkdir()
-    (tmp_path / "F/point_cloud.ply").touch()
+    points = "[mien.formats]\nnone9 = mien_none9:IT\n[mien.datasets]\nnone9 = mien_none9:IT\n"
+    install(tmp_path, "mien_none9", code, points)
+    install(tmp_path, "mien_toys", (toys / "mien_toys.py").read_text(), "[mien.formats]\nxyz9 = mien_toys:XYZ\n")
     out = ("export", str(workspace), "--out")
     quiet = (("create", "--help"), (*out, str(tmp_path / "me.ply"), "--format", "ply"))
     named = (("export", "--help"), ("import", "--help"), (*out, str(tmp_path / "me.xyz9")))
@@ -97,67 +304,43 @@ def test_a_broken_package_is_named_and_everything_else_works(
         assert all("mien_none9:IT: mien-none9 adds it to mien." in text for text in told)
         assert all(text.endswith("; update or uninstall mien-none9; mien goes on without it") for text in told)
     assert (tmp_path / "me.xyz9").exists()
-    for line in (
-        (*out, str(tmp_path / "a.none9"), "--format"),
-        ("import", str(tmp_path / "F"), "--out", "O", "--dataset"),
-    ):
-        refused = mien(fork_server, tmp_path, *line, "none9")
+    imports = ("import", str(tmp_path), "--out", "O")
+    for line in ((*out, str(tmp_path / "a.none9"), "--format", "none9"), (*imports, "--dataset", "none9")):
+        refused = mien(fork_server, tmp_path, *line)
         (told,) = refused.stderr.splitlines()
         assert (refused.returncode, told[:39]) == (2, "mien: mien_none9:IT: mien-none9 adds it")
 
 
-def test_a_dataset_that_fails_to_look_is_named(fork_server: ForkServer, tmp_path: Path) -> None:
-    code = (
-        "from mien.datasets import Dataset\nIT = Dataset('none9', 'none', 'avatar', lambda path: path.nothing, print)\n"
-    )
-    install(tmp_path, "mien_none9", code, "[mien.datasets]\nnone9 = mien_none9:IT\n")
-    (tmp_path / "F").mkdir()
-    done = mien(fork_server, tmp_path, "import", str(tmp_path / "F"), "--out", str(tmp_path / "O"))
-    warning, told = done.stderr.splitlines()
-    assert done.returncode == 2
-    assert warning.startswith(f"warning: {tmp_path / 'F'}: the dataset 'none9' fails (AttributeError(")
-    assert "is no dataset that mien knows" in told
+METHOD = "from mien.avatar.methods import Method\nOWN = Method('nowhere:Toy', 'nowhere:ToyConfig')\nWRONG = 1\n"
+TYPO = """
+from dataclasses import dataclass
+from mien.avatar import Method, MethodConfig
 
+@dataclass(frozen=True)
+class ToyConfig(MethodConfig):
+    pass
 
-def assert_holds(server: ForkServer, folder: Path, function: str) -> None:
-    """Check what a function of this file asserts in a process where the packages of a folder are installed."""
-    process = server.call(f"test_plugins:{function}", path=[folder])
-    assert process.wait() == 0, process.stderr
-
-
-def test_a_method_without_its_classes_is_named_and_stops_no_other(fork_server: ForkServer, tmp_path: Path) -> None:
-    code = (
-        "from dataclasses import dataclass\nfrom mien.avatar import Method, MethodConfig\n\n\n"
-        "@dataclass(frozen=True)\nclass ToyConfig(MethodConfig):\n    pass\n\n\n"
-        "A, B = (Method(f'mien_toys_c:{name}', f'mien_toys_c:{name}Config') for name in ('Typo', 'Toy'))\n"
-    )
-    install(tmp_path, "mien_toys_c", code, "[mien.methods]\ntoy_a = mien_toys_c:A\ntoy_b = mien_toys_c:B\n")
-    assert_holds(fork_server, tmp_path, "a_method_without_its_classes_is_named")
-
-
-def a_method_without_its_classes_is_named() -> None:
-    assert method_of(method_named("toy_b").config()) == "toy_b"
-    with pytest.raises(UserError, match="^mien_toys_c:TypoConfig: cannot be imported .*; update or uninstall"):
-        print(method_named("toy_a").config)
-    with pytest.raises(UserError, match="^mien_toys_c:Typo: cannot be imported .*; update or uninstall"):
-        print(method_named("toy_a").avatar)
-
-
-CODE = "from mien.avatar.methods import Method\nOWN = Method('nowhere:Toy', 'nowhere:ToyConfig')\nWRONG = 1\n"
+A, B = (Method(f'mien_toys_c:{name}', f'mien_toys_c:{name}Config') for name in ('Typo', 'Toy'))
+"""
 
 
 def test_methods_of_packages_are_found_by_name(fork_server: ForkServer, tmp_path: Path) -> None:
+    def assert_holds(function: str) -> None:
+        process = fork_server.call(f"test_plugins:{function}", path=[tmp_path])
+        assert process.wait() == 0, process.stderr
+
+    assert_holds("entry_points_are_read_late")
     points = "[mien.methods]\ntoy_a = mien_toys_a:OWN\nheadgas = mien_toys_a:OWN\nwrong = mien_toys_a:WRONG\n"
-    install(tmp_path, "mien_toys_a", CODE, points)
-    assert_holds(fork_server, tmp_path, "methods_are_found_by_name")
-    install(tmp_path, "mien_toys_b", CODE, "[mien.methods]\ntoy_a = mien_toys_b:OWN\n")
-    assert_holds(fork_server, tmp_path, "one_name_of_two_packages_is_told")
+    install(tmp_path, "mien_toys_a", METHOD, points)
+    assert_holds("methods_are_found_by_name")
+    install(tmp_path, "mien_toys_b", METHOD, "[mien.methods]\ntoy_a = mien_toys_b:OWN\n")
+    install(tmp_path, "mien_toys_c", TYPO, "[mien.methods]\ntypo = mien_toys_c:A\ntoy = mien_toys_c:B\n")
+    assert_holds("faults_are_told_and_others_go_on_working")
 
 
 def methods_are_found_by_name() -> None:
     assert method_names() == [*METHODS, "toy_a", "wrong"]
-    assert has_method("toy_a")
-    assert not has_method("toy_b")
+    assert (has_method("toy_a"), has_method("toy_b")) == (True, False)
     assert method_named("toy_a") == Method("nowhere:Toy", "nowhere:ToyConfig")
     assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
     with pytest.raises(UserError, match="it is no Method; update or uninstall mien-toys-a"):
@@ -166,14 +349,14 @@ def methods_are_found_by_name() -> None:
         method_named("toy_b")
 
 
-def one_name_of_two_packages_is_told() -> None:
+def faults_are_told_and_others_go_on_working() -> None:
     with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'toy_a' to mien.methods; uninstall"):
         method_named("toy_a")
-    assert method_names() == [*METHODS, "toy_a", "wrong"], "others go on working"
-
-
-def test_entry_points_are_read_only_for_methods_that_mien_lacks(fork_server: ForkServer, tmp_path: Path) -> None:
-    assert_holds(fork_server, tmp_path, "entry_points_are_read_late")
+    assert {"toy_a", "wrong", "typo", "toy"} <= set(method_names())
+    assert method_of(method_named("toy").config()) == "toy"
+    for part in ("config", "avatar"):
+        with pytest.raises(UserError, match="^mien_toys_c:Typo(Config)?: cannot be imported .*; update or uninstall"):
+            getattr(method_named("typo"), part)
 
 
 def entry_points_are_read_late() -> None:

@@ -1,36 +1,44 @@
-"""The release command: archives whose bytes depend on content alone, checksums, and the page from CHANGELOG."""
+"""Releases: archives whose bytes depend on content alone, the page from CHANGELOG, and the licences of what is used."""
 
 import hashlib
+import json
 import os
+import subprocess
 import sys
 import tarfile
+import tomllib
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
+from scikit_build_core.build import build_sdist
+
+from mien.cli import main
+from mien.licences import PARTS, installed_licences, spdx_document
+from mien.licences.facts import PACKAGES
+from mien.licences.installed import canonical, kind_of
+from mien.licences.spdx import requirements_of
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "release"))
 import make  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 
-def folder_of(path: Path, order: list[str]) -> Path:
-    for index, name in enumerate(order):
-        file = path / "docs" / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(f"content of {name}")
-        os.utime(file, (1_000_000 + index, 2_000_000 + index))
-    return path / "docs"
-
-
 def test_the_same_files_give_the_same_archive(tmp_path: Path) -> None:
-    one, other = folder_of(tmp_path / "a", ["x", "y/z", "b"]), folder_of(tmp_path / "b", ["b", "x", "y/z"])
-    (one / "x").chmod(0o600)
-    for folder, name in ((one, "one.tar.xz"), (other, "other.tar.xz")):
-        make.pack(folder, tmp_path / name, 1_700_000_000)
+    for folder, order in (("one", ("x", "y/z", "b")), ("other", ("b", "x", "y/z"))):
+        for index, name in enumerate(order):
+            file = tmp_path / folder / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(f"content of {name}")
+            os.utime(file, (1_000_000 + index, 2_000_000 + index))
+        (tmp_path / "one" / "x").chmod(0o600)
+        make.pack(tmp_path / folder, tmp_path / f"{folder}.tar.xz", 1_700_000_000)
     assert (tmp_path / "one.tar.xz").read_bytes() == (tmp_path / "other.tar.xz").read_bytes()
     with tarfile.open(tmp_path / "one.tar.xz") as tar:
-        assert tar.getnames() == ["b", "x", "y", "y/z"]
-        assert {member.mtime for member in tar} == {1_700_000_000}
+        assert [(member.name, member.mtime) for member in tar] == [
+            (name, 1_700_000_000) for name in ("b", "x", "y", "y/z")
+        ]
 
 
 def test_the_page_has_the_notes_and_sums(tmp_path: Path) -> None:
@@ -47,73 +55,123 @@ def test_the_page_has_the_notes_and_sums(tmp_path: Path) -> None:
 def test_the_changelog_has_the_version_of_the_package(tmp_path: Path) -> None:
     version = make.tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert "mien create" in make.section(ROOT / "CHANGELOG.md", version)
-    (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## 1.0.0\n\n- a\n\n## 0.9.0 (old)\n\n- b\n")
-    assert make.section(tmp_path / "CHANGELOG.md", "1.0.0") == "- a"
-    assert make.section(tmp_path / "CHANGELOG.md", "0.9.0") == "- b"
+    log = tmp_path / "CHANGELOG.md"
+    log.write_text("# Changelog\n\n## 1.0.0\n\n- a\n\n## 0.9.0 (old)\n\n- b\n")
+    assert (make.section(log, "1.0.0"), make.section(log, "0.9.0")) == ("- a", "- b")
     with pytest.raises(make.ReleaseError, match="no section '## 2.0.0'"):
-        make.section(tmp_path / "CHANGELOG.md", "2.0.0")
+        make.section(log, "2.0.0")
 
 
-def test_the_source_has_what_git_knows_alone(tmp_path: Path) -> None:
-    """Wheels take MediaPipe's code for pages from the checkout. With it, the sdist would be too large."""
-    make.copy_tracked(tmp_path / "source")
-    copied = {path.relative_to(tmp_path / "source").as_posix() for path in (tmp_path / "source").rglob("*")}
-    assert {"pyproject.toml", "src/mien/export/landmarker/face_landmarker.task.xz.1"} <= copied
-    assert not [name for name in copied if "/vision_" in name or name.startswith("build/")]
-    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "source").rglob("*.py")} == {0o644}
+def test_two_checkouts_give_the_same_small_source_distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has what git knows and a wheel is built from, and neither folders nor times of files matter.
 
-
-def test_the_source_distribution_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has what a wheel is built from, without history, tests, pictures and the network that only pages need."""
-    from scikit_build_core.build import build_sdist
-
-    make.copy_tracked(tmp_path / "source")
-    monkeypatch.chdir(tmp_path / "source")
-    archive = tmp_path / build_sdist(str(tmp_path))
-    assert archive.stat().st_size < make.MOST_SDIST_BYTES == 5_000_000
-    with tarfile.open(archive) as tar:
-        names = {name.partition("/")[2] for name in tar.getnames()}
-    needed = {
-        "pyproject.toml",
-        "CMakeLists.txt",
-        "native/bindings.cpp",
-        "src/mien/export/landmarker/face_landmarker.task.xz.1",
-        "src/mien/capture/data/selfie_segmentation.tflite.xz",
-    }
-    assert needed <= names
-    unneeded = ("tests/", "web/", ".ci/", "benchmarks/", "docs/images/", "docs/pictures/", "docs/log.md")
-    unneeded += ("src/mien/export/landmarker/face_landmarker.task.xz.2",)
-    assert not [name for name in names if name.startswith(unneeded)]
-
-
-def test_two_checkouts_give_the_same_source_distribution(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither folders nor times of files matter. A release sets the variable to the commit's time."""
-    from scikit_build_core.build import build_sdist
-
+    Tests, pictures, MediaPipe's code for pages and the network that only pages need would make it too large. A release
+    sets the variable to the commit's time.
+    """
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    sums = []
+    archives = []
     for folder, time in ((tmp_path / "here", 1_600_000_000), (tmp_path / "elsewhere" / "deep", 1_650_000_000)):
         make.copy_tracked(folder / "source")
         for path in (folder / "source").rglob("*"):
             os.utime(path, (time, time))
+        assert {path.stat().st_mode & 0o777 for path in (folder / "source").rglob("*.py")} == {0o644}
         monkeypatch.chdir(folder / "source")
-        sums.append(hashlib.sha256((folder / build_sdist(str(folder))).read_bytes()).hexdigest())
-    assert sums[0] == sums[1]
+        archives.append(folder / build_sdist(str(folder)))
+    assert archives[0].read_bytes() == archives[1].read_bytes()
+    assert archives[0].stat().st_size < make.MOST_SDIST_BYTES == 5_000_000
+    with tarfile.open(archives[0]) as tar:
+        names = {name.partition("/")[2] for name in tar.getnames()}
+    landmarker = "src/mien/export/landmarker/face_landmarker.task.xz"
+    needed = {"pyproject.toml", "CMakeLists.txt", "native/bindings.cpp", f"{landmarker}.1"}
+    assert {*needed, "src/mien/capture/data/selfie_segmentation.tflite.xz"} <= names
+    unneeded = ("tests/", "web/", ".ci/", "benchmarks/", "docs/images/", "docs/pictures/", "docs/log.md", "build/")
+    assert not [name for name in names if name.startswith((*unneeded, f"{landmarker}.2")) or "/vision_" in name]
 
 
-@pytest.mark.parametrize(("code", "answers"), [(0, True), (1, False), (None, False)])
-def test_containers_need_a_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None, answers: bool
-) -> None:
+def test_containers_need_a_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without one, wheels are those of this machine."""
-    if code is not None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert not make.has_containers()
+    for code, answers in ((0, True), (1, False)):
         (tmp_path / "docker").write_text(f"#!/bin/sh\nexit {code}\n")
         (tmp_path / "docker").chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert make.has_containers() is answers
+        assert make.has_containers() is answers
 
 
 def test_a_folder_with_files_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "old.whl").write_bytes(b"")
     assert make.main(["--out", str(tmp_path), "--parts", "sdist"]) == 2
     assert "is not empty" in capsys.readouterr().err
+
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+@pytest.fixture
+def listed(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What the command tells of each package and part."""
+    assert main(["licenses", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    return {canonical(each["name"]): each for each in (*told["parts"], *told["packages"])}
+
+
+def test_no_package_has_changed_the_kind_of_its_licence_and_none_forbids_commercial_use():
+    """A new package, or another licence, is looked at by a person, who then changes `licence_kinds.json`."""
+    kinds = json.loads((ROOT / "tests/licence_kinds.json").read_text())
+    recorded = {name: kind for kind, names in kinds.items() for name in names}
+    found = {canonical(each.name): each.kind for each in installed_licences()}
+    changed = {name: kind for name, kind in found.items() if recorded.get(name, "not recorded") != kind}
+    assert changed == {}, "look at these licences, and record their kinds in tests/licence_kinds.json"
+    assert "unknown" not in {*found.values(), *(kind_of(part.licence) for part in PARTS)}
+
+
+def test_kinds_of_expressions():
+    for expression, kind in {
+        "MIT": "permissive",
+        "MIT-0": "public domain",
+        "MIT OR GPL-2.0-or-later": "permissive",
+        "BSD-3-Clause AND LGPL-2.1-or-later": "weak copyleft",
+        "MPL-2.0 AND MIT": "weak copyleft",
+        "Apache-2.0 AND (MIT OR LicenseRef-NVIDIA-Proprietary)": "permissive",
+        "GPL-2.0-or-later": "strong copyleft",
+        "MIT AND CC-BY-NC-4.0": "unknown",
+    }.items():
+        assert kind_of(expression) == kind, expression
+
+
+def test_every_package_is_named_with_what_brings_it(listed: dict[str, Any], capsys: pytest.CaptureFixture[str]):
+    used = {name: listed[name]["used_for"] for name in ("numpy", "torch", "kiwisolver", "viser")}
+    assert list(used.values()) == ["mien", "mien[create]", "mien[create], by matplotlib", "mien[viewer]"]
+    x264 = listed[canonical("x264 and x265")]
+    assert (listed["mien"]["licence"], x264["licence"]) == ("Apache-2.0", "GPL-2.0-or-later")
+    assert "pip install --no-binary av av" in x264["meaning"]
+    assert main(["licenses"]) == 0
+    assert "keep its notices when you pass it on" in capsys.readouterr().out
+
+
+def test_the_list_is_that_of_pip_licenses(listed: dict[str, Any]):
+    """Row by row: the same packages and versions, and what both read as the declared licence."""
+    command = [sys.executable, "-m", "piplicenses", "--format=json", "--with-system", "--from=mixed"]
+    theirs = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert {canonical(row["Name"]) for row in theirs} == {name for name, own in listed.items() if "version" in own}
+    for row in theirs:
+        own = listed[canonical(row["Name"])]
+        assert row["Version"] == own["version"]
+        if row["License"] != "UNKNOWN" and canonical(row["Name"]) not in PACKAGES:
+            assert row["License"] == own["declared"], row["Name"]
+
+
+def test_the_bill_of_materials_in_the_wheel_is_up_to_date():
+    written = json.loads((ROOT / "src/mien/sbom.spdx.json").read_text(encoding="utf-8"))
+    expected = spdx_document(PROJECT["version"], requirements_of(PROJECT))
+    assert written == expected, "run: python -m mien.licences pyproject.toml > src/mien/sbom.spdx.json"
+    assert {"numpy", "torch", "mediapipe", "nanobind", "mien"} <= {each["name"] for each in written["packages"]}
+
+
+def test_mediapipe_is_older_than_its_statistics():
+    """From 0.10.35 on, mediapipe declares that it sends usage metrics to its maker (docs/platforms.md)."""
+    asked = next(line for line in PROJECT["optional-dependencies"]["create"] if line.startswith("mediapipe"))
+    pinned = asked.partition(";")[0].removeprefix("mediapipe==").strip()
+    assert tuple(map(int, pinned.split("."))) < (0, 10, 35)
+    assert version("mediapipe") == pinned
+    assert f"mediapipe=={pinned} " in (ROOT / "requirements/lock.txt").read_text(encoding="utf-8")

@@ -4,22 +4,19 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import pytest
 
 from capture_helpers import tree_bytes
-from forked import ForkServer
+from forked import Forked, ForkServer
 from mien.cli import main
 from mien.locks import lock_file
 from other_process import Holder
 from two_commands import RANK, Studio, beside, toy_studio
 
 pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
-TWO_RUNS = ["--runs", "alone", "twin"]
 WHERE = ["within", "before"]
 """Whether the first of two commands waits with the lock, or just before it takes it, until the second has ended."""
 
@@ -42,82 +39,62 @@ def studio(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Studio:
     return made
 
 
-@contextmanager
-def twin_run(studio: Studio) -> Iterator[None]:
-    """Let the workspace have a second run, which a study needs."""
-    runs = studio.root / "runs"
-    shutil.copytree(runs / "alone", runs / "twin")
-    try:
-        yield
-    finally:
-        shutil.rmtree(runs / "twin")
+def commands_that_write(studio: Studio, folder: Path) -> list[tuple[Path, str]]:
+    """Return command lines, each with the place that it writes."""
+    root, video, runs = studio.root, studio.video, studio.root / "runs"
+    clip, cache = root / "sequences/clip", Path(os.environ["MIEN_CACHE"])
+    capture, create = " ".join(studio.capture_options), " ".join(studio.create_options)
+    return [
+        (clip, f"capture {video} --out {root} --name clip {capture} --capture.end 9"),
+        (clip, f"track {root} --face-model toy --again"),
+        (clip, f"align {root} --split tail"),
+        (runs / "new", f"train {root} --run new --steps 3"),
+        (runs / "new", f"create {video} --out {root} --run new {create}"),
+        (runs / "new", f"import {studio.avatar_folder} --out {root} --run new"),
+        (runs / "alone", f"evaluate {root} --run alone"),
+        (root / "analysis/alone", f"analyze gaussian-avatars {root} --run alone --parts growth"),
+        (folder / "demo/synthetic-0-1s.mp4", f"demo --out {folder}/demo --seconds 1"),
+        (folder / "q/quality", f"bench quality --out {folder}/q"),
+        (folder / "q/compare", f"bench compare {root} --out {folder}/q"),
+        (folder / "a.html", f"study make {root} --out {folder}/a.html --runs alone twin"),
+        (cache / "face_models/added/pixels", f"face-models --add {video}/0.png --name pixels"),
+    ]
 
 
-def commands_that_write(studio: Studio, folder: Path) -> dict[str, tuple[Path, list[str]]]:
-    """Return commands by name, each with the place that it writes."""
-    root, video, runs = studio.root, str(studio.video), studio.root / "runs"
-    clip = studio.root / "sequences" / "clip"
-    return {
-        "capture": (
-            clip,
-            ["capture", video, "--out", str(root), "--name", "clip", *studio.capture_options, "--capture.end", "9"],
-        ),
-        "track": (clip, ["track", str(root), "--face-model", "toy", "--again"]),
-        "align": (clip, ["align", str(root), "--split", "tail"]),
-        "train": (runs / "new", ["train", str(root), "--run", "new", "--steps", "3"]),
-        "create": (runs / "new", ["create", video, "--out", str(root), "--run", "new", *studio.create_options]),
-        "evaluate": (runs / "alone", ["evaluate", str(root), "--run", "alone"]),
-        "analyze": (
-            root / "analysis" / "alone",
-            ["analyze", "gaussian-avatars", str(root), "--run", "alone", "--parts", "growth"],
-        ),
-        "import": (runs / "new", ["import", str(studio.avatar_folder), "--out", str(root), "--run", "new"]),
-        "demo": (folder / "demo" / "synthetic-0-1s.mp4", ["demo", "--out", str(folder / "demo"), "--seconds", "1"]),
-        "bench quality": (folder / "q" / "quality", ["bench", "quality", "--out", str(folder / "q")]),
-        "bench compare": (folder / "q" / "compare", ["bench", "compare", str(root), "--out", str(folder / "q")]),
-        "study": (folder / "a.html", ["study", "make", str(root), "--out", str(folder / "a.html"), *TWO_RUNS]),
-        "face-models": (
-            Path(os.environ["MIEN_CACHE"]) / "face_models" / "added" / "pixels",
-            ["face-models", "--add", f"{video}/0.png", "--name", "pixels"],
-        ),
-    }
-
-
-def test_every_command_that_writes_tells_who_is_at_it(
-    other: Holder, studio: Studio, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_that_writes_tells_who_is_at_it(other: Holder, studio: Studio, tmp_path: Path, capsys) -> None:
+    twin = shutil.copytree(studio.root / "runs/alone", studio.root / "runs/twin")  # a study needs two runs
     commands = commands_that_write(studio, tmp_path)
-    with twin_run(studio), other.holding(*{place for place, _ in commands.values()}):
+    with other.holding(*{place for place, _ in commands}):
         before = tree_bytes(studio.root)
-        for name, (place, command) in commands.items():
-            assert main(command) == 2, name
+        for place, words in commands:
+            assert main(words.split()) == 2, words
             (line,) = capsys.readouterr().err.splitlines()  # and no progress bar before it
-            assert line.startswith(f"mien: {place}: is being written by another command (process {other.pid} on "), name
-            assert ("--run NAME" in line) == (name in ("train", "create", "import"))
-            assert ("--out DIR" in line) == name.startswith("bench")
+            told = f"mien: {place}: is being written by another command (process {other.pid} on "
+            assert line.startswith(told), words
+            assert ("--run NAME" in line) == words.startswith(("train", "create", "import"))
+            assert ("--out DIR" in line) == words.startswith("bench")
         changed = {name for name, content in tree_bytes(studio.root).items() if before.get(name) != content}
         assert all(name.endswith(".lock") for name in changed)
+    shutil.rmtree(twin)
 
 
-def test_readers_go_on_beside_every_lock(
-    other: Holder, studio: Studio, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root, run = str(studio.root), ["--run", "alone"]
-    with other.holding(studio.root / "sequences" / "clip", studio.root / "runs" / "alone"):
-        for command in (
-            ["render", root, *run, "--out", str(tmp_path / "a.png"), "--size", "32"],
-            ["drive", root, *run, "--by", root, "--out", str(tmp_path / "drive"), "--size", "32"],
-            ["export", root, *run, "--out", str(tmp_path / "a.ply")],
-            ["export", root, *run, "--out", str(tmp_path / "folder"), "--format", "gaussian-avatars"],
-            ["import", str(tmp_path / "folder"), "--out", root, "--run", f"imported-{tmp_path.name}"],
-            ["analyze", "gaussian-avatars", root, *run, "--parts", "growth", "--out", str(tmp_path / "analysis")],
-            ["evaluate", root, *run, "--compare", "--out", str(tmp_path / "a.html")],
-            ["capture", str(studio.video), "--out", root, "--name", "clip", *studio.capture_options],
-            ["track", root, "--face-model", "toy", "--overlay", "none"],
-            ["train", root, *run, "--steps", "3", "--split", "tail", *RANK],
-            ["create", str(studio.video), "--out", root, *run, *studio.create_options],
+def test_readers_go_on_beside_every_lock(other: Holder, studio: Studio, tmp_path: Path, capsys) -> None:
+    root, out, create = studio.root, tmp_path, " ".join(studio.create_options)
+    with other.holding(root / "sequences" / "clip", root / "runs" / "alone"):
+        for words in (
+            f"render {root} --run alone --out {out}/a.png --size 32",
+            f"drive {root} --run alone --by {root} --out {out}/drive --size 32",
+            f"export {root} --run alone --out {out}/a.ply",
+            f"export {root} --run alone --out {out}/folder --format gaussian-avatars",
+            f"import {out}/folder --out {root} --run imported-{out.name}",
+            f"analyze gaussian-avatars {root} --run alone --parts growth --out {out}/analysis",
+            f"evaluate {root} --run alone --compare --out {out}/a.html",
+            f"capture {studio.video} --out {root} --name clip {' '.join(studio.capture_options)}",
+            f"track {root} --face-model toy --overlay none",
+            f"train {root} --run alone --steps 3 --split tail {' '.join(RANK)}",
+            f"create {studio.video} --out {root} --run alone {create}",
         ):
-            assert main(command) == 0, (command, capsys.readouterr().err)
+            assert main(words.split()) == 0, (words, capsys.readouterr().err)
 
 
 def test_a_run_that_is_being_trained_cannot_be_rendered_yet(
@@ -127,30 +104,23 @@ def test_a_run_that_is_being_trained_cannot_be_rendered_yet(
     run.mkdir()
     shutil.copy(studio.root / "runs" / "alone" / "config.json", run)
     render = ["render", str(studio.root), "--run", "begun", "--out", str(tmp_path / "a.png")]
-    try:
-        with other.holding(run):
-            assert main(render) == 2
-            line = capsys.readouterr().err
-            assert f"process {other.pid} on" in line
-            assert line.endswith("; try again when it is done\n")
+    with other.holding(run):
         assert main(render) == 2
-        assert "its training was not finished; run the same `mien train`" in capsys.readouterr().err
-    finally:
-        shutil.rmtree(run)
-
-
-def test_a_workspace_whose_first_capture_is_at_work(
-    other: Holder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "w" / "sequences" / "clip" / ".capture.partial").mkdir(parents=True)
-    with other.holding(tmp_path / "w" / "sequences" / "clip"):
+        line = capsys.readouterr().err
+        assert f"process {other.pid} on" in line
+        assert line.endswith("; try again when it is done\n")
+    assert main(render) == 2
+    assert "its training was not finished; run the same `mien train`" in capsys.readouterr().err
+    shutil.rmtree(run)
+    # A workspace whose first capture is at work.
+    clip = tmp_path / "w" / "sequences" / "clip"
+    (clip / ".capture.partial").mkdir(parents=True)
+    with other.holding(clip):
         assert main(["track", str(tmp_path / "w")]) == 2
     assert f"clip: is being written by another command (process {other.pid} on" in capsys.readouterr().err
 
 
-def test_the_command_after_a_kill_goes_on_at_once(
-    mortal: Holder, studio: Studio, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_after_a_kill_goes_on_at_once(mortal: Holder, studio: Studio) -> None:
     train = ["train", str(studio.root), "--run", "killed", "--steps", "3", "--split", "tail", *RANK]
     with mortal.holding(studio.root / "runs" / "killed"):
         assert main(train) == 2
@@ -168,10 +138,10 @@ def assert_same_run(studio: Studio, name: str) -> None:
     assert not lock_file(run).exists()
 
 
-def assert_told(pid: int, name: str, told: CompletedProcess[str]) -> None:
-    """Check that a command was refused, since a process writes a place, and did nothing."""
-    assert told.returncode == 2, told
-    assert f"{name}: is being written by another command (process {pid} on " in told.stderr.splitlines()[-1]
+def assert_told(first: Forked, name: str, told: Forked) -> None:
+    """Check that a command was refused, since another one writes a place, and did nothing."""
+    assert told.poll() == 2, told.stderr
+    assert f"{name}: is being written by another command (process {first.pid} on " in told.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("where", WHERE)
@@ -189,12 +159,12 @@ def test_one_of_two_works_and_the_other_names_it_or_finds_all_done(
         "import": (["import", str(studio.avatar_folder), "--out", str(out)], "gaussian_avatars", "Gaussians on toy"),
         "analyze": (["analyze", "gaussian-avatars", root, *of_analysis], "out", "Look at"),
     }[kind]
-    pid, first, second = beside(fork_server, tmp_path / "wait", (where, place), words, words)
+    first, second = beside(fork_server, tmp_path / "wait", (where, place), words, words)
     if where == "within":
-        assert first.returncode == 0, first.stderr
-        assert_told(pid, place, second)
+        assert first.poll() == 0, first.stderr
+        assert_told(first, place, second)
     else:
-        assert (first.returncode, second.returncode) == (2 if kind == "import" else 0, 0), first.stderr + second.stderr
+        assert (first.poll(), second.poll()) == (2 if kind == "import" else 0, 0), first.stderr + second.stderr
         late = {"import": "is there already; give the imported run another name", "analyze": "growth: measured before"}
         assert late.get(kind, "") in first.stderr
     worked = [work in each.stderr for each in (first, second)]
@@ -214,26 +184,17 @@ def test_one_of_two_works_and_the_other_names_it_or_finds_all_done(
     assert not lock_file(out).exists()
 
 
-def figures_of_both(run: Path) -> dict[str, Any]:
+def figures_of_both(run: Path) -> Any:
     """The figures that both commands compute. `create` judges the avatar alone by ST-LPIPS."""
-    content = json.loads((run / "metrics.json").read_text())["protocols"]["self_reenactment_tail"]
-    others = {name: without_perceptual(content[name]) for name in ("as_tracked", "baselines")}
-    return {key: value for key, value in content.items() if key != "seconds_per_frame"} | others
 
+    def shared(entry: dict[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in entry.items() if name not in ("seconds_per_frame", "perceptual")}
 
-def without_perceptual(content: Any) -> Any:
-    """The content without ST-LPIPS, at any depth."""
-    if not isinstance(content, dict):
-        return content
-    return {key: without_perceptual(value) for key, value in content.items() if key != "perceptual"}
+    return json.loads((run / "metrics.json").read_text(), object_hook=shared)["protocols"]["self_reenactment_tail"]
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize(
-    ("first_is", "trained"),
-    [("create", True), ("evaluate", True), ("create", False)],
-    ids=["create", "evaluate", "new"],
-)
+@pytest.mark.parametrize(("first_is", "trained"), [("create", True), ("evaluate", True), ("create", False)])
 def test_create_beside_evaluate(
     first_is: str, trained: bool, where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path
 ) -> None:
@@ -246,12 +207,12 @@ def test_create_beside_evaluate(
     lines = [create, ["evaluate", str(studio.root), "--run", name]]
     if first_is == "evaluate":
         lines.reverse()
-    pid, first, second = beside(fork_server, tmp_path / "wait", (where, name), *lines)
-    assert first.returncode == 0, first.stderr
+    first, second = beside(fork_server, tmp_path / "wait", (where, name), *lines)
+    assert first.poll() == 0, first.stderr
     if where == "within":
-        assert_told(pid, name, second)
+        assert_told(first, name, second)
     elif trained:
-        assert second.returncode == 0, second.stderr
+        assert second.poll() == 0, second.stderr
     else:
         assert "its training was not finished" in second.stderr
     assert_same_run(studio, name)

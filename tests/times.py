@@ -17,8 +17,8 @@ import pytest
 
 THEMES = {
     "pages, browser, viewer, web packages": "web|viewer|live_view|gaze_pixels|site|first_minute|playcanvas|vrm|glb",
-    "processes, commands, recipes": "no_network|examples|two_commands|kills|plugins|new_|needs|startup|places|cli|"
-    "interrupt|stops|terminal|memory|readers_beside|system|extras|end_to_end|checked_types|batch",
+    "processes, commands, recipes": "two_commands|kills|plugins|new_|needs|startup|places|cli|"
+    "interrupt|stops|terminal|memory|readers_beside|system|extras|end_to_end|batch",
     "damage, fuzz, full disks, odd command lines": "damage|reader|fuzz|hostile|odd_|full_disks|inside|exhaust|"
     "bad_input|handed_in|native_calls|edges_of|locks",
     "tracking, alignment, drawn people": "track(?!ed)|alignment|outline|eyelids|synthetic|mesh|photometric|neutral|"
@@ -27,8 +27,7 @@ THEMES = {
     "capture, cameras, driving": "capture|video|color|camera|calibration|driv|motion|recordings|interlaced|litert|cuts",
     "datasets": "dataset|layout|named_split|submission",
     "evaluation, reports, lab": "evaluation|analysis|study|bench|unseen|ablate|lpips|metrics|flicker|report",
-    "docs, settings, presets": "docs|settings|setting_|paper_preset|public_api|constants|licences|release|seams|sizes|"
-    "mutation",
+    "docs, settings, presets": "docs|settings|setting_|paper_preset|public_api|constants|licences|release|seams",
     "training, avatars, rasterizer": "",
 }
 """Theme -> pattern of the names of its files; the first that fits counts."""

@@ -7,17 +7,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from subprocess import CompletedProcess
 
 import cv2
 import numpy as np
 
-from forked import ForkServer
+from forked import Forked, ForkServer
 from mien import locks
+from mien.capture import read_capture_hash
 from mien.cli import main
+from mien.commands.stages.tracking import tracking_fingerprint
 from mien.evaluation import living
 from mien.face import add_face_model
 from mien.storage import write_arrays
+from mien.tracking import Scoring, TrackingSettings, write_scoring, write_tracking
+from mien.workspace import Workspace
 from toy_scene import toy_capture, toy_face_model, toy_tracking
 
 _TIMESTEPS, _SIZE = 5, 48
@@ -26,28 +29,20 @@ _PATIENCE_SECONDS = 600
 
 def beside(
     server: ForkServer, folder: Path, stop: tuple[str, str], first: list[str], second: list[str]
-) -> tuple[int, CompletedProcess[str], CompletedProcess[str]]:
+) -> tuple[Forked, Forked]:
     """Run a command up to a lock, then another one to its end, and then the first one to its end.
 
-    Args:
-        server: The server of forks.
-        folder: An empty folder.
-        stop: Whether the first stops "before" or "within" its first lock of a place, and the place's name.
-        first: The words of the first command.
-        second: Those of the second one.
-
-    Returns:
-        The process number of the first command, and how both ended.
+    The first stops "before" or "within" its first lock of a place, whose name `stop` has, too. The folder is made.
     """
     folder.mkdir()
     waiting = server.call("two_commands:run_up_to_a_lock", first, *stop, str(folder), exits=True)
     wait_until(lambda: (folder / "waits").exists() or waiting.poll() is not None)
     assert waiting.poll() is None, f"it did not come to the lock: {waiting.stderr}"
     other = server.call("two_commands:run", second, exits=True)
-    code = other.wait()
+    other.wait()
     (folder / "goes on").touch()
-    ended = CompletedProcess(first, waiting.wait(), waiting.stdout, waiting.stderr)
-    return waiting.pid, ended, CompletedProcess(second, code, other.stdout, other.stderr)
+    waiting.wait()
+    return waiting, other
 
 
 def run(words: list[str]) -> int:
@@ -113,34 +108,26 @@ RANK = ["--method.expression-rank", "0", "--method.appearance", "static"]
 
 def toy_studio(folder: Path, cache: Path) -> Studio:
     """Film, capture and track the toy head without any detector. MIEN_CACHE has to be `cache`."""
-    from mien.commands.stages.tracking import tracking_fingerprint
-    from mien.tracking import Scoring, TrackingSettings, write_scoring, write_tracking
-    from mien.workspace import Workspace
-
     assert os.environ["MIEN_CACHE"] == str(cache)
     model = toy_face_model()
     add_face_model(model, folder / "toy.npz", "none")
     film, alpha = toy_capture(model, _TIMESTEPS, _SIZE)
-    (folder / "mattes").mkdir(parents=True)
-    (folder / "pictures").mkdir()
-    for timestep in range(_TIMESTEPS):
-        cv2.imwrite(str(folder / "mattes" / f"{timestep}.png"), alpha[timestep, 0])
-        cv2.imwrite(str(folder / "pictures" / f"{timestep}.png"), film.images[timestep, 0][..., ::-1])
+    for kind, pictures in (("mattes", alpha[:, 0]), ("pictures", film.images[:, 0, ..., ::-1])):
+        (folder / kind).mkdir(parents=True)
+        for timestep, picture in enumerate(pictures):
+            cv2.imwrite(str(folder / kind / f"{timestep}.png"), picture)
     marks = np.random.default_rng(0).uniform(8, 40, (_TIMESTEPS, 478, 2)).astype(np.float32)
     write_arrays(folder / "landmarks.safetensors", {"landmarks": marks})
     capture_options = ["--capture.crop", "none", "--capture.mattes", str(folder / "mattes")]
     capture_options += ["--capture.landmarks", str(folder / "landmarks.safetensors")]
     root, video = folder / "workspace", folder / "pictures"
     assert main(["capture", str(video), "--out", str(root), "--name", "clip", *capture_options]) == 0
-    workspace, sequence = Workspace(root), root / "sequences" / "clip"
-    fingerprint = tracking_fingerprint(workspace, ["clip"], model, TrackingSettings())
+    sequence = root / "sequences" / "clip"
+    fingerprint = tracking_fingerprint(Workspace(root), ["clip"], model, TrackingSettings())
     made_from = {"fingerprint": fingerprint, "tracked_together": ["clip"]}
     write_tracking(sequence / "tracking", replace(toy_tracking(model, _TIMESTEPS, _SIZE), settings=made_from))
     (sequence / "tracking" / "report.html").write_text("a report")
     crops = np.tile(np.array([4, 4, 30, 30], np.int64), (_TIMESTEPS, 1, 1))
-    from mien.capture import read_capture_hash
-
     write_scoring(sequence / "scoring", Scoring(alpha, crops), read_capture_hash(sequence / "capture"))
     create_options = ["--name", "clip", "--face-model", "toy", "--overlay", "none", "--steps", "3", "--split", "tail"]
-    create_options += RANK
-    return Studio(root, video, capture_options, folder / "avatar", [*create_options, *capture_options])
+    return Studio(root, video, capture_options, folder / "avatar", [*create_options, *RANK, *capture_options])
