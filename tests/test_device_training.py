@@ -4,7 +4,7 @@ Tensors that are not float32 on a CPU use the plain PyTorch twins of all native 
 instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -16,22 +16,27 @@ from torch import Tensor
 import mien.devices
 import train_toy
 from mien import _native
-from mien.avatar import GaussianAvatarsConfig, load_avatar
+from mien.adam import FactoredMoments
+from mien.avatar import METHODS, GaussianAvatarsConfig, MethodConfig, Moments, load_avatar
+from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.training import TrainSettings, train
+from mien.gaussians import Gaussians
+from mien.render.rendering import Rendering
+from mien.training import TrainSettings, batch, train, trainer
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Sequence, Targets
 from mien.training.trainer import TrainingData, start, step
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.hair_surface import HairSurface
+from plain_settings import plain_config, plain_run
 from shared_things import toy_workspace
 from toy_scene import toy_sequence
-from training_progress import silence, stopped_at
+from train_toy import silence, stopped_at
 
 SETTINGS = replace(train_toy.SETTINGS, steps=12, record_every=1)
 
@@ -39,9 +44,7 @@ SETTINGS = replace(train_toy.SETTINGS, steps=12, record_every=1)
 Scene = tuple[FaceModel, Sequence]
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return toy_sequence(timesteps=5, size=32)
+scene = pytest.fixture(scope="module")(lambda: toy_sequence(timesteps=5, size=32))
 
 
 def train_some(
@@ -64,9 +67,9 @@ def assert_alike(one: TrainingState, other: TrainingState) -> None:
     assert one.curves["loss"] == pytest.approx(other.curves["loss"], rel=2e-2)
 
 
-@pytest.fixture
-def no_native_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make every native operation of a training step fail."""
+@pytest.mark.unchecked
+def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    native = train_some(scene, torch.zeros(()))
 
     def refuse(*_: object) -> None:
         raise AssertionError("a native operation away from float32 on a CPU")
@@ -74,12 +77,6 @@ def no_native_step(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = "ride rig_forward pose_face sigmoid head_poses rasterize_views photometric_loss triangle_penalties"
     for name in f"{parts} observe_view adam_update mean_squared_difference absolute_difference".split():
         monkeypatch.setattr(_native, name, refuse)
-
-
-@pytest.mark.unchecked
-def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, request: pytest.FixtureRequest) -> None:
-    native = train_some(scene, torch.zeros(()))
-    request.getfixturevalue("no_native_step")
     plain = train_some(scene, torch.zeros((), dtype=torch.float64))
     assert plain.avatar.gaussian_store()["means"].dtype == torch.float64
     assert plain.curves["gaussians"] == native.curves["gaussians"]
@@ -93,19 +90,12 @@ def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
-def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, installed: bool) -> None:
-    monkeypatch.setattr(mien.devices, "find_spec", lambda name: object() if installed else None)
-
-
-def test_a_device_is_chosen_or_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, no_gpu: None, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pretend_gsplat(monkeypatch, installed=False)
-    with pytest.raises(UserError, match=r"--device cuda: needs a CUDA GPU and gsplat.*uv pip install"):
-        choose_device("cuda")
-    pretend_gsplat(monkeypatch, installed=True)
-    with pytest.raises(UserError, match=r"--device cuda: torch .*nvidia-smi"):
-        choose_device("cuda")
+def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, capsys) -> None:
+    needs = "needs a CUDA GPU and gsplat.*uv pip install"
+    for gsplat, words in ((None, needs), (object(), "torch .*nvidia-smi")):
+        monkeypatch.setattr(mien.devices, "find_spec", lambda name, gsplat=gsplat: gsplat)
+        with pytest.raises(UserError, match=f"--device cuda: {words}"):
+            choose_device("cuda")
     assert choose_device("auto").type == choose_device("cpu").type == "cpu"
     assert "using the processor" in capsys.readouterr().err
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -150,22 +140,11 @@ def test_a_whole_head_is_trained_on_a_device(device: str, monkeypatch: pytest.Mo
 @pytest.mark.gpu
 def test_what_a_gpu_trained_is_loaded_and_resumed_without_one(scene: Scene, tmp_path: Path) -> None:
     face_model, sequence = scene
-    run, half = tmp_path / "run", SETTINGS.steps // 2
-
     often = replace(SETTINGS, device="cuda", checkpoint_every=1)
     with pytest.raises(KeyboardInterrupt):
-        train([sequence], face_model, train_toy.CONFIG, often, run, stopped_at(half))
-    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), run, silence)
-    avatar = load_avatar(run)
-    assert avatar.gaussian_store()["means"].device.type == "cpu"
-    whole = tmp_path / "whole"
-    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cuda"), whole, silence)
-    assert len(load_avatar(whole).gaussian_store()) > 0
-
-
-@pytest.fixture
-def workspace(made_once) -> Path:
-    return toy_workspace(made_once)
+        train([sequence], face_model, train_toy.CONFIG, often, tmp_path, stopped_at(SETTINGS.steps // 2))
+    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), tmp_path, silence)
+    assert load_avatar(tmp_path).gaussian_store()["means"].device.type == "cpu"
 
 
 def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
@@ -176,18 +155,80 @@ def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
 
 
 @pytest.mark.unchecked
-def test_pictures_are_the_same_wherever_they_are_drawn(
-    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("device", ["auto", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_pictures_are_the_same_wherever_they_are_drawn(device: str, made_once, tmp_path, monkeypatch) -> None:
+    workspace = toy_workspace(made_once)
     native = pictures(workspace, tmp_path / "native", "cpu")
-    # In place of a GPU: plain PyTorch in float64.
-    monkeypatch.setattr(render, "like_on", lambda device: torch.zeros((), dtype=torch.float64))
-    plain = pictures(workspace, tmp_path / "plain", "auto")
+    if device == "auto":  # in place of a GPU: plain PyTorch in float64
+        monkeypatch.setattr(render, "like_on", lambda device: torch.zeros((), dtype=torch.float64))
     assert native.std() > 1
-    assert np.abs(native - plain).max() <= 1
+    assert np.abs(native - pictures(workspace, tmp_path / "other", device)).max() <= 1
 
 
-@pytest.mark.gpu
-def test_a_gpu_draws_the_same_pictures(workspace: Path, tmp_path: Path) -> None:
-    native = pictures(workspace, tmp_path / "native", "cpu")
-    assert np.abs(native - pictures(workspace, tmp_path / "cuda", "cuda")).max() <= 1
+# -- no step waits for a GPU -----------------------------------------------------------------------------------------
+
+META = torch.zeros((), device="meta")
+
+
+def configs() -> dict[str, MethodConfig]:
+    """All methods, with every loss, and again with colours that depend on the view where a method has them."""
+    found = {}
+    for name in METHODS:
+        config = plain_config(name)
+        tuning = replace(config.face_tuning, keep_mean_pose=True, keep_turns=True)
+        config = replace(config, face_tuning=tuning)
+        found[name] = replace(config, photometric=replace(config.photometric, alpha_weight=0.1))
+        if "sh_degree" in {field.name for field in fields(config)}:
+            found[f"{name}-sh3"] = replace(config, sh_degree=3)
+    return found
+
+
+CONFIGS = configs()
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
+def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trainer's own step reads no number, in a run whose pictures are composited in every step."""
+    monkeypatch.setattr(batch, "rasterize", _rendered)
+    face_model, sequence = toy_sequence(timesteps=3, size=32)
+    settings = plain_run(steps=1_000_000, split="none", background="random", record_every=1_000_000)
+    state = trainer.start([sequence], face_model, config, settings, META)
+    order = FrameOrder(training_frames([sequence], settings), settings.seed)
+    data = trainer.TrainingData(order, (Targets(sequence, 0, like=META),))
+    for _ in range(3):
+        trainer.step(state, data, settings)
+    state.track.steady_pose()
+    store = state.avatar.gaussian_store()
+    assert all(store[name].device.type == "meta" for name in store.names())
+    updated = {**store.moments, **state.adam.state()}
+    assert updated
+    for moments in updated.values():
+        if isinstance(moments, FactoredMoments):
+            assert moments.second.device.type == "meta"
+        else:
+            assert float(moments.step) == 3
+            assert moments.first.device.type == "meta"
+
+
+def test_regions_are_looked_for_where_the_model_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU refuses tensors of two devices. The `meta` device does not."""
+    asked: list[tuple[str, str]] = []
+    monkeypatch.setattr(torch, "isin", lambda a, b: asked.append((a.device.type, b.device.type)) or a == 0)
+    face_model, _ = toy_sequence(timesteps=1, size=32)
+    face_model.to(META).region_mask("lips")
+    assert asked == [("meta", "meta")]
+
+
+def test_steps_are_counted_on_the_host() -> None:
+    with pytest.raises(RuntimeError):
+        (META + 1).item()
+    assert Moments.zeros(META).step.device.type == "cpu"
+
+
+def _rendered(gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:
+    """Return a rendering with the same dependences as a rasterizer's."""
+    offset = torch.zeros(len(gaussians), 2, device="meta", requires_grad=True)
+    parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, offset]
+    parts += [camera.K, camera.viewmat, background, *([] if (pose := gaussians.T_world_local) is None else [pose])]
+    image = torch.stack([part.sum() for part in parts]).sum().expand(camera.height, camera.width, 3)
+    return Rendering(image, image[..., 0], torch.ones(len(gaussians), dtype=torch.int32, device="meta"), offset)

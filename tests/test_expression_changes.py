@@ -11,23 +11,26 @@ import pytest
 import torch
 from torch import Tensor
 
-from mien import _native, runtime
-from mien.avatar import GaussianAvatars, Progress, Rate, load_avatar, make_portable, write_avatar
+from known import known
+from mien import runtime
+from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, load_avatar, make_portable, write_avatar
 from mien.avatar.gaussian_avatars.avatar import resting_opacities
 from mien.avatar.gaussian_avatars.changes import mean_squares
 from mien.avatar.ops.expression_changes import (
     MARGIN,
     activations_reference,
-    expression_change,
-    expression_change_reference,
     outermost,
     principal_directions,
     within_seen,
 )
+from mien.avatar.ops.feature_network import Layers, feature_network_reference
 from mien.errors import UserError
-from mien.render.rendering import Rendering
+from mien.export.packed import pack
+from mien.gaussians import Gaussians
+from mien.runtime.checks import baked_fault
+from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
-from toy_scene import toy_camera, toy_face, toy_face_model
+from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
 PARTS = ("means", "quats", "scales", "opacities", "sh")
@@ -47,34 +50,6 @@ def new_avatar(rank: int = 2, filled: bool = True, **settings: object) -> Gaussi
         if filled and name in avatar.store.names():
             avatar.store.assign(name, 0.3 * random(*avatar.store[name].shape, seed=index))
     return avatar
-
-
-@pytest.mark.parametrize("rank", range(1, 9))
-def test_native_changes_equal_their_reference(isa: str, rank: int) -> None:
-    for shape in ((0,), (1,), (17, 3), (9000, 3)):
-        check_native_changes(rank, shape)
-
-
-def check_native_changes(rank: int, shape: tuple[int, ...]) -> None:
-    results = []
-    for function, dtype in ((expression_change, torch.float32), (expression_change_reference, torch.float64)):
-        basis, activations = (t.to(dtype).requires_grad_() for t in (random(*shape, rank), random(rank, seed=1)))
-        change = function(basis, activations)
-        gradients = torch.autograd.grad(change, [basis, activations], random(*shape, seed=2).to(dtype))
-        results.append([tensor.double() for tensor in (change, *gradients)])
-    for ours, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
-
-
-def test_changes_have_the_same_bits_for_any_number_of_threads() -> None:
-    before, results = _native.thread_count(), []
-    for threads in (1, 3):
-        _native.set_thread_count(threads)
-        basis, activations = random(20_000, 3, 8).requires_grad_(), random(8, seed=1).requires_grad_()
-        change = expression_change(basis, activations)
-        results.append((change, *torch.autograd.grad(change.square().sum(), [basis, activations])))
-    _native.set_thread_count(before)
-    assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
 
 
 def test_activations_follow_training_within_its_range_and_stop_soon_after() -> None:
@@ -104,13 +79,11 @@ def test_frames_of_training_are_not_shortened() -> None:
 
 
 def test_native_activations_equal_their_reference() -> None:
-    avatar = new_avatar()
-    fixed = [getattr(avatar.activations, name) for name in ("rest", "directions", "seen")]
-    face = toy_face(5)
+    avatar, face = new_avatar(), toy_face(5)
+    fixed = [getattr(avatar.activations, name).double() for name in ("rest", "directions", "seen")]
     face = replace(face, expression=(3 * face.expression).requires_grad_())
-    inputs = torch.cat([face.expression, face.joints.flatten(1)], -1)
     ours = avatar.activations(face)
-    theirs = activations_reference(inputs.double(), *(tensor.double() for tensor in fixed))
+    theirs = activations_reference(torch.cat([face.expression, face.joints.flatten(1)], -1).double(), *fixed)
     torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-5)
     by_ours, by_theirs = (torch.autograd.grad(a[..., 0].sum(), face.expression)[0] for a in (ours, theirs))
     torch.testing.assert_close(by_ours, by_theirs, rtol=1e-4, atol=1e-5)
@@ -137,39 +110,26 @@ def test_rank_0_is_the_method_without_changes() -> None:
         assert avatar.density().judged_opacities is resting_opacities
 
 
+def unequal(one: Gaussians, other: Gaussians) -> list[str]:
+    pairs = {name: torch.broadcast_tensors(getattr(one, name), getattr(other, name)) for name in PARTS}
+    return [name for name, pair in pairs.items() if not torch.equal(*pair)]
+
+
 @pytest.mark.parametrize("sh_degree", [0, 1])
 def test_bases_start_at_zero_and_move_what_they_are_named_after(sh_degree: int) -> None:
     face = toy_face(5)
-    plain = new_avatar(0, sh_degree=sh_degree).pose(face).gaussians
     start = new_avatar(2, filled=False, sh_degree=sh_degree).pose(face).gaussians
-    for name in PARTS:
-        assert torch.equal(getattr(plain, name).expand_as(getattr(start, name)), getattr(start, name)), name
+    assert unequal(new_avatar(0, sh_degree=sh_degree).pose(face).gaussians, start) == []
     for basis, moved in zip(BASES, ("sh", "opacities", "means"), strict=True):
         avatar = new_avatar(2, filled=False, sh_degree=sh_degree)
         avatar.store.assign(basis, torch.ones(()))
-        changed = avatar.pose(face).gaussians
-        for name in PARTS:
-            assert torch.equal(getattr(start, name), getattr(changed, name)) == (name != moved), (basis, name)
-
-
-def test_timesteps_together_are_those_one_by_one() -> None:
-    avatar, face = new_avatar(), toy_face(5)
-    together = avatar.pose(face)
-    for timestep in range(5):
-        alone = avatar.pose(face[timestep])
-        for name in (*PARTS, "T_world_local"):
-            one, other = (getattr(p.gaussians.timestep(i), name) for p, i in ((together, timestep), (alone, 0)))
-            assert torch.equal(one, other), name
-        assert all(torch.equal(together.aux[name][timestep], alone.aux[name]) for name in BASES)
+        assert unequal(start, avatar.pose(face).gaussians) == [moved], basis
 
 
 def test_children_inherit_the_bases_and_faint_ones_are_judged_at_their_best() -> None:
-    avatar = new_avatar()
-    parents = torch.tensor([3, 3])
-    overrides = avatar.density().split(avatar.store, parents, random(2, 3))
-    avatar.store.append(parents, overrides)
-    for name in BASES:
-        assert torch.equal(avatar.store[name][-2:], avatar.store[name][[3, 3]])
+    avatar, parents = new_avatar(), torch.tensor([3, 3])
+    avatar.store.append(parents, avatar.density().split(avatar.store, parents, random(2, 3)))
+    assert all(torch.equal(avatar.store[name][-2:], avatar.store[name][parents]) for name in BASES)
     seen = torch.full((len(avatar.store),), 0.7)
     assert torch.equal(avatar.density().judged_opacities(avatar.store, seen), seen)
     fixed = new_avatar(expression_opacity_rate=Rate(0.0))
@@ -179,12 +139,10 @@ def test_children_inherit_the_bases_and_faint_ones_are_judged_at_their_best() ->
 def test_the_prior_is_the_mean_square_of_the_changes() -> None:
     avatar = new_avatar(expression_weight=2.0)
     posed = avatar.pose(toy_face(5)[1])
-    radii = torch.ones(len(avatar.store), dtype=torch.int32)
-    rendering = Rendering(torch.zeros(4, 4, 3), torch.zeros(4, 4), radii, torch.zeros(len(radii), 2))
-    losses = avatar.regularizers(posed, rendering, Progress(0, 1))
+    loss = avatar.regularizers(posed, pictured(len(avatar.store)), Progress(0, 1))["expression"].item()
     expected = 2 * sum(posed.aux[name].detach().square().mean().item() for name in BASES)
-    assert losses["expression"].item() == pytest.approx(expected, rel=1e-5)
-    assert losses["expression"].item() > 0.01
+    assert loss == pytest.approx(expected, rel=1e-5)
+    assert loss > 0.01
 
 
 def test_avatars_on_disk_keep_what_training_saw(tmp_path: Path) -> None:
@@ -204,25 +162,128 @@ def test_impossible_changes_are_refused(tmp_path: Path) -> None:
     whole = make_portable(new_avatar(2), toy_camera(32), "toy")
     baked = whole.baked
     assert isinstance(baked, runtime.MeshBound)
-    changes = baked.changes
-    assert changes is not None
-    parts = {name: getattr(changes, name) for name in ("color", "opacity_logits", "means")}
-    fixed = {name: getattr(changes, name) for name in ("rest", "directions", "seen")}
-    none = {name: array[..., :0] for name, array in (parts | fixed).items() if name != "rest"}
+    changes = known(baked.changes)
+    parts = {name: getattr(changes, name) for name in ("color", "opacity_logits", "means", "directions", "seen")}
     for wrong, part in (
-        (replace(changes, **{name: array[:3] for name, array in parts.items()}), "the shape of color of its changes"),
-        (replace(changes, rest=fixed["rest"][:1], directions=fixed["directions"][:1]), "the shape of rest of its"),
-        (replace(changes, seen=changes.seen[:, :1]), "the shape of seen of its"),
-        (replace(changes, **none), "0 activations"),
-        (replace(changes, directions=changes.directions * np.float32("nan")), "NaN"),
+        ({name: parts[name][:3] for name in ("color", "opacity_logits", "means")}, "the shape of color of its changes"),
+        ({"rest": changes.rest[:1], "directions": changes.directions[:1]}, "the shape of rest of its"),
+        ({"seen": changes.seen[:, :1]}, "the shape of seen of its"),
+        ({name: array[..., :0] for name, array in parts.items()}, "0 activations"),
+        ({"directions": changes.directions * np.float32("nan")}, "NaN"),
     ):
+        broken = replace(baked, changes=replace(changes, **wrong))
         with pytest.raises(UserError, match=part):
-            runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=replace(baked, changes=wrong)))
+            runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=broken))
 
 
 def test_mean_squares_are_what_autograd_computes() -> None:
-    tensors = [torch.randn(7, 3, dtype=torch.float64, requires_grad=True), torch.randn(7, dtype=torch.float64)]
-    tensors[1].requires_grad_()
+    tensors = [random(*shape).double().requires_grad_() for shape in ((7, 3), (7,))]
     assert torch.autograd.gradcheck(lambda *own: mean_squares(0.3, *own), tensors)
     expected = 0.3 * sum(own.square().mean() for own in tensors)
     torch.testing.assert_close(mean_squares(0.3, *tensors), expected)
+
+
+# -- features on Gaussians --------------------------------------------------------------------------------------------
+
+RANK, DIRECTIONS = 3, 5
+CONFIG = plain_gaussian_avatars(
+    expression_rank=RANK,
+    expression_color_rate=Rate(0.0),
+    appearance="features",
+    appearance_directions=DIRECTIONS,
+    appearance_features=6,
+)
+
+
+def with_features(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True) -> GaussianAvatars:
+    """Return an avatar whose features and network are random, as after training, or as before it."""
+    torch.manual_seed(0)
+    avatar = GaussianAvatars(config, toy_face_model(), toy_face(5))
+    if filled:
+        torch.manual_seed(1)
+        for name in set(avatar.store.names()) & {"feature_bases", "neutral_features", "offset_basis", "opacity_basis"}:
+            avatar.store.assign(name, 0.3 * torch.randn(avatar.store[name].shape))
+        with torch.no_grad():
+            assert avatar.appearance is not None
+            avatar.appearance.last.weight.normal_(0, 0.3)
+    return avatar
+
+
+def test_starts_as_without_features() -> None:
+    plain = plain_gaussian_avatars(expression_rank=RANK, expression_color_rate=Rate(0.0))
+    torch.manual_seed(0)
+    static = GaussianAvatars(plain, toy_face_model(), toy_face(5))
+    ours, theirs = (avatar.pose(toy_face(5)).gaussians for avatar in (with_features(filled=False), static))
+    assert all(torch.equal(getattr(ours, part), getattr(theirs, part)) for part in PARTS)
+
+
+def test_color_and_opacity_change_by_the_network() -> None:
+    """By the plain formula from the activations and the features, in float64."""
+    avatar, face = with_features(), toy_face(5)[2]
+    store, (activations,) = avatar.store, avatar.activations(face)
+    exact = Layers(*(tensor.double() for tensor in known(avatar.appearance).layers()))
+    bases, neutral = store["feature_bases"].double(), store["neutral_features"].double()
+    nothing = neutral.new_zeros(len(neutral), 0)
+    color, opacity = feature_network_reference(bases, activations.double(), neutral, nothing, exact)
+    static = GaussianAvatars(replace(CONFIG, appearance="static"), toy_face_model(), toy_face(5))
+    static.store.load_state_dict({name: store.state_dict()[name] for name in static.store.state_dict()})
+    posed, plain = avatar.pose(face).gaussians, static.pose(face).gaussians
+    logits = store["opacity_logits"] + opacity + store["opacity_basis"] @ activations[:RANK]
+    torch.testing.assert_close(posed.sh.view(-1, 3).double(), store["sh_constant"][:, 0] + color, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(posed.opacities.view(-1).double(), logits.sigmoid(), atol=1e-6, rtol=1e-5)
+    assert color.abs().max() > 0.1
+    assert all(torch.equal(getattr(posed, part), getattr(plain, part)) for part in ("means", "quats", "scales"))
+
+
+@pytest.mark.parametrize("settings", [{}, {"expression_offset_rate": Rate(0.0), "expression_opacity_rate": Rate(0.0)}])
+def test_baked_avatars_pose_alike_far_from_what_was_filmed(settings: dict[str, Rate], tmp_path: Path) -> None:
+    avatar, face = with_features(replace(CONFIG, **settings)), toy_face(5)
+    face, portable = replace(face, expression=30.0 * face.expression), make_portable(avatar, toy_camera(64), "toy")
+    runtime.write_portable(tmp_path / "a.mien", portable)
+    baked, expected = runtime.load(tmp_path / "a.mien").portable.baked, avatar.pose(face).gaussians
+    for index in range(len(face)):
+        found, truth = runtime.pose(baked, runtime_face(face[index])), expected.timestep(index)
+        for part in PARTS:
+            own, theirs = getattr(found, part), getattr(truth, part).detach().numpy()
+            np.testing.assert_allclose(own, theirs, atol=1e-5, rtol=1e-4, err_msg=part)
+    assert pack(portable), "a page holds them"
+
+
+def test_a_gaussian_without_features_never_changes_and_changes_have_a_penalty() -> None:
+    avatar = with_features(replace(CONFIG, appearance_weight=0.5))
+    for name in ("feature_bases", "neutral_features"):
+        avatar.store[name].data[0] = 0
+    posed = avatar.pose(toy_face(5)[1])
+    changes = [posed.aux[name] for name in ("feature_color", "feature_opacity")]
+    assert all(not each[0].any() and each[1].any() for each in changes)
+    losses = avatar.regularizers(posed, pictured(len(avatar.store)), Progress(0, 1))
+    torch.testing.assert_close(losses["appearance"], 0.5 * sum(each.square().mean() for each in changes))
+
+
+def test_features_have_their_own_number_of_activations() -> None:
+    """Bases take the first activations."""
+    avatar = with_features()
+    assert avatar.store["feature_bases"].shape[1] == DIRECTIONS
+    assert avatar.store["offset_basis"].shape[-1] == RANK
+    baked = avatar.bake()
+    changes = known(baked.changes)
+    features = known(changes.features)
+    assert changes.basis_columns == RANK
+    rows = {name: getattr(features, name)[:-1] for name in ("neutral", "basis", "own")}
+    for change, part in (
+        *(({"basis_columns": columns}, "") for columns in (0, RANK + 1, 99)),
+        ({"features": replace(features, **rows)}, "features"),
+        ({"features": replace(features, basis=features.basis[:, :-1])}, "features"),
+        (
+            {"features": replace(features, biases=(features.biases[0], features.biases[1][:3]))},
+            "layers of its features",
+        ),
+    ):
+        assert part in known(baked_fault(replace(baked, changes=replace(changes, **change))))
+    alone = replace(CONFIG, expression_rank=0)
+    alone.check()
+    assert baked_fault(with_features(alone).bake()) is None
+    few = replace(GaussianAvatarsConfig(), appearance_directions=3, expression_rank=4)
+    with pytest.raises(UserError, match=r"--method.appearance-directions 3: .* --method.expression-rank 4"):
+        few.check()
+    replace(few, appearance_directions=4).check()

@@ -12,12 +12,10 @@ HEAD = torch.tensor([0.0, 0.0, -0.9], dtype=torch.float64)
 
 def cameras_at(*angles: float) -> CameraBatch:
     """Return cameras around the head, at angles in radians to the subject's left of straight ahead."""
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     turned = torch.tensor(angles, dtype=torch.float64)
     places = HEAD + 0.9 * torch.stack([turned.sin(), 0 * turned, turned.cos()], dim=1)
-    return CameraBatch(
-        still_camera().K.expand(len(angles), 3, 3), torch.stack([look_at(place, HEAD, up) for place in places])
-    )
+    looks = torch.stack([look_at(place, HEAD, HEAD.new_tensor([0.0, 1.0, 0.0])) for place in places])
+    return CameraBatch(still_camera().K.expand(len(angles), 3, 3), looks)
 
 
 def views_of(*pictures: tuple[int, int]) -> Views:
@@ -41,10 +39,7 @@ def test_side_views_count_little_and_trust_goes_with_the_head():
     trust = trust_of(views_of((0, 0), (0, 1), (1, 0), (1, 1)), heads_turned(0.0, 1.0), cameras_at(0.0, 1.0))
     assert trust[0] == trust[3] == 1
     assert trust[1:3].max() < 0.05
-
-
-def test_the_best_picture_of_a_timestep_counts_whole():
-    """It counts in full even if it shows the head from the side; otherwise priors would decide."""
+    # The best picture of a timestep counts whole, even from the side; otherwise priors would decide.
     trust = trust_of(views_of((0, 0), (1, 1), (2, 0), (2, 1)), heads_turned(0.0, 0.0, 0.0), cameras_at(1.2, -1.5))
     assert trust[:3].eq(1).all()
     assert 0.2 < trust[3] < 0.6

@@ -7,16 +7,13 @@ import pytest
 import torch
 
 from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, GaussianStore, Progress
-from mien.avatar.gaussian_avatars.avatar import (
-    never_empty_a_triangle,
-)
+from mien.avatar.gaussian_avatars.avatar import never_empty_a_triangle
 from mien.avatar.gaussian_avatars.settings import SurfaceLimits
 from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface, limits_of_triangles
 from mien.avatar.ops.triangle_frames import bind_to_world, triangle_ellipses
 from mien.face import FaceModel
 from mien.gaussians import world_means
 from mien.render import rasterize
-from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_quaternion
 from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
@@ -29,18 +26,11 @@ def new_avatar(config: GaussianAvatarsConfig | None = None, face_model: FaceMode
     return GaussianAvatars(config or plain_gaussian_avatars(), face_model or toy_face_model(), toy_face(5))
 
 
-def rendering_of(radii: torch.Tensor) -> Rendering:
-    return replace(pictured(len(radii)), radii=radii.int())
-
-
 def test_starts_with_one_gray_faint_gaussian_a_triangle() -> None:
-    avatar = new_avatar()
-    face_model = avatar.face_model
-    gaussians = avatar.pose(toy_face(5)).gaussians
-    assert len(gaussians) == len(face_model.faces)
-    centroids = face_model(toy_face(5))[:, face_model.faces].mean(-2)
-    torch.testing.assert_close(world_means(gaussians), centroids, atol=1e-6, rtol=0)
-    torch.testing.assert_close(gaussians.opacities, torch.full((len(gaussians),), 0.1))
+    avatar, face = new_avatar(), toy_face(5)
+    gaussians, model = avatar.pose(face).gaussians, avatar.face_model
+    torch.testing.assert_close(world_means(gaussians), model(face)[:, model.faces].mean(-2), atol=1e-6, rtol=0)
+    torch.testing.assert_close(gaussians.opacities, torch.full((len(model.faces),), 0.1))
     assert (rgb_from_sh(gaussians.sh) - 0.5).abs().max() < 0.002
 
 
@@ -58,41 +48,35 @@ def test_first_colors_are_the_means_of_the_triangles_corners() -> None:
 
 
 def test_losses_are_those_of_the_paper() -> None:
-    avatar = new_avatar()
+    avatar, face = new_avatar(), toy_face(5)[0]
     store, n = avatar.store, len(avatar.store)
     with torch.no_grad():
         store["means"].zero_()
-        store["means"][0] = torch.tensor([0.0, 3.0, 4.0])
-        store["means"][1] = torch.tensor([0.0, 0.0, 0.9])
-        store["means"][2] = torch.tensor([100.0, 0.0, 0.0])
+        store["means"][:3] = torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.9], [100.0, 0.0, 0.0]])
         store["log_scales"].fill_(-3)
         store["log_scales"][0] = torch.tensor([0.6 + 3.0, 0.6 + 4.0, 0.5]).log()
         store["log_scales"][2] = 10
-    radii = torch.ones(n)
-    radii[2] = 0
-    losses = avatar.regularizers(avatar.pose(toy_face(5)[0]), rendering_of(radii), Progress(0, 1))
-    # Means over the n - 1 visible Gaussians; the third, which is out of bounds, is not in view.
-    assert losses["position"].item() == pytest.approx(0.01 * (5 - 1) / (n - 1), rel=1e-5)
-    assert losses["scale"].item() == pytest.approx(1.0 * 5 / (n - 1), rel=1e-5)
-    losses = avatar.regularizers(avatar.pose(toy_face(5)[0]), rendering_of(torch.zeros(n)), Progress(0, 1))
-    assert [loss.item() for loss in losses.values()] == [0, 0], "nothing is in view"
+    # Means over the n - 1 visible Gaussians; the third, which is out of bounds, is not in view. Then nothing is.
+    for radii, position, scale in (
+        (1 - torch.eye(n)[2], 0.01 * (5 - 1) / (n - 1), 1.0 * 5 / (n - 1)),
+        (torch.zeros(n), 0, 0),
+    ):
+        rendering = replace(pictured(n), radii=radii.int())
+        losses = avatar.regularizers(avatar.pose(face), rendering, Progress(0, 1))
+        assert [losses[name].item() for name in ("position", "scale")] == pytest.approx([position, scale], rel=1e-5)
 
 
 def test_sh_degrees_are_switched_on_one_after_the_other() -> None:
-    avatar = new_avatar(plain_gaussian_avatars(sh_degree=3, sh_warmup=0.4))
-    counts = [
-        avatar.pose(toy_face(5)[0], Progress(step, 100)).gaussians.sh.shape[-2] for step in (0, 9, 10, 20, 31, 99)
-    ]
+    avatar, face = new_avatar(plain_gaussian_avatars(sh_degree=3, sh_warmup=0.4)), toy_face(5)[0]
+    counts = [avatar.pose(face, Progress(step, 100)).gaussians.sh.shape[-2] for step in (0, 9, 10, 20, 31, 99)]
     assert counts == [1, 1, 4, 9, 16, 16]
-    assert avatar.pose(toy_face(5)[0]).gaussians.sh.shape[-2] == 16
+    assert avatar.pose(face).gaussians.sh.shape[-2] == 16
 
 
 def test_head_frame_sees_the_same_picture_but_for_the_light() -> None:
-    world, head = (new_avatar(plain_gaussian_avatars(sh_frame=frame)) for frame in ("world", "head"))
-    face = toy_face(5)[1]
-    pictures = [
-        rasterize(a.pose(face).gaussians.timestep(0), toy_camera(32), torch.ones(3)).image for a in (world, head)
-    ]
+    avatars = (new_avatar(plain_gaussian_avatars(sh_frame=frame)) for frame in ("world", "head"))
+    drawn = (avatar.pose(toy_face(5)[1]).gaussians.timestep(0) for avatar in avatars)
+    pictures = [rasterize(gaussians, toy_camera(32), torch.ones(3)).image for gaussians in drawn]
     torch.testing.assert_close(*pictures, atol=2e-4, rtol=0)
 
 
@@ -107,12 +91,11 @@ def test_no_triangle_is_emptied() -> None:
 @pytest.mark.parametrize(("hair", "widen"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
 def test_limits_keep_gaussians_on_the_surface(hair: float, widen: float) -> None:
     torch.manual_seed(0)
-    count, limits = 200, SurfaceLimits(enabled=True)
-    values = {"means": torch.randn(count, 3), "quats": torch.randn(count, 4), "log_scales": torch.randn(count, 3)}
-    store = GaussianStore(values, {"face_index": torch.arange(count) % 5})
+    limits, shapes = SurfaceLimits(enabled=True), {"means": (200, 3), "quats": (200, 4), "log_scales": (200, 3)}
+    values = {name: torch.randn(shape) for name, shape in shapes.items()}
+    store = GaussianStore(values, {"face_index": torch.arange(200) % 5})
     sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
-    widening = torch.full((5,), widen)
-    table = limits_of_triangles(limits, sizes, torch.full((5,), hair), widening)
+    table = limits_of_triangles(limits, sizes, torch.full((5,), hair), torch.full((5,), widen))
     keep_on_surface(store, table, limits.ratio)
     size = sizes[store["face_index"]]
     height, scales = store["means"][:, 1] * size, store["log_scales"].exp() * size[:, None]

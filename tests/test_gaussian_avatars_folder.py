@@ -11,8 +11,8 @@ import torch
 
 from flame_like import posed_as_flame
 from fuzzing.material import tiny_flame
+from known import known
 from mien.avatar import METHODS, Avatar
-from mien.camera import camera_from_fov
 from mien.errors import UserError
 from mien.export import read_gaussian_avatars_folder, read_ply, write_gaussian_avatars_folder
 from mien.export.flame_params import read_flame_params, write_flame_params
@@ -22,7 +22,7 @@ from mien.render import rasterize
 from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_camera, toy_face, toy_face_model
 
-SIZE = 64
+CAMERA = toy_camera(64)
 EQUAL = 1e-4
 
 
@@ -40,10 +40,9 @@ def new_avatar(face_model: FaceModel, face: FaceParams, **config: object) -> Ava
 
 
 @torch.no_grad()
-def drawn(avatar: Avatar, face: FaceParams, camera) -> torch.Tensor:
+def drawn(avatar: Avatar, face: FaceParams) -> torch.Tensor:
     gaussians = avatar.pose(face).gaussians
-    pictures = [rasterize(gaussians.timestep(t), camera, torch.ones(3)).image for t in range(len(face))]
-    return torch.stack(pictures)
+    return torch.stack([rasterize(gaussians.timestep(t), CAMERA, torch.ones(3)).image for t in range(len(face))])
 
 
 @pytest.fixture
@@ -54,20 +53,17 @@ def flame(tmp_path: Path) -> FaceModel:
     return flame_face_model(read_flame(path), "tiny")
 
 
-def flame_face(model: FaceModel, timesteps: int = 4) -> FaceParams:
+def flame_face(model: FaceModel) -> FaceParams:
     random = torch.Generator().manual_seed(2)
 
     def some(*shape: int, size: float) -> torch.Tensor:
         return size * torch.randn(*shape, generator=random)
 
     return FaceParams(
-        some(len(model.identity_basis), size=1.0),
-        some(timesteps, len(model.expression_basis), size=1.0),
-        some(timesteps, 4, 3, size=0.15),
-        some(timesteps, 3, size=0.2),
-        some(timesteps, 3, size=0.02) + torch.tensor([0.0, 0.0, -0.6]),
-        some(len(model.template), 3, size=1e-3),
-    )
+        some(len(model.identity_basis), size=1.0), some(4, len(model.expression_basis), size=1.0),
+        some(4, 4, 3, size=0.15), some(4, 3, size=0.2),
+        some(4, 3, size=0.02) + torch.tensor([0.0, 0.0, -0.6]), some(len(model.template), 3, size=1e-3),
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -87,25 +83,24 @@ def test_a_written_folder_draws_the_same(config: dict, tmp_path: Path) -> None:
     read = read_gaussian_avatars_folder(tmp_path / "a")
     assert len(read.avatar.gaussian_store()) == len(avatar.gaussian_store()) > len(model.faces)
     assert read.avatar.face_model.content_hash == model.content_hash
-    pictures = drawn(avatar, face, toy_camera(SIZE))
+    pictures = drawn(avatar, face)
     assert float((pictures[0] - pictures[2]).abs().max()) > 0.05
-    assert float((drawn(read.avatar, read.face, toy_camera(SIZE)) - pictures).abs().max()) < EQUAL
+    assert float((drawn(read.avatar, read.face) - pictures).abs().max()) < EQUAL
 
 
 def test_a_folder_on_flame_draws_the_same(flame: FaceModel, tmp_path: Path) -> None:
     """Parameters become FLAME's and come back; FLAME itself is not in the folder and has to be given."""
-    flame = replace(flame, shareable=False)
+    flame, folder = replace(flame, shareable=False), tmp_path / "a"
     face = flame_face(flame)
     avatar = new_avatar(flame, face, sh_degree=1)
-    write_gaussian_avatars_folder(tmp_path / "a", avatar, face)
-    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["flame_param.npz", "point_cloud.ply"]
+    write_gaussian_avatars_folder(folder, avatar, face)
+    assert sorted(path.name for path in folder.iterdir()) == ["flame_param.npz", "point_cloud.ply"]
     with pytest.raises(UserError, match="has no face model in it.*--face-model"):
-        read_gaussian_avatars_folder(tmp_path / "a")
-    read = read_gaussian_avatars_folder(tmp_path / "a", flame)
-    camera = camera_from_fov(0.6, SIZE, SIZE, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
-    pictures = drawn(avatar, face, camera)
+        read_gaussian_avatars_folder(folder)
+    read = read_gaussian_avatars_folder(folder, flame)
+    pictures = drawn(avatar, face)
     assert float(pictures.std()) > 0.05
-    assert float((drawn(read.avatar, read.face, camera) - pictures).abs().max()) < EQUAL
+    assert float((drawn(read.avatar, read.face) - pictures).abs().max()) < EQUAL
 
 
 def test_parameters_are_those_of_flame(flame: FaceModel, tmp_path: Path) -> None:
@@ -129,16 +124,11 @@ def test_parameters_are_those_of_flame(flame: FaceModel, tmp_path: Path) -> None
 def test_offsets_without_teeth_are_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flame: FaceModel) -> None:
     v = len(flame.template)
     monkeypatch.setattr("mien.export.flame_params.TEETH", (v - 20, v))
-    path = tmp_path / "flame_param.npz"
-    write_flame_params(path, flame, flame_face(flame))
-    with np.load(path) as file:
-        stored = dict(file)
-    stored["static_offset"] = stored["static_offset"][:, : v - 20]
-    stored["dynamic_offset"] = np.zeros((4, v, 3), np.float32)
-    np.savez(path, **stored)  # pyright: ignore[reportArgumentType]
-    offsets = read_flame_params(path, flame).vertex_offsets
-    assert offsets is not None
-    assert np.array_equal(offsets[: v - 20].numpy(), stored["static_offset"][0])
+    write_flame_params(tmp_path / "flame_param.npz", flame, flame_face(flame))
+    own = known(flame_face(flame).vertex_offsets)
+    change(tmp_path, static_offset=own[None, : v - 20].numpy(), dynamic_offset=np.zeros((4, v, 3), np.float32))
+    offsets = known(read_flame_params(tmp_path / "flame_param.npz", flame).vertex_offsets)
+    assert torch.equal(offsets[: v - 20], own[: v - 20])
     assert not offsets[v - 20 :].any()
 
 
@@ -147,58 +137,49 @@ def test_a_ply_with_local_means_is_refused_without_its_mesh(folder: Path) -> Non
         read_ply(folder / "point_cloud.ply")
 
 
-def with_binding(folder: Path, kind: str, numpy_kind: str, values) -> None:
-    """Write binding_0 again with another type."""
-    path = folder / "point_cloud.ply"
-    content = path.read_bytes()
-    end = content.index(b"end_header\n") + len(b"end_header\n")
-    header = content[:end].replace(b"property int binding_0", f"property {kind} binding_0".encode())
-    rows = np.frombuffer(content[end:], np.uint8).reshape(-1, (len(content) - end) // _count(header))
-    column = values(rows[:, -4:].copy().view("<i4")[:, 0]).astype(numpy_kind)
-    column = np.frombuffer(column.tobytes(), np.uint8).reshape(len(rows), -1)
-    path.write_bytes(header + np.concatenate([rows[:, :-4], column], axis=1).tobytes())
+KINDS = {"int": "<i4", "int32": "<i4", "uint": "<u4", "short": "<i2", "float": "<f4", "double": "<f8"}
 
 
-def _count(header: bytes) -> int:
-    return int(header.split(b"element vertex ")[1].split(b"\n")[0])
+def edit(folder: Path, kind: str = "int", **values: float) -> None:
+    """Change values of the fourth Gaussian, and write binding_0 with another type."""
+    header, mark, body = (folder / "point_cloud.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1].decode() for line in header.split(b"\n") if line.startswith(b"property")]
+    old, new = ([(name, KINDS[one] if name == "binding_0" else "<f4") for name in names] for one in ("int", kind))
+    rows = np.frombuffer(body, old).astype(new)
+    for name, value in values.items():
+        rows[name][3] = value
+    header = header.replace(b"int binding_0", f"{kind} binding_0".encode())
+    (folder / "point_cloud.ply").write_bytes(header + mark + rows.tobytes())
 
 
-@pytest.mark.parametrize(("kind", "numpy_kind"), [("int32", "<i4"), ("short", "<i2"), ("double", "<f8")])
-def test_the_binding_may_be_of_any_type(kind: str, numpy_kind: str, folder: Path) -> None:
+@pytest.mark.parametrize("kind", ["int32", "short", "double"])
+def test_the_binding_may_be_of_any_type(kind: str, folder: Path) -> None:
     before = read_gaussian_avatars_folder(folder).avatar.gaussian_store()["face_index"]
-    with_binding(folder, kind, numpy_kind, lambda values: values)
+    edit(folder, kind)
     assert torch.equal(read_gaussian_avatars_folder(folder).avatar.gaussian_store()["face_index"], before)
 
 
-FIRST = {"nan": np.nan, "half": 2.5, "negative": -1, "too_large": 1e6}
-
-
-@pytest.mark.parametrize("fault", [*FIRST, "negative int", "too large uint", "missing"])
-def test_a_damaged_binding_is_named(fault: str, folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [("float", np.nan), ("float", 2.5), ("float", -1), ("float", 1e6), ("int", -1), ("uint", 2**31 - 1), ("gone", 0)],
+)
+def test_a_damaged_binding_is_named(kind: str, value: float, folder: Path) -> None:
     path = folder / "point_cloud.ply"
-    if fault == "missing":
+    if kind == "gone":
         path.write_bytes(path.read_bytes().replace(b"int binding_0", b"float bonding_"))
-    elif fault in FIRST:
-        with_binding(folder, "float", "<f4", lambda values: np.where(np.arange(len(values)) == 3, FIRST[fault], values))
     else:
-        number, kind = (-1, "int") if "negative" in fault else (2**31 - 1, fault.split()[-1])
-        with_binding(
-            folder, kind, "<i4" if kind == "int" else "<u4", lambda values: np.where(values == 3, number, values)
-        )
-    with pytest.raises(UserError, match=r"point_cloud.ply: (lacks )?binding_0") as error:
+        edit(folder, kind, binding_0=value)
+    with pytest.raises(UserError, match=r"point_cloud.ply: (lacks )?binding_0[^\n]*; [^\n]*$"):
         read_gaussian_avatars_folder(folder)
-    assert "\n" not in str(error.value)
-    assert "; " in str(error.value)
 
 
 def change(folder: Path, **arrays: np.ndarray | None) -> None:
     """Replace arrays of flame_param.npz, or remove them."""
     path = folder / "flame_param.npz"
     with np.load(path) as file:
-        stored = dict(file)
-    stored |= {name: array for name, array in arrays.items() if array is not None}
-    stored = {name: array for name, array in stored.items() if not (name in arrays and arrays[name] is None)}
-    np.savez(path, allow_pickle=True, **stored)  # pyright: ignore[reportArgumentType]
+        changed = dict(file) | arrays
+    stored: dict = {name: array for name, array in changed.items() if array is not None}
+    np.savez(path, allow_pickle=True, **stored)
 
 
 FAULTS = {
@@ -216,18 +197,9 @@ FAULTS = {
     "shape": (lambda f: change(f, shape=np.ones(3, np.float32)), "3 coefficients, but the face model has 2"),
     "offsets": (lambda f: change(f, static_offset=np.ones((1, 9, 3), np.float32)), "'static_offset' has the shape"),
     "moving": (lambda f: change(f, dynamic_offset=np.ones((5, 9, 3), np.float32)), "'dynamic_offset' is not zero"),
-    "scales": (lambda f: _spoil(f, "scale_0", 1e5), "cannot be posed"),
-    "means": (lambda f: _spoil(f, "x", np.nan), "means holds NaN"),
+    "scales": (lambda f: edit(f, scale_0=1e5), "cannot be posed"),
+    "means": (lambda f: edit(f, x=np.nan), "means holds NaN"),
 }  # fmt: skip
-
-
-def _spoil(folder: Path, name: str, value: float) -> None:
-    path = folder / "point_cloud.ply"
-    content = bytearray(path.read_bytes())
-    end = content.index(b"end_header\n") + len(b"end_header\n")
-    names = [line.split()[-1].decode() for line in bytes(content[:end]).split(b"\n") if line.startswith(b"property")]
-    content[end + 4 * names.index(name) : end + 4 * names.index(name) + 4] = np.float32(value).tobytes()
-    path.write_bytes(content)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -258,17 +230,15 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(folder: Path) -> None:
         read_gaussian_avatars_folder(folder)
 
 
-def test_changes_with_the_expression_are_refused(tmp_path: Path) -> None:
-    """Changes with the expression would be lost silently, so nothing is written."""
-    model, face = toy_face_model(), toy_face(2)
-    with pytest.raises(UserError, match="cannot hold Gaussians that change with the expression"):
-        write_gaussian_avatars_folder(tmp_path / "out", new_avatar(model, face, expression_rank=2), face)
-    assert not (tmp_path / "out").exists()
-
-
 def test_methods_without_triangles_are_refused(tmp_path: Path) -> None:
-    model, face = toy_face_model(), toy_face(5)
-    avatar = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, face)
-    with pytest.raises(UserError, match="bound to triangles"):
-        write_gaussian_avatars_folder(tmp_path / "a", avatar, face)
-    assert not (tmp_path / "a").exists()
+    """And changes with the expression, which would be lost silently. Nothing is written."""
+    model, face = toy_face_model(), toy_face(2)
+    headgas = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, face)
+    changing = new_avatar(model, face, expression_rank=2)
+    for avatar, words in (
+        (headgas, "bound to triangles"),
+        (changing, "cannot hold Gaussians that change with the exp"),
+    ):
+        with pytest.raises(UserError, match=words):
+            write_gaussian_avatars_folder(tmp_path / "a", avatar, face)
+        assert not (tmp_path / "a").exists()

@@ -55,28 +55,17 @@ def _sequence(model: FaceModel, height: float, grows: torch.Tensor | None = None
     return Sequence("head", capture, tracking, mattes)
 
 
-def _height(model: FaceModel, sequence: Sequence) -> torch.Tensor:
-    frames = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
-    return hair_height(model, [sequence], [sequence.tracking.face], frames, threads=1)
-
-
 @pytest.mark.unchecked
 @pytest.mark.parametrize("height", [0.0, 0.012, 0.03])
 def test_the_height_of_a_scalp_that_stands_out(anny, height):
-    found = _height(anny, _sequence(anny, height))
+    sequence, frames = _sequence(anny, height), [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
+    found = hair_height(anny, [sequence], [sequence.tracking.face], frames, threads=1)
     middles, scalp = anny.template[anny.faces].mean(1), head_parts(anny).scalp
-    top = scalp & (middles[:, 1] > 0.07)
-    back = scalp & (middles[:, 2] < -0.06)
-    assert abs(float(found[top].median()) - height) < 0.004
-    assert abs(float(found[back].median()) - height) < 0.006
+    assert abs(float(found[scalp & (middles[:, 1] > 0.07)].median()) - height) < 0.004
+    assert abs(float(found[scalp & (middles[:, 2] < -0.06)].median()) - height) < 0.006
     assert not found[~scalp].any()
-
-
-def test_without_an_outline_there_is_no_height(anny):
-    sequence = _sequence(anny, 0.01)
     sequence.capture.mattes[:] = 255
-    found = _height(anny, sequence)
-    assert (found == 0).all()
+    assert not hair_height(anny, [sequence], [sequence.tracking.face], frames, threads=1).any(), "no outline"
 
 
 @pytest.mark.unchecked
@@ -109,19 +98,16 @@ def _back_hair(model: FaceModel, hanging: torch.Tensor, hair: float = _HAIR) -> 
 
 def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
     middles, _, normals = triangle_geometry(anny.template, anny.faces)
-    found = _back_hair(anny, _beside(anny))
+    found, parts = _back_hair(anny, _beside(anny)), head_parts(anny)
     nape = (found > 0) & (normals[:, 2] < -0.8) & (middles[:, 0].abs() < 0.02)
     assert int(nape.sum()) > 10
-    scalp = middles[head_parts(anny).scalp]
-    axis = (scalp[:, 2].min() + scalp[:, 2].max()) / 2
-    back = axis - (scalp[:, 2].min() - _HAIR)
-    behind = axis - (middles + found[:, None] * normals)[nape, 2]
-    level = middles[nape, 1] > middles[nape, 1].median()
-    assert (behind[level] - back).abs().median() < 0.006
-    assert not found[normals[:, 2] >= 0].any()
-    assert not found[head_parts(anny).face].any()
+    low, high = middles[parts.scalp, 2].aminmax()
+    outside = middles + found[:, None] * normals
+    level = nape & (middles[:, 1] > middles[nape, 1].median())
+    assert (outside[level, 2] - (low - _HAIR)).abs().median() < 0.006
+    assert not found[(normals[:, 2] >= 0) | parts.face].any()
     cut = fit_neck_cut(NeckParts.of(anny), anny.template, torch.tensor([0.0, 1.0, 0.0]))
-    assert (cut.margins((middles + found[:, None] * normals)[found > 0]) > 0).all(), "no hair hangs below the cut"
+    assert (cut.margins(outside[found > 0]) > 0).all(), "no hair hangs below the cut"
     shorter = _back_hair(anny, _beside(anny, low=-0.09))
     assert float(middles[found > 0][:, 1].min()) < float(middles[shorter > 0][:, 1].min()) - 0.01, "as at the sides"
 
@@ -154,18 +140,16 @@ def _back(model: FaceModel) -> torch.Tensor:
 
 
 def _strands(model: FaceModel) -> dict[str, torch.Tensor]:
-    count = len(model.faces)
-    heights, colors = torch.full((count,), _HAIR), torch.full((count, 3), 0.4)
+    heights, colors = torch.full((len(model.faces),), _HAIR), torch.full((len(model.faces), 3), 0.4)
     return strand_gaussians(model.template, model.faces, _back(model), heights, colors)
 
 
 def test_strands_cover_the_chosen_triangles_and_hang_in_the_surface(anny):
     strands, frames = _strands(anny), triangle_frames(anny.template, anny.faces)
     counts = torch.bincount(strands["face_index"], minlength=len(anny.faces)).double()
-    assert not counts[~_back(anny)].any()
-    a, b, c = (anny.template[anny.faces[:, corner].long()].double() for corner in range(3))
-    expected = 150_000 * 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1) * _back(anny)
+    expected = 150_000 * triangle_geometry(anny.template.double(), anny.faces)[1] * _back(anny)
     assert float((counts - expected).abs().max()) <= 1
+    assert not counts[~_back(anny)].any()
     assert len(strands["means"]) > 1000
     # Just below the top of the hair.
     above = strands["means"][:, 1] * frames.k[strands["face_index"]]
@@ -178,32 +162,27 @@ def test_strands_cover_the_chosen_triangles_and_hang_in_the_surface(anny):
     assert float((along * normals).sum(-1).abs().max()) < 1e-4
     assert float(along[:, 1].median()) < -0.8
     assert float(along[:, 0].abs().median()) < 0.4
-
-
-def test_strands_differ_in_brightness_and_not_in_tint_or_between_calls(anny):
-    strands = _strands(anny)
+    # They differ in brightness, and not in tint or between calls.
     colors = rgb_from_sh(strands["sh_constant"][:, 0])
     assert abs(float(colors.mean()) - 0.4) < 0.01
     assert 0.06 < float(colors[:, 0].std()) < 0.1
     torch.testing.assert_close(colors[:, 0], colors[:, 2])
     again = _strands(anny)
     assert all(strands[name].equal(again[name]) for name in strands)
-    count, none = len(anny.faces), torch.zeros(len(anny.faces), dtype=torch.bool)
-    empty = strand_gaussians(anny.template, anny.faces, none, torch.zeros(count), torch.zeros(count, 3))
-    assert all(len(values) == 0 for values in empty.values())
+    none = torch.zeros(len(anny.faces), dtype=torch.bool)
+    empty = strand_gaussians(anny.template, anny.faces, none, none.float(), none[:, None].expand(-1, 3).float())
+    assert not any(len(values) for values in empty.values())
 
 
 def test_a_closed_head_has_strands_that_keep_their_colors(anny):
-    face, count = anny.neutral(1), len(anny.faces)
-    avatar = method_named("gaussian_avatars").avatar(PRESETS["standard"].config("gaussian_avatars"), anny, face)
-    store = avatar.gaussian_store()
-    bald = len(store)
-    chosen, color = _back(anny), torch.full((count, 3), 0.4)
-    hair, doubt = torch.full((count,), _HAIR), chosen.float()
-    prior = SurfacePrior(hair, colors=color, doubt=doubt, filled_in=chosen, strands=chosen)
+    chosen, count = _back(anny), len(anny.faces)
+    config = PRESETS["standard"].config("gaussian_avatars")
+    avatar = method_named("gaussian_avatars").avatar(config, anny, anny.neutral(1))
+    store, bald = avatar.gaussian_store(), len(avatar.gaussian_store())
+    hair, color = torch.full((count,), _HAIR), torch.full((count, 3), 0.4)
+    prior = SurfacePrior(hair, colors=color, doubt=chosen.float(), filled_in=chosen, strands=chosen)
     surface_of(avatar).close(prior)
-    own = len(_strands(anny)["means"])
-    assert len(store) == bald + own
+    assert len(store) == bald + len(_strands(anny)["means"])
     before = store["sh_constant"][bald:].detach().clone()
     for _ in range(20):
         surface_of(avatar).keep_to(prior)

@@ -1,4 +1,4 @@
-"""The surface of hair rises and sinks as a whole where that lowers the loss. Limits and side views follow it."""
+"""The surface of hair follows the loss as a whole, and hidden Gaussians are removed or become a closed surface again."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,20 +7,30 @@ from typing import Any
 import pytest
 import torch
 
+from known import known
 from mien.avatar import SurfacePrior, method_named
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
-from mien.face import FaceModel
+from mien.avatar.ops.triangle_frames import triangle_ellipses
+from mien.camera import Camera, camera_from_fov
+from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
+from mien.gaussians import sh_from_rgb
+from mien.render import rasterize
 from mien.training import PRESETS, Sequence, train
+from mien.training.footage.coverage import triangle_views
 from mien.training.footage.frames import training_frames
 from mien.training.parts import Preparation
 from mien.training.trainer import start
+from mien.training.whole_head.contribution import contributions, prune_hidden
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.part import prepare_whole_head
+from mien.training.whole_head.unseen import Unseen
 from plain_settings import plain_run
+from sh_colors import rgb_from_sh
+from test_training_resume import RESULTS
 from toy_scene import surface_of, toy_sequence
-from training_progress import stopped_at
+from train_toy import stopped_at
 
 _HAIR, _RATE = 0.02, 1e-3
 CONFIG = PRESETS["draft"].config("gaussian_avatars")
@@ -34,18 +44,13 @@ def _avatar(model: FaceModel) -> GaussianAvatars:
     return avatar
 
 
-def _prior(model: FaceModel) -> SurfacePrior:
+def _with_surface(model: FaceModel) -> tuple[GaussianAvatars, SurfacePrior, HairSurface]:
     """Hair everywhere on the scalp. The back of the head is made up."""
-    scalp = head_parts(model).scalp
+    scalp, avatar = head_parts(model).scalp, _avatar(model)
     back = scalp & (model.template[model.faces].mean(1)[:, 2] < 0)
     colors = torch.full((len(model.faces), 3), 0.3)
-    return SurfacePrior(_HAIR * scalp.float(), colors=colors, doubt=back.float(), filled_in=back)
-
-
-def _surface(avatar: GaussianAvatars, prior: SurfacePrior) -> HairSurface:
-    surface = hair_surface(avatar, prior)
-    assert surface is not None
-    return surface
+    prior = SurfacePrior(_HAIR * scalp.float(), colors=colors, doubt=back.float(), filled_in=back)
+    return avatar, prior, known(hair_surface(avatar, prior))
 
 
 def _pull(avatar: GaussianAvatars, surface: HairSurface, slope: float, rounds: int = 1) -> None:
@@ -61,26 +66,20 @@ def _pull(avatar: GaussianAvatars, surface: HairSurface, slope: float, rounds: i
 def test_the_gradient_of_the_height_is_that_of_the_posed_gaussians(anny):
     """A loss that is the centres' place along the normals has a slope of 1 a metre for each Gaussian."""
     avatar = _avatar(anny)
-    face = anny.neutral(1)
     normals = triangle_geometry(anny.head_vertices(avatar.subject)[0], anny.faces)[2]
-    means = avatar.pose(avatar.subject).gaussians.means.reshape(-1, 3)
-    assert len(face) == 1
-    (means * normals).sum().backward()
-    gradient = surface_of(avatar).height_gradient()
-    assert gradient is not None
-    big = surface_of(avatar).sizes > 1e-3
-    torch.testing.assert_close(gradient[big], torch.ones_like(gradient)[big], rtol=0.01, atol=0.01)
+    (avatar.pose(avatar.subject).gaussians.means.reshape(-1, 3) * normals).sum().backward()
+    gradient = known(surface_of(avatar).height_gradient())[surface_of(avatar).sizes > 1e-3]
+    torch.testing.assert_close(gradient, torch.ones_like(gradient), rtol=0.01, atol=0.01)
 
 
 @pytest.mark.parametrize("slope", [1.0, -1.0])
 def test_hair_moves_against_the_slope(anny, slope):
-    avatar, prior = _avatar(anny), _prior(anny)
-    surface = _surface(avatar, prior)
+    avatar, prior, surface = _with_surface(anny)
     before = avatar.store["means"].detach()[:, 1].clone()
     _pull(avatar, surface, slope, rounds=5)
     shift, scalp = surface.shift, head_parts(anny).scalp
     assert not shift[~scalp].any()
-    front = scalp & ~(prior.filled_in if prior.filled_in is not None else scalp)
+    front = scalp & ~known(prior.filled_in)
     assert (shift[front] * slope < -0.5 * _RATE).all()
     assert float((shift[front] * slope).median()) < -3 * _RATE
     moved = (avatar.store["means"].detach()[:, 1] - before) * surface_of(avatar).sizes
@@ -94,31 +93,21 @@ def test_hair_moves_against_the_slope(anny, slope):
     assert not shift[far].any()
 
 
-def test_pictures_that_disagree_move_little(anny):
-    avatar, prior = _avatar(anny), _prior(anny)
-    surface = _surface(avatar, prior)
-    for turn in range(40):
-        _pull(avatar, surface, 1.0 if turn % 2 else -1.0)
-    assert float(surface.shift.abs().max()) < 3 * _RATE
-
-
-def test_hair_sinks_to_the_skin_and_no_deeper(anny):
-    avatar, prior = _avatar(anny), _prior(anny)
-    surface = _surface(avatar, prior)
-    _pull(avatar, surface, 1.0, rounds=60)
-    assert float(surface.shift.min()) == pytest.approx(-_HAIR - 0.004, abs=1e-6)
-    assert float(surface.prior().hair.min()) == 0
-
-
-def test_outside_of_its_time_nothing_moves(anny):
-    avatar, surface = _avatar(anny), _surface(_avatar(anny), _prior(anny))
+def test_pictures_that_disagree_move_little_and_hair_sinks_to_the_skin(anny):
+    avatar, _, surface = _with_surface(anny)
     means = avatar.store["means"]
-    for fraction, rate in ((0.01, _RATE), (0.7, _RATE), (0.2, 0.0)):
+    for fraction, rate in ((0.01, _RATE), (0.7, _RATE), (0.2, 0.0)):  # outside of its time, nothing moves
         means.grad = torch.ones_like(means)
         surface.collect(surface_of(avatar), 0.1)
         surface.correct(surface_of(avatar), fraction, rate)
         assert not surface.shift.any()
         assert not surface.state["gradient"].any()
+    for turn in range(40):
+        _pull(avatar, surface, 1.0 if turn % 2 else -1.0)
+    assert float(surface.shift.abs().max()) < 3 * _RATE
+    _pull(avatar, surface, 1.0, rounds=60)
+    assert float(surface.shift.min()) == pytest.approx(-_HAIR - 0.004, abs=1e-6)
+    assert float(surface.prior().hair.min()) == 0
 
 
 def _toy_with_scalp() -> tuple[FaceModel, Sequence]:
@@ -132,17 +121,12 @@ def test_limits_and_side_views_follow_the_hair():
     settings = replace(SETTINGS, side_weight=0.1)
     avatar = start([sequence], model, CONFIG, settings).avatar
     faces, frames = [sequence.tracking.face], training_frames([sequence], settings)
-    make = prepare_whole_head(Preparation(avatar, model, [sequence], faces, frames, settings, torch.zeros(())))
-    assert make is not None
-    head = make()
-    assert head.hair is not None
-    assert head.side_views is not None
-    height = head.side_views.height
-    state = head.part().state()
+    given = Preparation(avatar, model, [sequence], faces, frames, settings, torch.zeros(()))
+    head = known(prepare_whole_head(given))()
+    height, scalp, state = known(head.side_views).height, head_parts(model).scalp, head.part().state()
     head.part().load_state(state | {"shift": state["shift"] + 0.01})
-    scalp = head_parts(model).scalp
-    torch.testing.assert_close(head.unseen.prior.hair[scalp], head.hair.start.hair[scalp] + 0.01)
-    assert float(head.side_views.height.max()) > float(height.max())
+    torch.testing.assert_close(head.unseen.prior.hair[scalp], known(head.hair).start.hair[scalp] + 0.01)
+    assert float(known(head.side_views).height.max()) > float(height.max())
 
 
 @pytest.mark.unchecked
@@ -152,12 +136,114 @@ def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
 
     def run(name: str, *progress: Any, **changes: Any) -> list[bytes]:
         train([sequence], model, CONFIG, replace(SETTINGS, **changes), tmp_path / name, *progress)
-        return [
-            (tmp_path / name / file).read_bytes() for file in ("avatar/avatar.safetensors", "face_track.safetensors")
-        ]
+        return [(tmp_path / name / file).read_bytes() for file in RESULTS]
 
     whole = run("whole")
     with pytest.raises(KeyboardInterrupt):
         run("halves", stopped_at(10))
     assert run("halves") == whole
     assert run("still", hair_rate=0.0)[0] != whole[0]
+
+
+# -- hidden Gaussians ------------------------------------------------------------------------------------------------
+
+_COLOR = 0.3
+
+
+def _closed_avatar(model: FaceModel) -> tuple[GaussianAvatars, tuple[FaceParams, Camera], torch.Tensor]:
+    """An avatar, the view from its front, and the triangles at the back of its head."""
+    torch.manual_seed(0)
+    face = model.neutral(1)
+    face.head_translation[:, 2] = -0.8
+    config = PRESETS["draft"].config("gaussian_avatars")
+    avatar = method_named("gaussian_avatars").avatar(config, model, face)
+    assert isinstance(avatar, GaussianAvatars)
+    every = torch.ones(len(model.faces), dtype=torch.bool)
+    surface_of(avatar).fill_interior(every, 0.97, torch.full((len(model.faces), 3), 0.6))
+    away = triangle_views(model.template, model.faces, torch.tensor([0.0, 0.0, 0.8])) < -0.5
+    camera = camera_from_fov(0.5, 128, 128, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+    return avatar, (face, camera), head_parts(model).scalp & away
+
+
+def _seen_from_the_front(model: FaceModel, filled_in: torch.Tensor | None = None) -> Unseen:
+    parts, none = head_parts(model), torch.zeros(len(model.faces), dtype=torch.bool)
+    filled_in = none if filled_in is None else filled_in
+    prior = SurfacePrior(
+        0.01 * parts.scalp.float(), colors=torch.full((len(none), 3), _COLOR), filled_in=filled_in,
+        closed=filled_in | parts.interior,
+    )  # fmt: skip
+    return Unseen(None, prior)
+
+
+def test_contributions_are_the_shares_of_the_picture(anny):
+    avatar, (face, camera), back = _closed_avatar(anny)
+    found = contributions(avatar, [(face, camera)])
+    with torch.no_grad():
+        alpha = rasterize(avatar.pose(face).gaussians.timestep(0), camera, torch.zeros(3)).alpha
+    assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-4)
+    assert (found >= 0).all()
+    front = anny.region_mask("nose") & (triangle_views(anny(face)[0], anny.faces, camera.position) > 0.5)
+    assert float(found[back].median()) < 0.03
+    assert float(found[front].mean()) > 0.05
+    behind = replace(face, head_rotation=torch.tensor([[0.0, torch.pi, 0.0]]))
+    both = contributions(avatar, [(face, camera), (behind, camera)])
+    assert float(both[back].mean()) > 0.5
+    assert (both >= found).all()
+
+
+def test_of_hidden_copies_one_stays(anny):
+    """A third Gaussian on each hidden triangle, and a second one on triangles that are shown."""
+    avatar, view, back = _closed_avatar(anny)
+    back &= contributions(avatar, [view]) < 0.03
+    rows, n = back.nonzero()[:, 0], len(avatar.store)
+    avatar.store.append(rows)
+    avatar.store.append(rows)
+    removed = prune_hidden(avatar, _seen_from_the_front(anny), [view], close=True)
+    assert len(removed) == n + 2 * len(rows)
+    left = avatar.store["face_index"][~removed].bincount(minlength=len(anny.faces))
+    assert (left == 1).all(), "no triangle is left without a Gaussian, and none has two"
+    assert len(rows) > 50
+
+
+def test_hidden_copies_below_what_is_shown_go(anny):
+    avatar, view, _ = _closed_avatar(anny)
+    rows, n = (anny.region_mask("nose") & (contributions(avatar, [view]) > 0.2)).nonzero()[:, 0], len(avatar.store)
+    assert len(rows) > 20
+    avatar.store.append(rows)
+    avatar.store["means"].detach()[n:, 1] -= 0.01 / surface_of(avatar).sizes[rows]
+    removed = prune_hidden(avatar, _seen_from_the_front(anny), [view], close=True)
+    assert not removed[rows].any()
+    assert float(removed[n:].float().mean()) > 0.8
+
+
+@pytest.mark.parametrize("close", [True, False])
+def test_what_stays_becomes_a_surface_in_completed_colors(anny, close):
+    avatar, view, back = _closed_avatar(anny)
+    store, unseen = avatar.store, _seen_from_the_front(anny)
+    store.assign("opacity_logits", torch.where(back, -3.0, 4.0))
+    store.assign("offset_basis", torch.ones_like(store["offset_basis"]))
+    prune_hidden(avatar, unseen, [view], close=close)
+    torch.testing.assert_close(rgb_from_sh(store["sh_constant"][back, 0]), torch.full((int(back.sum()), 3), _COLOR))
+    height = store["means"].detach()[:, 1] * surface_of(avatar).sizes
+    if not close:
+        assert (store["opacity_logits"].detach()[back] == -3.0).all()
+        assert not height[back].any()
+        return
+    assert (store["opacity_logits"].detach()[back].sigmoid() > 0.9).all()
+    shapes = triangle_ellipses(anny.head_vertices(avatar.subject)[0], anny.faces)[1]
+    wide = store["log_scales"].detach()[back] - shapes[back]
+    torch.testing.assert_close(wide[:, 1], torch.zeros(int(back.sum())))
+    assert (wide[:, [0, 2]] > 0).all(), "hair is a shell around the head"
+    torch.testing.assert_close(height[back], unseen.prior.fill_height[back])
+    assert not store["offset_basis"][back].any()
+
+
+def test_made_up_sides_and_the_mouth_are_left_alone(anny):
+    avatar, view, back = _closed_avatar(anny)
+    alone = back | head_parts(anny).interior
+    avatar.store.append(alone.nonzero()[:, 0])
+    removed = prune_hidden(avatar, _seen_from_the_front(anny, back), [view], close=True)
+    own = alone[avatar.store["face_index"]]
+    assert not removed[own].any()
+    colors = avatar.store["sh_constant"].detach()[own]
+    assert torch.equal(colors, sh_from_rgb(torch.full_like(colors, 0.6)))

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from known import known
 from mien.adam import FactoredMoments, Moments
 from mien.avatar import HeadGas, HeadGasConfig, Progress, make_portable, method_named
 from mien.avatar.avatar import neutral_of
@@ -36,9 +37,10 @@ def new_avatar(config: HeadGasConfig = SMALL, face_model: FaceModel | None = Non
     return HeadGas(config, face_model or toy_face_model(), toy_face(5))
 
 
-def fill(tensor: Tensor, seed: int = 1) -> None:
-    with torch.no_grad():
-        tensor.copy_(torch.randn(tensor.shape, generator=torch.Generator().manual_seed(seed)))
+def fill(avatar: HeadGas, *names: str) -> None:
+    for seed, name in enumerate(names or ("bases", "neutral_features"), 1):
+        values = torch.randn(avatar.store[name].shape, generator=torch.Generator().manual_seed(seed))
+        avatar.store.assign(name, values)
 
 
 def inputs_of(face: FaceParams) -> Tensor:
@@ -47,14 +49,7 @@ def inputs_of(face: FaceParams) -> Tensor:
 
 def blended(avatar: HeadGas, face: FaceParams) -> Tensor:
     """The features [b, n, f] by the formula."""
-    inputs = (inputs_of(face) - avatar.rest) @ avatar.directions
-    return avatar.store["neutral_features"] + torch.einsum("bk,nkf->bnf", inputs, avatar.store["bases"])
-
-
-def test_the_person_at_rest_has_the_neutral_features() -> None:
-    avatar = new_avatar()
-    fill(avatar.store["bases"])
-    assert torch.equal(blended(avatar, avatar.subject)[0], avatar.store["neutral_features"])
+    return avatar.store["neutral_features"] + torch.einsum("bk,nkf->bnf", directed(avatar, face), avatar.store["bases"])
 
 
 def test_all_directions_span_the_inputs_and_few_the_largest_spread() -> None:
@@ -62,31 +57,23 @@ def test_all_directions_span_the_inputs_and_few_the_largest_spread() -> None:
     rest, every = input_directions(face, neutral_of(face), 0)
     _, two = input_directions(face, neutral_of(face), 2)
     assert torch.equal(rest, inputs_of(neutral_of(face))[0])
-    assert every.shape == (5, 5)
-    assert two.shape == (5, 2)
-    assert torch.equal(every[:, :2], two)
-    offsets = inputs_of(face) - rest
-    deviations = (offsets @ every).std(0)
-    assert float(deviations.max()) == pytest.approx(1, abs=0.05)
     # Two angles never change and the third follows an expression, so three directions are 0. The others lose nothing.
-    used = every[:, every.abs().sum(0) > 0]
-    assert used.shape[1] == 2
-    torch.testing.assert_close((offsets - offsets.mean(0)) @ used @ torch.linalg.pinv(used), offsets - offsets.mean(0))
+    assert torch.equal(every, torch.nn.functional.pad(two, (0, 3)))
+    offsets = inputs_of(face) - inputs_of(face).mean(0)
+    assert float((offsets @ every).std(0).max()) == pytest.approx(1, abs=0.05)
+    torch.testing.assert_close(offsets @ two @ torch.linalg.pinv(two), offsets)
 
 
 def test_color_and_opacity_are_the_networks_of_features_and_place() -> None:
     avatar, face = new_avatar(), toy_face(5)[2]
-    fill(avatar.store["bases"])
-    fill(avatar.store["neutral_features"], 2)
+    fill(avatar)
+    assert torch.equal(blended(avatar, avatar.subject)[0], avatar.store["neutral_features"])
     gaussians = avatar.pose(face).gaussians
     first, _, last = avatar.network
     assert isinstance(first, torch.nn.Linear)
     assert isinstance(last, torch.nn.Linear)
-    points = avatar.store["means"].detach() / SMALL.encoding_length
-    features = blended(avatar, face)[0]
-    values = torch.cat([features, positional_encoding(points, SMALL.encoding_bands)], dim=-1) @ first.weight.T
-    values = values + first.bias
-    values = torch.where(values < 0, 0.01 * values, values) @ last.weight.T + last.bias
+    values = first(torch.cat([blended(avatar, face)[0], encoding_of(avatar)], dim=-1))
+    values = last(torch.where(values < 0, 0.01 * values, values))
     torch.testing.assert_close(gaussians.sh[0], values[:, :12].reshape(40, 4, 3))
     torch.testing.assert_close(gaussians.opacities[0], values[:, 12].sigmoid())
 
@@ -97,101 +84,71 @@ def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None
     assert (paper.encoding_gradient, paper.factored_bases, paper.network_epsilon) == (True, False, 1e-8)
     groups = {group.name: group for group in new_avatar(replace(SMALL, network_epsilon=1e-8)).parameter_groups()}
     assert (groups["network"].epsilon, groups["means"].epsilon) == (1e-8, 1e-15)
-    face, by_encoding, by_bases = toy_face(5)[2], {}, {}
+    moved, by_bases = [], []
     for encoding_gradient, factored_bases in ((False, True), (True, True), (False, False), (True, False)):
         avatar = new_avatar(replace(SMALL, encoding_gradient=encoding_gradient, factored_bases=factored_bases))
-        fill(avatar.store["bases"])
-        fill(avatar.store["neutral_features"], 2)
-        gaussians = avatar.pose(face).gaussians
+        fill(avatar)
+        gaussians = avatar.pose(toy_face(5)[2]).gaussians
         (gaussians.opacities.sum() + gaussians.sh.square().sum()).backward()
-        by_encoding[encoding_gradient, factored_bases] = avatar.store["means"].grad
+        assert (avatar.store["means"].grad is not None) == encoding_gradient
+        moved += [avatar.store["means"].grad] if encoding_gradient else []
         (group,) = [group for group in avatar.parameter_groups() if group.name == "bases"]
-        before = avatar.store["bases"].detach().clone()
         if not factored_bases:
             ((rows, columns),) = group.factored["bases"].terms
-            by_bases[encoding_gradient] = rows[:, None] * columns[:, None]
+            by_bases.append(rows[:, None] * columns[:, None])
+        before = avatar.store["bases"].detach().clone()
         Adam().step([group], Progress(0, 100))
-        moved = (avatar.store["bases"].detach() - before).abs()
-        assert moved.max() > 0
-        kind = FactoredMoments if factored_bases else Moments
-        assert isinstance(avatar.store.moments["bases"], kind)
-    assert by_encoding[False, True] is None
-    assert by_encoding[False, False] is None
-    moving = by_encoding[True, True]
-    assert moving is not None
-    assert moving.abs().min() > 0
-    torch.testing.assert_close(by_encoding[True, False], moving)
-    assert by_bases[True].abs().max() > 0
-    torch.testing.assert_close(by_bases[True], by_bases[False])
+        assert not before.equal(avatar.store["bases"])
+        assert isinstance(avatar.store.moments["bases"], FactoredMoments if factored_bases else Moments)
+    assert moved[0].abs().min() > 0
+    torch.testing.assert_close(*moved)
+    assert by_bases[0].abs().max() > 0
+    torch.testing.assert_close(*by_bases)
 
 
-def test_nothing_moves_in_the_head_frame() -> None:
+def test_nothing_moves_in_the_head_frame_and_joints_change_colors() -> None:
     avatar, face = new_avatar(), toy_face(5)
-    fill(avatar.store["bases"])
+    fill(avatar, "bases")
     gaussians = avatar.pose(face).gaussians
     assert gaussians.means.shape == gaussians.scales.shape == (40, 3)
-    assert gaussians.T_world_local is not None
-    assert torch.equal(gaussians.T_world_local, head_poses(face))
+    assert torch.equal(known(gaussians.T_world_local), head_poses(face))
     still = replace(face, head_rotation=0 * face.head_rotation, head_translation=0 * face.head_translation)
     assert torch.equal(avatar.pose(still).gaussians.sh, gaussians.sh)
+    assert not torch.allclose(avatar.pose(replace(face, joints=face.joints + 0.2)).gaussians.sh, gaussians.sh)
 
 
-def test_joints_change_colors_also_when_baked() -> None:
-    avatar, face = new_avatar(), toy_face(5)
-    fill(avatar.store["bases"])
-    turned = replace(face, joints=face.joints + 0.2)
-    ours, baked = avatar.pose(turned).gaussians, avatar.bake()
-    assert not torch.allclose(ours.sh, avatar.pose(face).gaussians.sh)
-    for timestep in range(5):
-        theirs = pose(baked, runtime_face(turned[timestep]))
-        torch.testing.assert_close(ours.sh[timestep], torch.from_numpy(theirs.sh))
-        torch.testing.assert_close(ours.opacities[timestep], torch.from_numpy(theirs.opacities))
-
-
-def test_children_of_a_split_copy_features() -> None:
-    avatar = new_avatar()
-    fill(avatar.store["bases"])
-    fill(avatar.store["neutral_features"])
-    parents = torch.tensor([3, 3, 9])
-    avatar.store.append(parents, avatar.density().split(avatar.store, parents, torch.randn(3, 3)))
-    for name in ("bases", "neutral_features"):
-        assert torch.equal(avatar.store[name][-3:], avatar.store[name][parents])
-    assert not torch.equal(avatar.store["means"][-3:], avatar.store["means"][parents])
-
-
-def test_opacity_has_no_reset_and_counts_by_the_highest_seen() -> None:
-    avatar = new_avatar()
+def test_children_of_a_split_copy_features_and_opacity_has_no_reset() -> None:
+    avatar, parents = new_avatar(), torch.tensor([3, 3, 9])
+    fill(avatar)
     density = avatar.density()
+    avatar.store.append(parents, density.split(avatar.store, parents, torch.randn(3, 3)))
+    for name in ("bases", "neutral_features", "means"):
+        assert torch.equal(avatar.store[name][-3:], avatar.store[name][parents]) == (name != "means")
     assert density.opacity_logits is None
     for preset in method_named("headgas").presets:
         config: Any = PRESETS[preset].config("headgas")
         assert config.density.opacity_resets == ()
-    seen = torch.rand(40)
-    assert torch.equal(density.judged_opacities(avatar.store, seen), seen)
 
 
 def test_judged_expressions_are_far_from_each_other() -> None:
     points = torch.tensor([[0.0, 0], [0.1, 0], [5, 0], [0, 1], [5.1, 0], [0.1, 0.1]])
+    assert [len(spread_out(points, count)) for count in (0, 3, 100)] == [0, 3, 6]
     assert torch.equal(spread_out(points, 3), points[[4, 3, 1]])
-    assert torch.equal(spread_out(points, 0), points[:0])
-    assert len(spread_out(points, 100)) == 6
 
 
 def test_higher_degrees_learn_slower_and_begin_later() -> None:
     config = replace(SMALL, sh_degree=3, sh_warmup=0.4, sh_higher_share=0.05)
     avatar, face = new_avatar(config), toy_face(5)[1]
     for parameter in avatar.network.parameters():
-        fill(parameter)
+        torch.nn.init.normal_(parameter)
     full = avatar.pose(face).gaussians.sh[0]
     for step, active in ((0, 1), (99, 1), (100, 4), (200, 9), (301, 16), (1000, 16)):
         sh = avatar.pose(face, Progress(step, 1000)).gaussians.sh[0]
-        torch.testing.assert_close(sh[:, :active], full[:, :active])
-        assert not bool(sh[:, active:].any())
+        torch.testing.assert_close(sh, torch.where(torch.arange(16)[:, None] < active, full, 0))
     plain = new_avatar(replace(config, sh_higher_share=1.0))
     plain.load_state_dict(avatar.state_dict())
-    expected = plain.pose(face).gaussians.sh[0]
-    torch.testing.assert_close(full[:, :1], expected[:, :1])
-    torch.testing.assert_close(full[:, 1:], 0.05 * expected[:, 1:])
+    share = torch.where(torch.arange(16)[:, None] < 1, 1, 0.05)
+    torch.testing.assert_close(full, share * plain.pose(face).gaussians.sh[0])
     torch.testing.assert_close(torch.from_numpy(pose(avatar.bake(), runtime_face(face)).sh), full)
 
 
@@ -218,18 +175,13 @@ def test_points_are_on_the_mesh_evenly_by_area() -> None:
     torch.testing.assert_close(points[large, :2].mean(0), torch.ones(2), atol=0.05, rtol=0)
 
 
-def test_neighbor_distances_are_means_over_three() -> None:
+def test_neighbor_distances_and_the_encoding_of_places() -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [10, 0, 0]])
     expected = torch.tensor([2.0, (9 + 10 + 104**0.5) / 3])
     torch.testing.assert_close(neighbor_distances(points)[[0, 4]], expected)
-
-
-def test_positional_encoding_is_sines_and_cosines_of_octaves() -> None:
     point = torch.tensor([0.1, -0.2, 0.3])
-    expected = [point]
-    for octave in (1, 2, 4):
-        expected += [(octave * point).sin(), (octave * point).cos()]
-    torch.testing.assert_close(positional_encoding(point, 3), torch.cat(expected))
+    waves = [wave(octave * point) for octave in (1, 2, 4) for wave in (torch.sin, torch.cos)]
+    torch.testing.assert_close(positional_encoding(point, 3), torch.cat([point, *waves]))
 
 
 VARIANT = HeadGasConfig(points=40, features=5, hidden=8, sh_degree=1, sh_warmup=0.0)
@@ -254,39 +206,41 @@ def network_inputs(avatar: HeadGas) -> Tensor:
     return torch.cat([blended(avatar, toy_face(5)[2])[0], encoding_of(avatar)], dim=-1)
 
 
-def directed(avatar: HeadGas) -> Tensor:
-    """The third timestep's inputs along the directions."""
-    return ((inputs_of(toy_face(5)[2]) - avatar.rest) @ avatar.directions)[0]
+def directed(avatar: HeadGas, face: FaceParams) -> Tensor:
+    """Inputs along the directions."""
+    return (inputs_of(face) - avatar.rest) @ avatar.directions
 
 
 @pytest.mark.parametrize("variant", get_args(Variant))
-def test_starts_faint_gray_and_still(variant: Variant) -> None:
+def test_starts_faint_gray_and_still_and_is_judged_as_it_is_drawn(variant: Variant) -> None:
     avatar, face = new_variant(variant, disturbed=False), toy_face(5)
     gaussians = avatar.pose(face).gaussians
     assert (gaussians.opacities - 0.1).abs().max() < 0.1
     assert gaussians.sh.abs().max() < 1
     torch.testing.assert_close(gaussians.means.expand(5, 40, 3), avatar.store["means"].expand(5, 40, 3))
     assert variant != "full" or torch.equal(gaussians.sh[0], gaussians.sh[3])
+    avatar = new_variant(variant)
+    expected = avatar.pose(face).gaussians.opacities.expand(5, 40).amax(0).detach()
+    judged = avatar.density().judged_opacities
+    torch.testing.assert_close(judged(avatar.store, torch.zeros(40)), expected)
+    assert torch.equal(judged(avatar.store, torch.ones(40)), torch.ones(40))
 
 
 def test_delta_moves_and_turns_by_the_network_and_paints_nothing() -> None:
     """Eq. 1 to 4 of the supplement, where the rotation comes before that of the Gaussian itself."""
     avatar, face = new_variant("delta"), toy_face(5)
-    posed = avatar.pose(face)
-    moved = avatar.network(network_inputs(avatar))
+    posed, moved, store = avatar.pose(face), avatar.network(network_inputs(avatar)), avatar.store
     assert moved.shape == (40, MOVED)
-    store, found = avatar.store, posed.gaussians.timestep(2)
+    found = posed.gaussians.timestep(2)
     torch.testing.assert_close(found.means, store["means"] + HEADGAS.shift_length * moved[:, :3])
     turn = matrix_from_quaternion(moved[:, 3:] + torch.tensor([1.0, 0, 0, 0]))
-    expected = turn @ matrix_from_quaternion(store["quats"])
-    torch.testing.assert_close(matrix_from_quaternion(found.quats), expected)
+    torch.testing.assert_close(matrix_from_quaternion(found.quats), turn @ matrix_from_quaternion(store["quats"]))
     torch.testing.assert_close(found.opacities, store["opacity_logits"].sigmoid())
-    torch.testing.assert_close(found.sh[:, 0], store["sh"][:, 0])
-    torch.testing.assert_close(found.sh[:, 1:], VARIANT.sh_higher_share * store["sh"][:, 1:])
-    rendering = rasterize(found, toy_camera(32), torch.ones(3))
+    share = torch.tensor([1.0, *[VARIANT.sh_higher_share] * 3])[:, None]
+    torch.testing.assert_close(found.sh, share * store["sh"])
     shifts = (posed.gaussians.means - store["means"]).detach()
     assert float(shifts.abs().max()) > 1e-4
-    losses = avatar.regularizers(posed, rendering, Progress(1, 2))
+    losses = avatar.regularizers(posed, rasterize(found, toy_camera(32), torch.ones(3)), Progress(1, 2))
     torch.testing.assert_close(losses["shift"], VARIANT.shift_weight * shifts.abs().mean(), atol=1e-7, rtol=1e-4)
 
 
@@ -302,43 +256,29 @@ def test_change_all_paints_too() -> None:
 
 
 def test_no_mlp_averages_colors_and_opacities() -> None:
-    avatar, face = new_variant("no_mlp"), toy_face(5)
-    e = directed(avatar)
-    total = 1 + e.abs().sum()
-    average = (avatar.store["neutral_features"] + torch.einsum("nko,k->no", avatar.store["bases"], e)) / total
-    found = avatar.pose(face).gaussians.timestep(2)
+    avatar, face = new_variant("no_mlp"), toy_face(5)[2]
+    (e,) = directed(avatar, face)
+    average = avatar.store["neutral_features"] + torch.einsum("nko,k->no", avatar.store["bases"], e)
+    average = average / (1 + e.abs().sum())
+    found = avatar.pose(face).gaussians.timestep(0)
     torch.testing.assert_close(found.sh[:, 0], average[:, :3])
-    logits = torch.logit(torch.tensor(0.1)) + 20 * average[:, -1]
-    torch.testing.assert_close(found.opacities, logits.sigmoid())
+    torch.testing.assert_close(found.opacities, (torch.logit(torch.tensor(0.1)) + 20 * average[:, -1]).sigmoid())
     assert len(list(avatar.network.parameters())) == 0
     weights, rest = averaging_weights(torch.tensor([3.0, -4.0]))
     torch.testing.assert_close(torch.cat([weights, rest[None]]), torch.tensor([0.375, -0.5, 0.125]))
 
 
 def test_no_blending_gives_the_expression_to_five_layers() -> None:
-    avatar, face = new_variant("no_blending"), toy_face(5)
-    e = directed(avatar)
-    outputs = avatar.network(torch.cat([e.expand(40, -1), encoding_of(avatar)], dim=-1))
-    found = avatar.pose(face).gaussians.timestep(2)
+    avatar, face = new_variant("no_blending"), toy_face(5)[2]
+    outputs = avatar.network(torch.cat([directed(avatar, face).expand(40, -1), encoding_of(avatar)], dim=-1))
+    found = avatar.pose(face).gaussians.timestep(0)
     torch.testing.assert_close(found.sh[:, 0], outputs[:, :3])
     torch.testing.assert_close(found.opacities, outputs[:, -1].sigmoid())
     assert sum(isinstance(layer, torch.nn.Linear) for layer in avatar.network) == 5
     assert set(avatar.store.names()) == {"means", "quats", "log_scales"}
 
 
-@pytest.mark.parametrize("variant", get_args(Variant))
-def test_opacities_are_judged_as_they_are_drawn(variant: Variant) -> None:
-    avatar, face = new_variant(variant), toy_face(5)
-    expected = avatar.pose(face).gaussians.opacities.expand(5, 40).amax(0)
-    found = avatar.density().judged_opacities(avatar.store, torch.zeros(40))
-    torch.testing.assert_close(found, expected.detach())
-    assert torch.equal(avatar.density().judged_opacities(avatar.store, torch.ones(40)), torch.ones(40))
-
-
-def test_what_cannot_be_baked_says_so_in_one_line() -> None:
-    variants: tuple[Variant, ...] = ("no_mlp", "delta", "change_all")
-    for variant in variants:
-        with pytest.raises(UserError, match=rf"^the variant {variant} of headgas: .*export a \.ply") as caught:
-            make_portable(new_variant(variant), toy_camera(32), "toy")
-        assert "\n" not in str(caught.value)
-    assert new_variant("full").extras.unbaked is None
+@pytest.mark.parametrize("variant", ["no_mlp", "delta", "change_all"])
+def test_what_cannot_be_baked_says_so_in_one_line(variant: Variant) -> None:
+    with pytest.raises(UserError, match=rf"^the variant {variant} of headgas: [^\n]*export a \.ply[^\n]*$"):
+        make_portable(new_variant(variant), toy_camera(32), "toy")

@@ -7,15 +7,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Progress, Rate
+from known import known
+from mien.avatar import MonoGaussianAvatar, Progress, Rate
+from mien.avatar.encoding import positional_encoding
+from mien.avatar.mono_gaussian_avatar import motion
 from mien.avatar.mono_gaussian_avatar.constants import MONO
-from mien.avatar.mono_gaussian_avatar.motion import canonical_face
-from mien.avatar.mono_gaussian_avatar.networks import Deformation, DeformationNet
+from mien.avatar.mono_gaussian_avatar.motion import canonical_face, nearest_vertices
+from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.surface_places import at_places, random_places
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, head_poses
+from mien.face import FaceModel, head_poses
+from mien.face.mirror import triangle_geometry
 from mien.training import PRESETS
 from mono_avatars import SMALL, new_avatar, pictured
 from plain_settings import plain_mono_gaussian_avatar
@@ -53,51 +57,41 @@ def test_canonical_face_leaves_points_at_their_canonical_places() -> None:
 
 def test_canonical_jaw_is_open() -> None:
     """A jaw that follows the expression opens by its coefficient, a free one by its angle."""
-    follows = toy_face_model()
-    jaw = follows.joint_names.index("jaw")
-    mean = toy_face(5).expression.mean(0)
+    follows, mean = toy_face_model(), toy_face(5).expression.mean(0)
+    names, jaw = follows.joint_names, follows.joint_names.index("jaw")
     expression, joints = canonical_face(follows, mean)
     opening = follows.joint_rotation_basis[:, jaw, 0]
     assert float(expression @ opening) == pytest.approx(MONO.canonical_jaw, abs=1e-6)
     # Only the coefficient that opens the jaw most has changed.
     assert (expression != mean).nonzero()[:, 0].tolist() == [int(opening.argmax())]
     assert joints.abs().max() == 0
-    free = replace(
-        follows,
-        joint_free=tuple(
-            name == "jaw" or was for name, was in zip(follows.joint_names, follows.joint_free, strict=True)
-        ),
-        joint_rotation_basis=torch.zeros_like(follows.joint_rotation_basis),
-    )
-    expression, joints = canonical_face(free, mean)
+    all_free, still = (True,) * len(names), torch.zeros_like(follows.joint_rotation_basis)
+    expression, joints = canonical_face(replace(follows, joint_free=all_free, joint_rotation_basis=still), mean)
     assert torch.equal(expression, mean)
-    turned = joints[free.free_joint_names.index("jaw")]
-    torch.testing.assert_close(turned, torch.tensor([MONO.canonical_jaw, 0, 0]))
-    assert joints.abs().sum() == turned.abs().sum()
-    headless = replace(follows, joint_names=tuple("chin" if name == "jaw" else name for name in follows.joint_names))
+    turned = torch.zeros(len(names), 3)
+    turned[jaw, 0] = MONO.canonical_jaw
+    torch.testing.assert_close(joints, turned)
+    headless = replace(follows, joint_names=tuple("chin" if name == "jaw" else name for name in names))
     assert torch.equal(canonical_face(headless, mean)[0], mean)
 
 
 def test_a_point_on_the_still_bone_stays_in_the_world_while_the_head_moves() -> None:
     avatar, face = new_avatar(), toy_face(5)
-    k = len(avatar.face_model.joint_names)
-    with torch.no_grad():
-        avatar.deformation.skinning.weight.zero_()
-        avatar.deformation.skinning.bias.copy_(10.0 * torch.eye(k + 1)[k])
-        avatar.deformation.directions.weight.zero_()
-        avatar.deformation.directions.bias.zero_()
+    bones, last = torch.eye(len(avatar.face_model.joint_names) + 1), avatar.deformation.skinning
     face = replace(face, head_rotation=torch.randn(5, 3), head_translation=torch.randn(5, 3))
-    world = [points_in_world(avatar, face[index]) for index in range(5)]
-    for other in world[1:]:
-        torch.testing.assert_close(other, world[0], atol=1e-5, rtol=0)
-    with torch.no_grad():  # the head's bone
-        avatar.deformation.skinning.bias.copy_(10.0 * torch.eye(k + 1)[0])
-    assert (points_in_world(avatar, face[0]) - points_in_world(avatar, face[1])).abs().max() > 0.1
 
+    def in_world(bone: int) -> Tensor:
+        with torch.no_grad():
+            last.bias.copy_(10.0 * bones[bone])
+        poses = head_poses(face)
+        return torch.einsum("bij,bnj->bni", poses[:, :3, :3], avatar.pose(face).gaussians.means) + poses[:, None, :3, 3]
 
-def points_in_world(avatar: MonoGaussianAvatar, face: FaceParams) -> Tensor:
-    pose, means = head_poses(face)[0], avatar.pose(face).gaussians.means[0]
-    return means @ pose[:3, :3].T + pose[:3, 3]
+    with torch.no_grad():
+        for weight in (last.weight, avatar.deformation.directions.weight, avatar.deformation.directions.bias):
+            weight.zero_()
+    still, moving = in_world(-1), in_world(0)  # and on the head's bone
+    torch.testing.assert_close(still, still[:1].expand_as(still), atol=1e-5, rtol=0)
+    assert (moving[0] - moving[1]).abs().max() > 0.1
 
 
 class Perfect(DeformationNet):
@@ -108,11 +102,12 @@ class Perfect(DeformationNet):
         self.model = face_model
 
     def whole(self, points: Tensor) -> Deformation:
-        model, basis = self.model, self.model.pose_basis
-        assert basis is not None
-        expression = model.expression_basis.permute(1, 2, 0) / LENGTH_UNIT
-        weights = torch.nn.functional.pad(model.skinning_weights, (0, 1))
-        return Deformation(torch.zeros_like(points), expression, basis.permute(1, 2, 0) / LENGTH_UNIT, weights)
+        expression, pose = (
+            known(basis).permute(1, 2, 0) / LENGTH_UNIT
+            for basis in (self.model.expression_basis, self.model.pose_basis)
+        )
+        weights = torch.nn.functional.pad(self.model.skinning_weights, (0, 1))
+        return Deformation(torch.zeros_like(points), expression, pose, weights)
 
     def forward(self, points: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         found = self.whole(points)
@@ -120,114 +115,92 @@ class Perfect(DeformationNet):
         return found.offset, torch.einsum("nxc,bc->bnx", directions, coefficients), found.weights
 
 
-def perfect_avatar() -> MonoGaussianAvatar:
-    """Return an avatar whose points are the canonical mesh's vertices."""
-    avatar = new_avatar(face_model=with_pose_correctives())
+def test_vertices_with_their_own_directions_move_as_the_mesh_does_and_cost_nothing() -> None:
+    """The points are the canonical mesh's vertices."""
+    avatar, face = new_avatar(face_model=with_pose_correctives()), toy_face(5)
     vertices = avatar.face_model.head_vertices(avatar.canonical_face())[0]
     avatar.store.resize(len(vertices))
-    with torch.no_grad():
-        avatar.store["means"].copy_(vertices)
+    avatar.store.assign("means", vertices)
     avatar.deformation = Perfect(avatar.face_model)  # type: ignore[assignment]
-    return avatar
-
-
-def test_vertices_with_their_own_directions_move_as_the_mesh_does_and_cost_nothing() -> None:
-    avatar, face = perfect_avatar(), toy_face(5)
     gaussians = avatar.pose(face).gaussians
     torch.testing.assert_close(gaussians.means, avatar.face_model.head_vertices(face), atol=1e-6, rtol=0)
-    assert gaussians.T_world_local is not None
-    assert torch.equal(gaussians.T_world_local, head_poses(face))
-    avatar.config = replace(SMALL, face_points=len(avatar.store))
-    losses = avatar.regularizers(avatar.pose(face[1]), pictured(len(avatar.store)), Progress(0, 100))
+    assert torch.equal(known(gaussians.T_world_local), head_poses(face))
+    avatar.config = replace(SMALL, face_points=len(vertices))
+    losses = avatar.regularizers(avatar.pose(face[1]), pictured(len(vertices)), Progress(0, 100))
     assert max(loss.item() for loss in losses.values()) < 1e-9
 
 
 @pytest.mark.parametrize("source", ["code", "supplement"])
 def test_losses_near_the_face_model_are_those_of_the_paper(source: str) -> None:
     face_model, by_code = with_pose_correctives(), source == "code"
-    supplement: dict[str, Any] = {
-        "face_expression_weight": 1e3,
-        "face_expression_by_variance": False,
-        "face_correctives_weight": 1e3,
-    }
+    names = ("face_expression_weight", "face_expression_by_variance", "face_correctives_weight")
+    supplement: dict[str, Any] = dict(zip(names, (1e3, False, 1e3), strict=True))
     paper = PRESETS["paper"].config("mono_gaussian_avatar")
     assert supplement == {name: getattr(paper, name) for name in supplement}
     avatar = new_avatar(replace(SMALL, face_points=12, **({} if by_code else supplement)), face_model)
-    step = 4
-    posed = avatar.pose(toy_face(5)[1], Progress(step, 100))
-    losses = avatar.regularizers(posed, pictured(30), Progress(step, 100))
-    # Points 48 .. 59, in turn, of 30.
-    rows = torch.arange(18, 30)
+    progress, rows = Progress(4, 100), torch.arange(18, 30)  # points 48 .. 59, in turn, of 30
+    losses = avatar.regularizers(avatar.pose(toy_face(5)[1], progress), pictured(30), progress)
     found = avatar.deformation.whole(avatar.store["means"][rows] / LENGTH_UNIT)
     vertices = face_model.head_vertices(avatar.canonical_face())[0]
     nearest = (canonical_places(avatar)[rows, None] - vertices).norm(dim=-1).argmin(1)
     weights = found.weights - torch.nn.functional.pad(face_model.skinning_weights[nearest], (0, 1))
-    expected = 10 * 0.1 * weights.square().mean()
-    torch.testing.assert_close(losses["skinning"], expected)
-    assert face_model.pose_basis is not None
+    torch.testing.assert_close(losses["skinning"], 10 * 0.1 * weights.square().mean())
     # Lengths are four times life size.
-    pose = found.pose - 4 * face_model.pose_basis[:, nearest].permute(1, 2, 0)
+    pose = found.pose - 4 * known(face_model.pose_basis)[:, nearest].permute(1, 2, 0)
     expected = 10 * 10 * (10 * pose).square().mean() if by_code else 1000 * pose.square().mean()
     torch.testing.assert_close(losses["pose_correctives"], expected)
-    variance = toy_face(5).expression.var(0, correction=0)
     # Coefficients and directions in units where the mean variance of coefficients is 1.
+    variance = toy_face(5).expression.var(0, correction=0)
     unit = variance.mean()
     expression = unit.sqrt() * (found.expression - 4 * face_model.expression_basis[:, nearest].permute(1, 2, 0))
     of_code = 10 * 10 * ((10 * expression).square() / (variance / unit * 2)).mean()
     expected = of_code if by_code else 1000 * expression.square().mean()
     torch.testing.assert_close(losses["expression_directions"], expected)
     torch.stack(list(losses.values())).sum().backward()
-    # The points do not feel these losses.
-    assert avatar.store["means"].grad is None
+    assert avatar.store["means"].grad is None, "the points do not feel these losses"
 
 
 def test_expressions_that_never_move_stay_finite() -> None:
     face = toy_face(5)
-    still = replace(face, expression=face.expression * torch.tensor([1.0, 0.0]))
-    for one in (still, replace(face, expression=0 * face.expression), face[0]):
+    for one in (
+        *(replace(face, expression=face.expression * torch.tensor(way)) for way in ((1.0, 0), (0.0, 0))),
+        face[0],
+    ):
         avatar = MonoGaussianAvatar(SMALL, toy_face_model(), one)
         losses = avatar.regularizers(avatar.pose(one[0]), pictured(30), Progress(0, 10))
         assert all(loss.isfinite() for loss in losses.values())
 
 
 def test_attributes_are_those_at_rest_and_their_change() -> None:
-    avatar, face = new_avatar(), toy_face(5)[3]
-    got = avatar.pose(face, Progress(50, 100)).gaussians
+    avatar = new_avatar()
+    got, means = avatar.pose(toy_face(5)[3], Progress(50, 100)).gaussians, avatar.store["means"]
     moved = (got.means[0] - canonical_places(avatar)) / LENGTH_UNIT
-    raw = avatar.attributes(avatar.store["means"] / LENGTH_UNIT) + avatar.store["own_attributes"] + avatar.change(moved)
+    raw = avatar.attributes(means / LENGTH_UNIT) + avatar.store["own_attributes"] + avatar.change(moved)
     radius = Schedule("code", 100, 30).rendering_radius(0.5)
     torch.testing.assert_close(got.scales[0], 0.00625 * raw[:, :3].sigmoid() + radius)
     torch.testing.assert_close(got.quats[0], raw[:, 3:7] / raw[:, 3:7].norm(dim=-1, keepdim=True))
     torch.testing.assert_close(got.opacities[0], raw[:, 7].sigmoid())
     torch.testing.assert_close(rgb_from_sh(got.sh[0, :, 0]), raw[:, 8:].sigmoid())
-    # They do not pull at points.
     (got.opacities.sum() + got.sh.sum() + got.scales.sum()).backward(retain_graph=True)
-    assert avatar.store["means"].grad is None
+    assert means.grad is None, "they do not pull at points"
     got.means.sum().backward()
-    assert avatar.store["means"].grad is not None
-
-
-def radii(name: ScheduleName, epochs: int) -> dict[int, float]:
-    """Radii by epoch, in the paper's lengths."""
-    schedule = Schedule(name, epochs, 400)
-    return {epoch: 4 * schedule.rendering_radius(epoch / epochs) for epoch in range(epochs)}
+    assert means.grad is not None
 
 
 def test_schedules_are_those_of_paper_and_code() -> None:
-    code, paper = radii("code", 130), radii("paper", 130)
+    schedules: dict[ScheduleName, Schedule] = {name: Schedule(name, 130, 400) for name in ("code", "paper")}
+    # Radii in the paper's lengths.
+    code, paper = ([4 * one.rendering_radius(epoch / 130) for epoch in range(130)] for one in schedules.values())
     expected = {0: 8.44e-2, 4: 8.44e-2, 5: 6.3e-2, 30: 1.5e-2, 60: 7.6e-3, 80: 2.4e-3, 100: 7.6e-4, 120: 2.4e-4}
-    for epoch, radius in expected.items():
-        assert code[epoch] == pytest.approx(radius, rel=0.02), epoch
+    assert {epoch: code[epoch] for epoch in expected} == pytest.approx(expected, rel=0.02)
     # The paper's shrinks: every 5 epochs up to 40, every 10 up to 60, every 5 up to 100.
     shrinks = [*range(5, 45, 5), 50, 60, *range(65, 105, 5)]
-    for epoch, radius in paper.items():
-        assert radius == pytest.approx(8.4375e-2 * 0.75 ** sum(epoch >= at for at in shrinks)), epoch
+    assert paper == pytest.approx([8.4375e-2 * 0.75 ** sum(epoch >= at for at in shrinks) for epoch in range(130)])
     counts = {
         "code": {0: 400, 5: 800, 10: 1600, 25: 10_000, 29: 10_000, 35: 20_000, 45: 40_000, 50: 80_000, 60: 100_000},
         "paper": {0: 400, 5: 800, 10: 1600, 25: 10_000, 30: 20_000, 35: 40_000, 40: 80_000, 49: 80_000, 50: 100_000},
     }
-    for name in ("code", "paper"):
-        schedule = Schedule(name, 130, 400)
+    for name, schedule in schedules.items():
         assert {epoch: schedule.points_at(epoch / 130) for epoch in counts[name]} == counts[name]
         assert 4 * schedule.sampling_length(101 / 130) == 0.004
         assert schedule.sampling_length(100 / 130) == schedule.rendering_radius(100 / 130)
@@ -249,13 +222,6 @@ def test_the_round_into_epoch_101_is_the_first_with_the_late_length_in_paper() -
     torch.testing.assert_close(children - avatar.store["means"][parents], torch.tensor([[0.0005, 0, 0]]))
 
 
-def test_paper_has_adams_own_epsilon_and_the_published_skinning_branch() -> None:
-    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
-    assert (paper.adam_epsilon, paper.skinning_norm) == (1e-8, True)
-    for epsilon, config in ((1e-8, replace(SMALL, adam_epsilon=1e-8)), (1e-15, SMALL)):
-        assert {group.epsilon for group in new_avatar(config).parameter_groups()} == {epsilon}
-
-
 def test_rounds_grow_to_the_limit_and_no_further() -> None:
     settings = new_avatar(plain_mono_gaussian_avatar(max_points=5000)).density().settings
     targets = dict(zip(settings.times, settings.targets, strict=True))
@@ -266,15 +232,12 @@ def test_rounds_grow_to_the_limit_and_no_further() -> None:
 
 def test_children_are_around_their_parents() -> None:
     parents, noise = torch.tensor([3, 7]), torch.tensor([[0.5, -0.5, 0.0], [0.1, 0.2, 0.3]])
-    for name in ("code", "paper"):
+    lengths: dict[ScheduleName, Tensor] = {"code": torch.ones(2, 1), "paper": noise.norm(dim=-1, keepdim=True)}
+    for name, length in lengths.items():
         avatar = new_avatar(replace(SMALL, schedule=name))
         children = avatar.density().refill(avatar.store, parents, noise, 0.3)["means"]
         away = (children - avatar.store["means"][parents]) / Schedule(name, 100, 30).rendering_radius(0.3)
-        if name == "code":
-            torch.testing.assert_close(away, noise, atol=1e-5, rtol=0)
-        else:
-            torch.testing.assert_close(away.norm(dim=-1), torch.ones(2), atol=1e-5, rtol=0)
-            assert (away * noise).sum(-1).min() > 0
+        torch.testing.assert_close(away, noise / length, atol=1e-5, rtol=0)
         avatar.store.append(parents, {"means": children})
         own = avatar.store["own_attributes"]
         assert torch.equal(own[30:], own[parents]), "children inherit what is their parents' own"
@@ -283,34 +246,31 @@ def test_children_are_around_their_parents() -> None:
 def test_rates_halve_at_their_times() -> None:
     constant = Rate(1e-3)
     config = replace(SMALL, network_rate=constant, own_rate=constant, means_rate=constant, rate_halvings=(0.5, 0.75))
-    avatar = new_avatar(config)
-    for group in avatar.parameter_groups():
+    for group in new_avatar(config).parameter_groups():
         rates = [group.rate_at(Progress(step, 100)) / group.rate_at(Progress(0, 100)) for step in (0, 49, 50, 75, 99)]
         assert rates == [1, 1, 0.5, 0.25, 0.25], group.name
 
 
-def test_points_without_attributes_of_their_own() -> None:
-    """The preset `paper` has none."""
-    paper = PRESETS["paper"].config("mono_gaussian_avatar")
-    assert isinstance(paper, MonoGaussianAvatarConfig)
-    assert paper.own_rate == Rate(0.0)
-    avatar = new_avatar(replace(SMALL, own_rate=Rate(0.0)))
+def test_paper_has_adams_own_epsilon_and_the_published_skinning_branch() -> None:
+    """And points without attributes of their own."""
+    paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
+    assert (paper.adam_epsilon, paper.skinning_norm, paper.own_rate) == (1e-8, True, Rate(0.0))
+    for epsilon, config in ((1e-8, replace(SMALL, adam_epsilon=1e-8)), (1e-15, SMALL)):
+        assert {group.epsilon for group in new_avatar(config).parameter_groups()} == {epsilon}
+    avatar, face = new_avatar(replace(SMALL, own_rate=Rate(0.0))), toy_face(5)[2]
     assert avatar.store.names() == ("means",)
     assert [group.name for group in avatar.parameter_groups()] == ["means", "attributes", "deformation", "change"]
-    face = toy_face(5)[2]
     trained, baked = avatar.pose(face).gaussians, avatar.eval().pose(face).gaussians
     torch.testing.assert_close(baked.sh, trained.sh, atol=1e-5, rtol=0)
 
 
 def test_points_start_on_the_canonical_face() -> None:
     avatar = new_avatar(replace(SMALL, start="face", points=200), disturbed=False)
-    vertices = avatar.face_model.head_vertices(avatar.canonical_face())[0]
-    a, b, c = vertices[avatar.face_model.faces].unbind(1)
-    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    vertices, means = avatar.face_model.head_vertices(avatar.canonical_face())[0], avatar.store["means"]
+    middles, _, normals = triangle_geometry(vertices, avatar.face_model.faces)
     # Each point lies in the plane of a triangle.
-    heights = ((avatar.store["means"][:, None] - a) * normals).sum(-1).abs().min(dim=1).values
-    assert heights.max() < 1e-6
-    assert len({tuple(point) for point in avatar.store["means"].tolist()}) == 200
+    assert ((means[:, None] - middles) * normals).sum(-1).abs().amin(1).max() < 1e-6
+    assert len(means.unique(dim=0)) == 200
 
 
 @pytest.mark.unchecked
@@ -321,26 +281,119 @@ def test_lessons_teach_the_motion_of_the_face_model() -> None:
         avatar = new_avatar(replace(SMALL, start="face", points=200, pretraining=pretraining), disturbed=False)
         torch.manual_seed(1)
         corners, weights = random_places(avatar.at_rest().vertices, avatar.face_model.faces, 200)
-        with torch.no_grad():
-            avatar.store["means"].copy_(at_places(avatar.at_rest().vertices, corners, weights))
+        avatar.store.assign("means", at_places(avatar.at_rest().vertices, corners, weights))
         taught = avatar.extras.pretraining
         assert (0 if taught is None else len(list(taught.run(face)))) == pretraining == (taught.count if taught else 0)
         target = at_places(avatar.face_model.head_vertices(face), corners, weights)
         return float((avatar.pose(face).gaussians.means - target).norm(dim=-1).mean().detach())
 
-    untaught = error(0)
-    assert error(60) < 0.5 * untaught
+    assert error(60) < 0.5 * error(0)
 
 
 def test_a_run_may_begin_at_a_later_epoch() -> None:
     whole, late = Schedule("code", 100, 400), Schedule("code", 100, 400, 60)
     assert whole.rendering_radius(1.0) == whole.rendering_radius(0.999), "the end of a run changes nothing"
-    assert whole.rendering_radius(0.949) > whole.rendering_radius(0.95)
     assert late.rounds() == tuple(epoch / 40 for epoch in range(1, 40))
     for fraction in (0.0, 0.25, 0.5, 0.975):
-        at = 0.6 + 0.4 * fraction
-        assert late.rendering_radius(fraction) == whole.rendering_radius(at)
-        assert late.points_at(fraction) == whole.points_at(at)
-        assert late.face_decay(fraction) == whole.face_decay(at)
+        for part in ("rendering_radius", "points_at", "face_decay"):
+            assert getattr(late, part)(fraction) == getattr(whole, part)(0.6 + 0.4 * fraction)
     with pytest.raises(UserError, match="--method.epochs 60: give more than --method.first-epoch 60"):
         plain_mono_gaussian_avatar(epochs=60, first_epoch=60).check()
+
+
+# -- networks --------------------------------------------------------------------------------------------------------
+
+
+def softplus(values: Tensor) -> Tensor:
+    return torch.nn.functional.softplus(values, beta=100)
+
+
+def test_change_network_has_the_published_layers() -> None:
+    torch.manual_seed(0)
+    network, values = AttributeChangeNet(16), torch.randn(9, 3)
+    first, second, third = network.trunk
+    trunk = third(second(first(values).relu()).relu())  # no activation after the third
+    heads = zip(network.heads, network.outputs, strict=True)
+    expected = torch.cat([output(head(trunk).relu()) for head, output in heads], dim=-1)
+    torch.testing.assert_close(network(values), expected)
+
+
+def trunk_of(network: AttributeNet, encoding: Tensor) -> Tensor:
+    """The values of the trunk, whose fourth layer sees the encoding again."""
+    values = encoding
+    for index, layer in enumerate(network.trunk):
+        values = softplus(layer(torch.cat([values, encoding], -1) / 2**0.5 if index == 3 else values))
+    return values
+
+
+def test_attribute_network_has_the_published_layers() -> None:
+    torch.manual_seed(0)
+    network, points = AttributeNet(48, 7, 6), torch.randn(9, 3)
+    hidden = [softplus(head(trunk_of(network, positional_encoding(points, 6)))) for head in network.heads]
+    hidden[3] = network.color(hidden[3])
+    expected = torch.cat([output(one) for output, one in zip(network.outputs, hidden, strict=True)], dim=-1)
+    torch.testing.assert_close(network(points), expected)
+    assert [AttributeNet(48, layers, 6)(points).shape for layers in (2, 3, 4, 7)] == [(9, 11)] * 4
+
+
+@torch.no_grad()
+def test_attribute_network_starts_with_the_published_weights() -> None:
+    torch.manual_seed(0)
+    network = AttributeNet(256, 7, 6)
+    first, skip, last = (dict(network.trunk[index].named_parameters()) for index in (0, 3, -1))
+    # The waves have no effect at first, and the positions have no more than theirs.
+    assert first["weight"][:, 3:].abs().max() == skip["weight"][:, -36:].abs().max() == 0
+    assert float(first["weight"][:, :3].std()) == pytest.approx((2 / 256) ** 0.5, rel=0.1)
+    assert float(last["weight"].mean()) == pytest.approx((torch.pi / 256) ** 0.5, rel=1e-3)
+    assert float(last["weight"].std()) == pytest.approx(1e-4, rel=0.1)
+    assert last["bias"].unique().tolist() == pytest.approx([-0.6])
+
+
+def test_summed_directions_are_exactly_the_sums_of_directions() -> None:
+    torch.manual_seed(0)
+    network = DeformationNet(16, 4, 9, 5).double()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    values = points = torch.randn(7, 3).double()
+    coefficients, found = torch.randn(2, 13).double(), network.whole(points)
+    for layer in network.trunk:
+        values = softplus(layer(values))
+    directions = torch.cat([found.expression, found.pose], dim=-1)
+    expected = network.directions(values).unflatten(-1, (3, 14))
+    torch.testing.assert_close(torch.cat([found.offset[..., None], directions], dim=-1), expected)
+    weights = (20 * network.skinning(softplus(network.hidden(values)))).softmax(-1)
+    moved = torch.einsum("nxc,bc->bnx", directions, coefficients)
+    torch.testing.assert_close(network(points, coefficients), (found.offset, moved, weights))
+    torch.testing.assert_close(found.weights, weights)
+
+
+def test_the_published_skinning_branch_has_weight_norm_and_the_start_of_the_trunk() -> None:
+    """Both branches start as nothing, with even weights."""
+    torch.manual_seed(0)
+    norm = ["bias", "parametrizations.weight.original0", "parametrizations.weight.original1"]
+    for published, names in ((False, ["bias", "weight"]), (True, norm)):
+        network = DeformationNet(400, 4, 9, 5, skinning_norm=published)
+        assert sorted(dict(network.hidden.named_parameters())) == names
+        found = network.whole(torch.randn(7, 3))
+        assert found.offset.abs().max() == found.expression.abs().max() == found.pose.abs().max() == 0
+        torch.testing.assert_close(found.weights, torch.full((7, 5), 0.2))
+        if published:
+            weight, bias = network.hidden.weight, network.hidden.bias
+            assert float(weight.detach().std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)  # pyright: ignore
+            assert not bias.any()  # pyright: ignore
+
+
+def test_nearest_vertices_take_no_distances_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU there is a tree. Points are looked at in parts where there is none, as on a GPU."""
+    random, sizes, addmm = torch.Generator().manual_seed(0), [], torch.addmm
+    points, vertices = (torch.randn(n, 3, generator=random, dtype=torch.float64) for n in (1000, 50))
+    monkeypatch.setattr(motion, "POINTS_AT_ONCE", 64)
+    monkeypatch.setattr(torch, "addmm", lambda *args, **more: sizes.append(len(args[1])) or addmm(*args, **more))
+    expected = (points[:, None] - vertices).norm(dim=-1).argmin(1)
+    assert torch.equal(nearest_vertices(points, vertices), expected)
+    assert max(sizes) == 64
+    monkeypatch.delattr(torch, "addmm")
+    points, vertices = points.float(), vertices.float()
+    assert torch.equal(nearest_vertices(points, vertices), expected)
+    points[0, 0] = float("nan")
+    assert torch.equal(nearest_vertices(points, vertices)[1:], expected[1:])

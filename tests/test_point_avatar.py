@@ -56,9 +56,6 @@ def test_points_double_and_shrink_together() -> None:
     assert len(targets) == 19
     # The round that ends epoch 3 already fills up to the number of epoch 4.
     assert (targets[3 / 20], targets[4 / 20], targets[19 / 20]) == (30, 60, 100)
-
-
-def test_the_papers_points_begin_on_a_sphere_and_end_as_a_hundred_thousand() -> None:
     paper: Any = PRESETS["paper"].config("point_avatar")
     assert (paper.start, paper.points, paper.max_points, paper.normals) == ("sphere", 400, 100_000, "deformed")
     # In the paper's lengths, of a head of four times life size: 400 points of radius 0.15 * 0.75^2.
@@ -69,53 +66,49 @@ def test_the_papers_points_begin_on_a_sphere_and_end_as_a_hundred_thousand() -> 
 
 def test_slopes_are_the_gradients_of_the_distance() -> None:
     torch.manual_seed(0)
-    network = SurfaceNet(16, 3, 2).double()
+    network, points = SurfaceNet(16, 3, 2).double(), torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
-    points = torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
-    found = network(points)
-    (expected,) = torch.autograd.grad(found.distance.sum(), points)
-    torch.testing.assert_close(found.slope, expected)
-    encoding = positional_encoding(points, 2)
-    for column in range(encoding.shape[1]):
-        (expected,) = torch.autograd.grad(encoding[:, column].sum(), points, retain_graph=True)
-        torch.testing.assert_close(slopes_of_encoding(points, 2)[:, column].detach(), expected)
+    found, encoding = network(points), positional_encoding(points, 2)
+    torch.testing.assert_close(found.slope, torch.autograd.grad(found.distance.sum(), points)[0])
+    for column, slopes in zip(encoding.unbind(1), slopes_of_encoding(points, 2).unbind(1), strict=True):
+        (expected,) = torch.autograd.grad(column.sum(), points, retain_graph=True)
+        torch.testing.assert_close(slopes.detach(), expected)
 
 
+@torch.no_grad()
 def test_the_surface_starts_as_about_a_sphere() -> None:
     torch.manual_seed(0)
-    network = SurfaceNet(256, 7, 6)
-    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    network, directions = SurfaceNet(256, 7, 6), torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
     inner, outer = (network(radius * directions) for radius in (0.3, 0.8))
-    assert (outer.distance - inner.distance).detach().mean() > 0.2
-    assert (torch.nn.functional.normalize(outer.slope, dim=-1) * directions).sum(-1).detach().mean() > 0.8
+    assert (outer.distance - inner.distance).mean() > 0.2
+    assert (torch.nn.functional.normalize(outer.slope, dim=-1) * directions).sum(-1).mean() > 0.8
 
 
 def test_a_color_is_albedo_times_light_on_the_normal() -> None:
-    avatar, face = new_avatar(), toy_face(5)[2]
+    avatar = new_avatar()
     surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
     normals = torch.nn.functional.normalize(surface.slope, dim=-1)
-    torch.testing.assert_close(colors(avatar, face), surface.albedo.sigmoid() * avatar.shading(normals))
+    expected = surface.albedo.sigmoid() * avatar.shading(normals)
+    torch.testing.assert_close(colors(avatar, toy_face(5)[2]), expected)
     assert new_avatar(disturbed=False).shading(normals).unique().tolist() == [1.0]
 
 
 def test_light_follows_deformed_normals_as_the_head_turns() -> None:
-    avatar, face = new_avatar(replace(SMALL, normals="deformed")), toy_face(5)[2]
+    avatar, still, face = new_avatar(replace(SMALL, normals="deformed")), new_avatar(), toy_face(5)[2]
     turned = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.0, 0.0]))
     assert (colors(avatar, face) - colors(avatar, turned)).abs().max() > 1e-3
     with pytest.raises(UserError, match=r"^the setting normals deformed of point_avatar: .*export a \.ply"):
         avatar.bake()
-    still = new_avatar()
     torch.testing.assert_close(colors(still, face), colors(still, turned))
     # Points on rigid bones have normals that turn with them.
+    last = avatar.deformation.skinning
     with torch.no_grad():
-        avatar.deformation.skinning.weight.zero_()
-        avatar.deformation.skinning.bias.zero_()
-        avatar.deformation.skinning.bias[0] = 10.0
-    points = avatar.store["means"].detach() / LENGTH_UNIT
-    normals = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
-    rest = avatar.motion.transforms(avatar.motion.canonical_face())[0, 0, :, :3]
-    now = avatar.motion.transforms(turned)[0, 0, :, :3]
+        last.weight.zero_()
+        last.bias.copy_(10.0 * torch.eye(len(last.bias))[0])
+    points, normals = avatar.store["means"].detach() / LENGTH_UNIT, torch.randn(30, 3)
+    normals = torch.nn.functional.normalize(normals, dim=-1)
+    rest, now = (avatar.motion.transforms(one)[0, 0, :, :3] for one in (avatar.motion.canonical_face(), turned))
     expected = normals @ (head_poses(turned)[0, :3, :3] @ now @ rest.T).T
     torch.testing.assert_close(avatar.deformed_normals(points, normals, turned)[0], expected, atol=1e-5, rtol=0)
 
@@ -123,19 +116,16 @@ def test_light_follows_deformed_normals_as_the_head_turns() -> None:
 def test_points_that_others_hide_are_not_drawn() -> None:
     """A small point behind four large ones takes part in no pixel, but is within the picture."""
     camera = toy_camera(32)
-    ahead = camera.viewmat[2, :3]
-    near = camera.position + 0.5 * ahead
-    means = torch.stack([near, near, near, near, near + 0.3 * ahead]).requires_grad_()
+    depths = torch.tensor([0.5, 0.5, 0.5, 0.5, 0.8])
+    means = (camera.position + depths[:, None] * camera.viewmat[2, :3]).requires_grad_()
     scales = torch.tensor([0.2, 0.2, 0.2, 0.2, 0.01])[:, None].repeat(1, 3)
-    gaussians = Gaussians(
-        means, torch.tensor([1.0, 0, 0, 0]).repeat(5, 1), scales, torch.full((5,), 0.99), torch.zeros(5, 1, 3)
-    )
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(5, 1)
+    gaussians = Gaussians(means, quats, scales, torch.full((5,), 0.99), torch.zeros(5, 1, 3))
     rendering = rasterize(gaussians, camera, torch.ones(3))
     assert (rendering.radii > 0).all()
     (rendering.image * torch.linspace(0, 1, 32)[:, None]).sum().backward()
     seen = was_drawn(gaussians, rendering)
-    assert seen[0] == 1
-    assert seen[4] == 0
+    assert (seen[0], seen[4]) == (1, 0)
 
 
 def test_losses_hold_points_on_a_surface_whose_slope_is_one() -> None:

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from known import known
 from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
 
 Sizes = tuple[int, int, tuple[tuple[int, Activation, int | None], ...]]
@@ -55,15 +56,13 @@ def results(sizes: Sizes, given: list[Tensor], native: bool) -> list[Tensor]:
 
 
 def test_softplus_over_its_whole_range(isa: str) -> None:
-    values = torch.cat([torch.linspace(-2, 2, 4001), torch.tensor([0.0, -1e30, 1e30, 1e-20])])[:, None]
-    one = torch.ones(1, 1)
-    inputs = values.clone().requires_grad_()
-    given = [Layer(one, torch.zeros(1), "softplus"), Layer(one, torch.zeros(1))]
-    outputs = point_network(inputs, given)
+    inputs = torch.cat([torch.linspace(-2, 2, 4001), torch.tensor([0.0, -1e30, 1e30, 1e-20])])[:, None]
+    inputs, one = inputs.requires_grad_(), torch.ones(1, 1)
+    outputs = point_network(inputs, [Layer(one, torch.zeros(1), "softplus"), Layer(one, torch.zeros(1))])
     (slope,) = torch.autograd.grad(outputs.sum(), inputs)
-    expected = torch.nn.functional.softplus(values.double(), beta=100)
-    torch.testing.assert_close(outputs.detach().double(), expected, atol=2e-8, rtol=1e-6)
-    torch.testing.assert_close(slope.double(), (100 * values.double()).sigmoid(), atol=2e-5, rtol=0)
+    expected = torch.nn.functional.softplus(inputs.double(), beta=100)
+    torch.testing.assert_close(outputs.double(), expected, atol=2e-8, rtol=1e-6)
+    torch.testing.assert_close(slope.double(), (100 * inputs.double()).sigmoid(), atol=2e-5, rtol=0)
 
 
 def test_reference_has_the_gradients_of_finite_differences() -> None:
@@ -78,13 +77,10 @@ def test_reference_has_the_gradients_of_finite_differences() -> None:
 def test_what_needs_no_gradient_gets_none() -> None:
     sizes = NETWORKS[0]
     inputs, *parameters = arguments(sizes)
+    expected = results(sizes, [inputs, *parameters], native=True)
     with torch.no_grad():
-        alone = point_network(inputs, layers_of(sizes, parameters))
-    assert torch.equal(alone, results(sizes, arguments(sizes), native=True)[0])
+        assert torch.equal(point_network(inputs, layers_of(sizes, parameters)), expected[0])
     parameters = [tensor.requires_grad_() for tensor in parameters]
     point_network(inputs, layers_of(sizes, parameters)).backward(gradient_of(sizes))
-    expected = results(sizes, arguments(sizes), native=True)[2:]
     assert inputs.grad is None
-    for own, truth in zip(parameters, expected, strict=True):
-        assert own.grad is not None
-        assert torch.equal(own.grad, truth)
+    assert all(torch.equal(known(own.grad), truth) for own, truth in zip(parameters, expected[2:], strict=True))

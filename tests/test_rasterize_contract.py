@@ -1,5 +1,6 @@
 """`rasterize` keeps its contract besides the colours: batches, frames, edge cases and clear refusals."""
 
+import math
 import multiprocessing
 import sys
 from dataclasses import replace
@@ -7,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from known import known
 from mien import _native
 from mien.camera import Camera
 from mien.errors import UserError
@@ -48,9 +50,8 @@ def test_a_ball_on_the_axis_shows_its_color_at_the_center(backend: Backend) -> N
     torch.testing.assert_close(rendering.image[7, 10], 0.8 * torch.tensor([1.0, 0.5, 0.1]), atol=1e-4, rtol=0)
     torch.testing.assert_close(rendering.image, rendering.image.flip(0).flip(1), atol=1e-5, rtol=0)
     variance = (60 * 0.02) ** 2 + 0.3
-    falloff = 0.8 * torch.exp(torch.tensor(-0.5 * 2**2 / variance))
-    assert rendering.alpha[7, 12].item() == pytest.approx(falloff.item(), abs=1e-5)
-    assert rendering.radii.tolist() == [int(torch.ceil(torch.tensor(3 * variance**0.5)))]
+    assert rendering.alpha[7, 12].item() == pytest.approx(0.8 * math.exp(-0.5 * 2**2 / variance), abs=1e-5)
+    assert rendering.radii.tolist() == [math.ceil(3 * variance**0.5)]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -62,30 +63,37 @@ def test_nearer_hides_farther_and_ties_go_by_index(backend: Backend) -> None:
     torch.testing.assert_close(seen, torch.tensor([0.8 * 0.04, 0.8, 0.8 * 0.2]), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_clamped_alpha_has_no_gradient(backend: Backend) -> None:
+    gaussians = replace(one_gaussian(scale=5.0), opacities=torch.ones(1, requires_grad=True))
+    alpha = rasterize(gaussians, front_camera(), torch.zeros(3), backend).alpha[7, 10]
+    assert alpha.item() == pytest.approx(0.999, abs=1e-6)
+    assert torch.autograd.grad(alpha, gaussians.opacities)[0].item() == 0
+
+
 @pytest.mark.exact
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_local_frame_moves_the_camera(backend: Backend) -> None:
     """Spherical harmonics are evaluated in the local frame, so a posed head keeps its colours."""
     scene = random_scene(0, coefficients=9)
-    pose = scene.gaussians.T_world_local
-    assert pose is not None
     local = replace(scene.gaussians, T_world_local=None)
-    moved = scene.camera.in_frame(pose)  # not `@`, which adds in another order on another processor
-    expected = rasterize(local, moved, scene.background, backend)
-    found = rasterize(scene.gaussians, scene.camera, scene.background, backend)
-    assert torch.equal(found.image, expected.image)
+    # Not `@`, which adds in another order on another processor.
+    moved = scene.camera.in_frame(known(scene.gaussians.T_world_local))
+    found, expected = (
+        rasterize(gaussians, camera, scene.background, backend).image
+        for gaussians, camera in ((scene.gaussians, scene.camera), (local, moved))
+    )
+    assert torch.equal(found, expected)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_batches_equal_their_single_pictures(backend: Backend) -> None:
     scenes = [random_scene(seed, count=50) for seed in range(3)]
-    cameras = [scene.camera for scene in scenes]
-    background = scenes[0].background
+    cameras, background = [scene.camera for scene in scenes], scenes[0].background
     singles = [rasterize(s.gaussians, s.camera, background, backend) for s in scenes]
     batch = rasterize(stacked(scenes), cameras, background, backend)
-    assert torch.equal(batch.image, torch.stack([single.image for single in singles]))
-    assert torch.equal(batch.radii, torch.stack([single.radii for single in singles]))
-    assert batch.alpha.shape == (3, 45, 61)
+    for name in ("image", "radii", "alpha"):
+        assert torch.equal(getattr(batch, name), torch.stack([getattr(single, name) for single in singles]))
     one_camera = rasterize(stacked(scenes), cameras[1], background, backend)
     assert torch.equal(one_camera.image[1], singles[1].image)
     one_scene = rasterize(scenes[1].gaussians, cameras, background, backend)
@@ -103,79 +111,51 @@ def test_means2d_gradient_is_per_pixel_of_motion(backend: Backend) -> None:
     gaussians, camera = one_gaussian(), front_camera()
     rendering = rasterize(gaussians, camera, torch.zeros(3), backend)
     rendering.alpha[7, 12].backward()
-    gradient = rendering.means2d_offset.grad
-    assert gradient is not None
     moved = replace(camera, K=camera.K + torch.tensor([[0, 0, 1e-2], [0, 0, 0], [0, 0, 0]]))
     change = rasterize(gaussians, moved, torch.zeros(3), backend).alpha[7, 12] - rendering.alpha[7, 12]
+    gradient = known(rendering.means2d_offset.grad)
     assert gradient[0, 0].item() == pytest.approx(change.item() / 1e-2, rel=2e-2)
     assert gradient[0, 1].abs() < 1e-6
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_nothing_to_see_is_background(backend: Backend) -> None:
-    unseen = {
+    background = torch.tensor([0.1, 0.2, 0.3])
+    for name, gaussians in {
         "behind": one_gaussian(depth=-1),
         "at the near plane": one_gaussian(depth=0.01),
         "transparent": one_gaussian(opacity=0),
         "below 1/255": one_gaussian(opacity=1 / 256),
         "beside the picture": replace(one_gaussian(), means=torch.tensor([[10.0, 0, 1]])),
         "none": one_gaussian().select(torch.zeros(1, dtype=torch.bool)),
-    }
-    for name, gaussians in unseen.items():
+    }.items():
         means = gaussians.means.clone().requires_grad_()
-        rendering = rasterize(replace(gaussians, means=means), front_camera(), torch.tensor([0.1, 0.2, 0.3]), backend)
-        assert torch.equal(rendering.image, torch.tensor([0.1, 0.2, 0.3]).expand(15, 21, 3)), name
+        rendering = rasterize(replace(gaussians, means=means), front_camera(), background, backend)
+        assert torch.equal(rendering.image, background.expand(15, 21, 3)), name
         assert not rendering.alpha.any(), name
         assert not rendering.radii.any(), name
-        rendering.image.sum().backward()
-        assert means.grad is not None
-        assert not means.grad.any(), name
+        assert not torch.autograd.grad(rendering.image.sum(), means)[0].any(), name
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_extremes_stay_finite(backend: Backend) -> None:
-    extremes = {
-        "zero quaternion": {"quats": torch.zeros(1, 4)},
-        "points": {"scales": torch.zeros(1, 3)},
-        "huge": {"scales": torch.full((1, 3), 1e4)},
-        "needle": {"scales": torch.tensor([[1e3, 1e-6, 1e-6]])},
-        "opaque": {"opacities": torch.ones(1)},
-        "at the cutoff": {"opacities": torch.full((1,), 1 / 255)},
-        "touching the camera": {"means": torch.tensor([[0.0, 0.0, 0.0101]])},
-        "far away": {"means": torch.tensor([[0.0, 0.0, 1e6]])},
-    }
-    for name, change in extremes.items():
-        gaussians = replace(one_gaussian(), **change)
-        leaves = {one: getattr(gaussians, one).clone().requires_grad_() for one in ("means", "quats", "scales")}
-        rendering = rasterize(replace(gaussians, **leaves), front_camera(70, 50), torch.zeros(3), backend)
-        rendering.image.sum().backward()
-        assert rendering.image.isfinite().all(), name
-        assert ((rendering.alpha >= 0) & (rendering.alpha <= 1)).all(), name
-        assert all(tensor.grad is not None and tensor.grad.isfinite().all() for tensor in leaves.values()), name
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh"])
-def test_what_is_not_finite_is_named(backend: Backend, name: str) -> None:
-    for value in (torch.nan, torch.inf, -torch.inf):
-        gaussians = random_scene(3, count=40).gaussians
-        gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
-        gaussians.opacities[17] = 0.5
-        getattr(gaussians, name).view(40, -1)[17, -1] = value
-        with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
-            rasterize(gaussians, random_scene(3).camera, torch.zeros(3), backend)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_camera_that_is_not_finite_is_named(backend: Backend) -> None:
-    camera = front_camera()
+def test_what_is_not_finite_is_named(backend: Backend) -> None:
+    camera = random_scene(3).camera
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        for value in (torch.nan, torch.inf, -torch.inf):
+            gaussians = random_scene(3, count=40).gaussians
+            gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
+            gaussians.opacities[17] = 0.5
+            getattr(gaussians, name).view(40, -1)[17, -1] = value
+            with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
+                rasterize(gaussians, camera, torch.zeros(3), backend)
     broken = replace(camera, viewmat=torch.full((4, 4), torch.nan))
-    with pytest.raises(ValueError, match=r"camera.viewmat\[0, 0\] is nan"):
-        rasterize(one_gaussian(), broken, torch.zeros(3), backend)
-    with pytest.raises(ValueError, match=r"camera.viewmat\[0, \d\] is nan"):
-        rasterize(one_gaussian(), [camera, broken, camera], torch.zeros(3), backend)
-    with pytest.raises(ValueError, match=r"background\[1\] is inf"):
-        rasterize(one_gaussian(), camera, torch.tensor([0, torch.inf, 0]), backend)
+    for given, background, words in (
+        (broken, 0.0, r"camera.viewmat\[0, 0\] is nan"),
+        ([camera, broken, camera], 0.0, r"camera.viewmat\[0, \d\] is nan"),
+        (camera, torch.inf, r"background\[1\] is inf"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            rasterize(one_gaussian(), given, torch.tensor([0.0, background, 0.0]), backend)
 
 
 def test_layouts_and_dtypes() -> None:
@@ -187,38 +167,25 @@ def test_layouts_and_dtypes() -> None:
     found = rasterize(replace(scene.gaussians, **spread), scene.camera, scene.background, "native")
     assert torch.equal(found.image, rasterize(scene.gaussians, scene.camera, scene.background, "native").image)
     double = scene.to(torch.float64)
-    assert rasterize(double.gaussians, scene.camera, double.background).image.dtype == torch.float64
+    assert rasterize(double.gaussians, double.camera, double.background).image.dtype == torch.float64
     with pytest.raises(ValueError, match="takes float32 CPU tensors, got torch.float64"):
         rasterize(double.gaussians, double.camera, double.background, "native")
     with pytest.raises(ValueError, match="quats is torch.float64"):
         rasterize(replace(scene.gaussians, quats=double.gaussians.quats), scene.camera, scene.background)
-    assert choose_backend(scene.background) == "native"
-    assert choose_backend(double.background) == "reference"
+    assert [choose_backend(one.background) for one in (scene, double)] == ["native", "reference"]
 
 
 def test_what_does_not_fit_is_refused() -> None:
     scenes = [random_scene(seed) for seed in range(3)]
-    cameras = [scene.camera for scene in scenes]
-    background = torch.zeros(3)
-    with pytest.raises(ValueError, match="3 timesteps of Gaussians but 2 cameras"):
-        rasterize(stacked(scenes), cameras[:2], background)
-    with pytest.raises(ValueError, match="must have one size"):
-        rasterize(scenes[0].gaussians, [cameras[0], front_camera()], background)
-    with pytest.raises(ValueError, match="is empty"):
-        rasterize(scenes[0].gaussians, [], background)
-    with pytest.raises(ValueError, match="sh has shape"):
-        rasterize(random_scene(0, coefficients=5).gaussians, cameras[0], background)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_clamped_alpha_has_no_gradient(backend: Backend) -> None:
-    opacities = torch.ones(1, requires_grad=True)
-    gaussians = replace(one_gaussian(scale=5.0), opacities=opacities)
-    alpha = rasterize(gaussians, front_camera(), torch.zeros(3), backend).alpha[7, 10]
-    assert alpha.item() == pytest.approx(0.999, abs=1e-6)
-    alpha.backward()
-    assert opacities.grad is not None
-    assert opacities.grad.item() == 0
+    one, cameras = scenes[0].gaussians, [scene.camera for scene in scenes]
+    for gaussians, given, words in (
+        (stacked(scenes), cameras[:2], "3 timesteps of Gaussians but 2 cameras"),
+        (one, [cameras[0], front_camera()], "must have one size"),
+        (one, [], "is empty"),
+        (random_scene(0, coefficients=5).gaussians, cameras[0], "sh has shape"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            rasterize(gaussians, given, torch.zeros(3))
 
 
 def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
@@ -227,7 +194,7 @@ def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
 
 
 def test_a_forked_child_renders() -> None:
-    """A forked child renders. Threads do not survive a fork, so the pool must notice it."""
+    """Threads do not survive a fork, so the pool must notice it."""
     _native.set_thread_count(2)
     scene = random_scene(0)
     expected = rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist()
@@ -249,14 +216,9 @@ def test_gsplat_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_more_pairs_than_can_be_counted_are_refused():
     count, width = 70_000, 1_048_544  # each Gaussian touches all of 32,767 tiles
-    one = one_gaussian(scale=3.0)
-    means = one.means.repeat(count, 1)
-    means[:, 2] += torch.linspace(0, 1, count)
-    repeated = {name: getattr(one, name).repeat_interleave(count, 0) for name in ("quats", "scales", "opacities", "sh")}
+    gaussians = one_gaussian(scale=3.0).select(torch.zeros(count, dtype=torch.long))
+    gaussians.means[:, 2] += torch.linspace(0, 1, count)
     K = torch.tensor([[float(width), 0, width / 2], [0, float(width), 0.5], [0, 0, 1]])
-    gaussians, camera = Gaussians(means=means, **repeated), Camera(K, torch.eye(4), width, 1)
-    with (
-        pytest.raises(UserError, match=r"^it: cannot be drawn \(too many pairs .*\); do something else$"),
-        drawable("it", "do something else"),
-    ):
-        rasterize_in_place(gaussians, camera, torch.ones(3), backend="native")
+    words = r"^it: cannot be drawn \(too many pairs .*\); do something else$"
+    with pytest.raises(UserError, match=words), drawable("it", "do something else"):
+        rasterize_in_place(gaussians, Camera(K, torch.eye(4), width, 1), torch.ones(3), backend="native")

@@ -1,6 +1,5 @@
 """Settings and constants have a sentence and a range; the help tells them, and presets hold only what they may."""
 
-import ast
 import math
 import re
 from collections.abc import Iterator
@@ -11,27 +10,13 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import pytest
 
-import mien
 import train_toy
 from mien import _native
-from mien.avatar import (
-    METHODS,
-    FaceTuning,
-    GradientSettings,
-    HeadGasConfig,
-    Progress,
-    Rate,
-    RefillSettings,
-)
-from mien.capture.constants import CAPTURE
-from mien.commands.help_text import field_docs
+from mien.avatar import METHODS, GradientSettings, HeadGasConfig, Rate, RefillSettings
 from mien.commands.settings_options import leaves
-from mien.driving.constants import DRIVING
 from mien.errors import UserError
-from mien.face.constants import FACE
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges, shown
-from mien.tracking.constants import TRACKING
-from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings, train
+from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings, train, trainer
 from plain_settings import plain_gaussian_avatars
 from test_settings import help_of, with_file
 from toy_scene import toy_sequence
@@ -55,48 +40,6 @@ def changed(settings: Any, path: str, value: Any) -> Any:
     """Return settings with another value of a dotted name."""
     name, _, rest = path.partition(".")
     return replace(settings, **{name: changed(getattr(settings, name), rest, value) if rest else value})
-
-
-@pytest.mark.parametrize("settings", [*EVERYTHING, FaceTuning(), Rate(1.0)], ids=lambda one: type(one).__name__)
-def test_every_field_has_a_sentence(settings: Any) -> None:
-    docs = field_docs(type(settings))
-    for field in fields(settings):
-        about = docs[field.name]
-        assert about[0].isupper(), field.name
-        assert about.endswith("."), field.name
-        assert not about.startswith("Of "), field.name
-        if is_dataclass(getattr(settings, field.name)):
-            test_every_field_has_a_sentence(getattr(settings, field.name))
-
-
-def constants(name: str, room: Any) -> Iterator[tuple[str, str, bool]]:
-    """Yield each constant's name, its name behind the local name `known`, and whether its class documents it."""
-    docs = field_docs(type(room))
-    for field in fields(room):
-        value = getattr(room, field.name)
-        if is_dataclass(value):
-            yield from constants(f"{name}.{field.name}", value)
-        else:
-            yield f"{name}.{field.name}", f"known.{field.name}", bool(docs.get(field.name))
-
-
-def dotted(node: ast.AST) -> str:
-    """Return `A.b.c` of an expression that is a chain of names, and nothing of another one."""
-    if isinstance(node, ast.Attribute):
-        before = dotted(node.value)
-        return f"{before}.{node.attr}" if before else ""
-    return node.id if isinstance(node, ast.Name) else ""
-
-
-def test_every_constant_says_what_it_is_and_is_used() -> None:
-    rooms = {"CAPTURE": CAPTURE, "DRIVING": DRIVING, "FACE": FACE, "TRACKING": TRACKING}
-    texts = [path.read_text(encoding="utf-8") for path in Path(str(mien.__file__)).parent.rglob("*.py")]
-    trees = [ast.parse(text) for text in texts if any(f"{name}." in text for name in (*rooms, "known"))]
-    used = {dotted(node) for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    for room, values in rooms.items():
-        for name, local, documented in constants(room, values):
-            assert documented, name
-            assert {name, local} & used, f"nothing uses {name}"
 
 
 @pytest.mark.unchecked
@@ -130,15 +73,14 @@ def test_what_is_in_range_passes() -> None:
     TrainSettings(resolution=16).check()
 
 
+@dataclass(frozen=True)
+class Some:
+    sizes: Annotated[tuple[int, ...], Range(16, 64, filled=True)] = (16,)
+    first: Annotated[float, FRACTION] = 0.0
+    last: Annotated[float, FRACTION, NotBelow("first")] = 1.0
+
+
 def test_ranges_in_words() -> None:
-    """Messages say the allowed range in words."""
-
-    @dataclass(frozen=True)
-    class Some:
-        sizes: Annotated[tuple[int, ...], Range(16, 64, filled=True)] = (16,)
-        first: Annotated[float, FRACTION] = 0.0
-        last: Annotated[float, FRACTION, NotBelow("first")] = 1.0
-
     for some, words in (
         (Some(sizes=()), "--sizes (nothing): give numbers from 16 to 64"),
         (Some(sizes=(16, 70)), "--sizes 16 70: give numbers from 16 to 64"),
@@ -152,11 +94,12 @@ def test_ranges_in_words() -> None:
 
 def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
-    with pytest.raises(UserError, match="--training.record-every 0"):
-        train([sequence], face_model, train_toy.CONFIG, TrainSettings(record_every=0), tmp_path / "run")
-    config = replace(train_toy.CONFIG, sh_degree=4)
-    with pytest.raises(UserError, match="--method.sh-degree 4"):
-        train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "run")
+    for config, settings, words in (
+        (train_toy.CONFIG, TrainSettings(record_every=0), "--training.record-every 0"),
+        (replace(train_toy.CONFIG, sh_degree=4), train_toy.SETTINGS, "--method.sh-degree 4"),
+    ):
+        with pytest.raises(UserError, match=words):
+            train([sequence], face_model, config, settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -168,26 +111,14 @@ def test_settings_that_make_training_diverge_are_told(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "avatar").exists()
 
 
-def test_a_rate_that_starts_at_nothing_stays_there() -> None:
-    assert Rate(0.0, 1e-3).at(Progress(5, 10)) == 0
-    assert Rate(1e-2, 1e-4).at(Progress(5, 10)) == pytest.approx(1e-3)
-
-
 def test_threads_of_a_run_are_those_it_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before, seen = _native.thread_count(), []
     face_model, sequence = toy_sequence(timesteps=5, size=32)
-    settings = replace(train_toy.SETTINGS, steps=1, threads=before + 1)
-    monkeypatch.setattr("mien.training.trainer.step", lambda state, *_: _end(state, seen))
-    monkeypatch.setattr("mien.training.trainer.write_results", lambda *_: None)
+    settings, first = replace(train_toy.SETTINGS, steps=1, threads=before + 1), trainer.step
+    monkeypatch.setattr(trainer, "step", lambda *given: seen.append(_native.thread_count()) or first(*given))
     train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
     assert seen == [before + 1]
     assert _native.thread_count() == before
-
-
-def _end(state: Any, seen: list[int]) -> str:
-    seen.append(_native.thread_count())
-    state.step += 1
-    return ""
 
 
 def about_options(help_text: str) -> dict[str, str]:
@@ -204,49 +135,36 @@ def about_options(help_text: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """With what presets give it where that is not the default."""
     text = help_of(capsys, "train", "--method", method, "--help-all")
-    listed = leaves(METHODS[method].config(), "method")
-    assert [leaf for leaf in listed if f" {leaf.option('method')} " not in text] == []
-    assert [leaf.heading for leaf in listed if f" {leaf.heading} options " not in text] == []
-    rest = [field.name for field in fields(TrainSettings) if field.name not in MAIN_SETTINGS]
-    assert [name for name in rest if f"--training.{name.replace('_', '-')} " not in text] == []
-    about = about_options(text)
-    for prefix, default in (("method", METHODS[method].config()), ("training", TrainSettings())):
-        of_presets = {
-            name: (preset.config(method) if prefix == "method" else preset.settings_of(method))
-            for name, preset in PRESETS.items()
-            if name in METHODS[method].presets
-        }
-        for leaf in leaves(default, prefix):
+    about, default = about_options(text), METHODS[method].config()
+    presets = {name: PRESETS[name] for name in METHODS[method].presets}
+    assert [leaf for leaf in leaves(default, "method") if f" {leaf.heading} options " not in text] == []
+    of_method = {name: preset.config(method) for name, preset in presets.items()}
+    of_run = {name: preset.settings_of(method) for name, preset in presets.items()}
+    for prefix, settings, of_presets in (("method", default, of_method), ("training", TrainSettings(), of_run)):
+        for leaf in leaves(settings, prefix):
             option = leaf.option(prefix if leaf.name not in MAIN_SETTINGS else "").replace("--.", "--")
-            if option not in about:
-                assert option in ("--held-out-sequences", "--held-out-cameras")
+            if option in ("--held-out-sequences", "--held-out-cameras"):
                 continue
+            assert leaf.about[0].isupper(), option
             known = about[option].rpartition("(")[2]
-            for name, settings in of_presets.items():
-                value = attrgetter(leaf.name)(settings)
+            for name, values in of_presets.items():
+                value = attrgetter(leaf.name)(values)
                 if value == leaf.value and leaf.name != "steps":
-                    assert f"{name}:" not in known, (option, name)
-                    assert f"{name}," not in known, (option, name)
+                    assert not re.search(rf"\b{name}[:,]", known), (option, name)
                 else:
-                    text = re.escape("none" if value is None else shown(value))
-                    assert re.search(rf"\b{name}(, [a-z-]+)*: {text}[;)]", known), (option, known)
-    assert ("paper" in about["--background"]) == ("paper" in METHODS[method].presets)
+                    words = re.escape("none" if value is None else shown(value))
+                    assert re.search(rf"\b{name}(, [a-z-]+)*: {words}[;)]", known), (option, known)
+    assert ("paper" in about["--background"]) == ("paper" in presets)
 
 
-def test_help_all_with_a_preset_shows_its_values(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_all_shows_the_values_of_a_preset_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     about = about_options(help_of(capsys, "create", "--preset", "paper", "--help-all"))
     assert about["--method.sh-degree"].endswith("(from 0 to 3; default: 3; draft, standard, fine: 0)")
     assert about["--background"].endswith("(default: white; draft, standard, fine: auto)")
-
-
-def test_help_all_shows_what_a_file_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = with_file(tmp_path, '{"method": {"kind": "headgas", "features": 321}}')
-    shown = help_of(capsys, *line, "--help-all")
-    assert "default: 321" in " ".join(shown.split())
-
-
-def test_help_stays_short_and_says_how_to_see_more(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "default: 321" in about_options(help_of(capsys, *line, "--help-all"))["--method.features"]
     short = help_of(capsys, "train", "--method", "headgas", "--help")
     assert len(short.splitlines()) < 60
     assert "--method.features" not in short

@@ -1,6 +1,7 @@
 """Several frames in one optimiser step, and pictures of half the size at the start of a run."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,9 @@ import pytest
 import torch
 
 import train_toy
-from mien import _native
+from instruction_sets import by_threads
 from mien.adam import Moments
 from mien.avatar import MonoGaussianAvatarConfig, PerceptualLoss, Photometric, Progress
-from mien.cli import main
 from mien.errors import UserError
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
@@ -27,7 +27,7 @@ from plain_settings import plain_mono_gaussian_avatar, plain_run
 from test_methods import new_avatar
 from test_training_resume import assert_same_results
 from toy_scene import toy_camera, toy_face, toy_sequence
-from training_progress import silence, stopped_at
+from train_toy import silence, stopped_at
 
 SMALL = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
@@ -44,10 +44,10 @@ def new_state(
     return state, TrainingData(order, (Targets(sequence, 0),))
 
 
-def pull_at(state: TrainingState, data: TrainingData, frame: int, settings: TrainSettings = SETTINGS) -> torch.Tensor:
+def pull_at(state: TrainingState, data: TrainingData, frame: int) -> torch.Tensor:
     """Return the gradient of the points in the first step, which begins at a frame: ten times the first moments."""
     state.step = frame
-    step(state, data, settings)
+    step(state, data, SETTINGS)
     return 10 * means_moments(state).first
 
 
@@ -80,15 +80,8 @@ def test_losses_of_a_picture_are_means_and_steps_pass_every_multiple_once() -> N
 @pytest.mark.unchecked
 def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     state, data = new_state()
-    rounds: list[bool] = []
-    adapt = state.density.adapt
-
-    def adapt_and_note(*given: Any) -> bool:
-        rounds.append(adapt(*given))
-        return rounds[-1]
-
-    monkeypatch.setattr(state.density, "adapt", adapt_and_note)
-    seen = []
+    rounds, seen, adapt = [], [], state.density.adapt
+    monkeypatch.setattr(state.density, "adapt", lambda *given: rounds.append(adapt(*given)) or rounds[-1])
     while state.step < SETTINGS.steps:
         batch = next_batch(state, data, SETTINGS)
         assert [one.number for one in batch] == list(range(state.step, state.step + len(batch)))
@@ -105,17 +98,15 @@ def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: py
 
 
 def test_a_timestep_that_comes_twice_is_updated_once() -> None:
-    settings = replace(SETTINGS, steps=10)
-    config = replace(
-        SMALL, face_tuning=replace(SMALL.face_tuning, expression=replace(SMALL.face_tuning.expression, begin=0.0))
-    )
-    state, data = new_state(config, settings, timesteps=3)
+    settings, tuning = replace(SETTINGS, steps=10), SMALL.face_tuning
+    tuning = replace(tuning, expression=replace(tuning.expression, begin=0.0))
+    state, data = new_state(replace(SMALL, face_tuning=tuning), settings, timesteps=3)
     step(state, data, settings)
-    moments = state.track.state()
-    assert sorted(moments["expression.step"].tolist()) == [1, 1, 1]
+    assert state.track.state()["expression.step"].tolist() == [1, 1, 1]
 
 
 def test_many_points_mean_fewer_frames() -> None:
+    """Other methods use one frame."""
     state, _ = new_state(replace(SMALL, frames_per_step=8, points_per_step=200))
     store, found = state.avatar.gaussian_store(), []
     for count in (20, 25, 26, 60, 100, 101, 200, 500):
@@ -124,65 +115,41 @@ def test_many_points_mean_fewer_frames() -> None:
     assert found == [8, 8, 7, 3, 2, 1, 1, 1]
     with pytest.raises(UserError, match="frames-per-step 0"):
         replace(SMALL, frames_per_step=0).check()
-
-
-def test_other_methods_use_one_frame_and_have_no_such_setting(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     assert [new_avatar(method).extras.frames_per_step() for method in ("gaussian_avatars", "headgas")] == [1, 1]
-    assert main(["train", str(tmp_path), "--method", "headgas", "--method.frames-per-step", "4"]) == 2
-    assert "frames-per-step" in capsys.readouterr().err
 
 
 @pytest.mark.unchecked
 def test_the_number_of_threads_changes_no_bit() -> None:
     """Pictures of a step are drawn side by side, or one by one if there are more threads than frames."""
-    results, before = [], _native.thread_count()
-    try:
-        for threads in (1, 3, 6):
-            _native.set_thread_count(threads)
-            state, data = new_state()
-            for _ in range(3):
-                step(state, data, SETTINGS)
-            results.append(state.avatar.state_dict())
-    finally:
-        _native.set_thread_count(before)
-    for other in results[1:]:
-        assert all(torch.equal(tensor, other[name]) for name, tensor in results[0].items())
 
+    def trained() -> dict[str, torch.Tensor]:
+        state, data = new_state()
+        for _ in range(3):
+            step(state, data, SETTINGS)
+        return state.avatar.state_dict()
 
-def test_entries_of_a_batch_are_its_timesteps() -> None:
-    avatar, face = new_avatar("mono_gaussian_avatar"), toy_face(3)
-    together = avatar.pose(face, Progress(0, 10)).gaussians
-    one_by_one = [together.timestep(index) for index in range(3)]
-    for found, expected in zip(together.timesteps(), one_by_one, strict=True):
-        for name in ("means", "quats", "scales", "opacities", "sh", "T_world_local"):
-            assert torch.equal(getattr(found, name), getattr(expected, name))
-    assert one_by_one[0].timesteps() == [one_by_one[0]]
+    first, *others = by_threads(trained, (1, 3, 6))
+    assert all(torch.equal(tensor, other[name]) for other in others for name, tensor in first.items())
 
 
 def test_views_with_their_own_backgrounds_and_sizes_are_drawn_as_alone() -> None:
-    avatar, face = new_avatar("mono_gaussian_avatar"), toy_face(2)
-    backgrounds = [torch.ones(3), torch.tensor([0.1, 0.5, 0.9])]
-    cameras = [toy_camera(24), toy_camera(40)]
+    avatar, cameras = new_avatar("mono_gaussian_avatar"), [toy_camera(24), toy_camera(40)]
+    backgrounds, means = [torch.ones(3), torch.tensor([0.1, 0.5, 0.9])], avatar.gaussian_store()["means"]
 
-    def gradient(together: bool) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-        own = avatar.pose(face, Progress(0, 10)).gaussians.timesteps()
+    def drawn(together: bool) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+        own = avatar.pose(toy_face(2), Progress(0, 10)).gaussians.timesteps()
         if together:
             pictures = rasterize_each(list(zip(own, cameras, strict=True)), backgrounds)
         else:
             pictures = [rasterize(*view) for view in zip(own, cameras, backgrounds, strict=True)]
-        sum((picture.image * picture.image).sum() for picture in pictures).backward()  # type: ignore[union-attr]
-        found = [avatar.gaussian_store()["means"].grad, *(picture.means2d_offset.grad for picture in pictures)]
-        avatar.gaussian_store()["means"].grad = None
-        return [picture.image for picture in pictures], [one for one in found if one is not None]
+        images = [picture.image for picture in pictures]
+        loss = torch.stack([image.square().sum() for image in images]).sum()
+        return images, list(torch.autograd.grad(loss, [means, *(picture.means2d_offset for picture in pictures)]))
 
-    (images, pulls), (alone, pulls_alone) = gradient(True), gradient(False)
+    (images, pulls), (alone, pulls_alone) = drawn(True), drawn(False)
     assert [tuple(image.shape) for image in images] == [(24, 24, 3), (40, 40, 3)]
     assert all(torch.equal(a, b) for a, b in zip(images, alone, strict=True))
-    assert len(pulls) == 3
-    for a, b in zip(pulls, pulls_alone, strict=True):
-        torch.testing.assert_close(a, b)
+    torch.testing.assert_close(pulls, pulls_alone)
 
 
 COARSE = replace(train_toy.SETTINGS, steps=10, coarse=0.5, record_every=1)
@@ -199,60 +166,49 @@ def sizes_of(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     seen, compare = [], trainer.compare
 
-    def looked(state, batch, shown):  # noqa: ANN001, ANN202
-        camera = batch[0].camera
-        seen.append((camera.width, batch[0].target.picture.shape[0], shown[0].image.shape[0]))
+    def looked(state: TrainingState, batch: Any, shown: Any) -> Any:
+        seen.append((batch[0].camera.width, batch[0].target.picture.shape[0], shown[0].image.shape[0]))
         return compare(state, batch, shown)
 
-    monkeypatch.setattr(trainer, "compare", looked)
-    train([sequence], face_model, train_toy.CONFIG, COARSE, run_dir)
+    with monkeypatch.context() as patched:
+        patched.setattr(trainer, "compare", looked)
+        train([sequence], face_model, train_toy.CONFIG, COARSE, run_dir)
     return seen
 
 
 @pytest.mark.unchecked
 @pytest.mark.usefixtures("_halved")
-def test_the_first_half_of_a_run_sees_pictures_of_half_the_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They are forgotten after their last step."""
+def test_the_first_half_of_a_run_sees_pictures_of_half_the_size(tmp_path: Path, monkeypatch) -> None:
+    """They are forgotten after their last step. Smaller ones keep their size."""
     forgotten, forget = [], Targets.forget
     monkeypatch.setattr(Targets, "forget", lambda self: forgotten.append(self.width) or forget(self))
-    assert sizes_of(tmp_path, monkeypatch) == [(16, 16, 16)] * 5 + [(32, 32, 32)] * 5
+    assert sizes_of(tmp_path / "large", monkeypatch) == [(16, 16, 16)] * 5 + [(32, 32, 32)] * 5
     assert forgotten == [16]
-
-
-@pytest.mark.unchecked
-def test_small_pictures_keep_their_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert sizes_of(tmp_path, monkeypatch) == [(32, 32, 32)] * 10
+    monkeypatch.setattr("mien.training.batch.TRAINING", TRAINING)
+    assert sizes_of(tmp_path / "small", monkeypatch) == [(32, 32, 32)] * 10
 
 
 @pytest.mark.unchecked
 @pytest.mark.usefixtures("_halved")
 def test_a_run_that_is_stopped_near_the_change_ends_with_the_same_bytes(tmp_path: Path) -> None:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
-    train([sequence], face_model, train_toy.CONFIG, COARSE, tmp_path / "whole", silence)
-    settings = replace(COARSE, checkpoint_every=1)
+    run = partial(train, [sequence], face_model, train_toy.CONFIG)
+    run(COARSE, tmp_path / "whole", silence)
+    often = replace(COARSE, checkpoint_every=1)
     for last in (3, 5, 6):
         with pytest.raises(KeyboardInterrupt):
-            train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / "stopped", stopped_at(last))
-    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / "stopped", silence)
+            run(often, tmp_path / "stopped", stopped_at(last))
+    run(often, tmp_path / "stopped", silence)
     assert_same_results(tmp_path / "stopped", tmp_path / "whole")
 
 
+@pytest.mark.usefixtures("_halved")
 def test_halved_targets_show_the_same() -> None:
-    sequence = toy_sequence(timesteps=3, size=33)[1]
-    targets = Targets(sequence, 0)
+    targets = Targets(toy_sequence(timesteps=3, size=33)[1], 0)
     halved = targets.halved()
     assert (halved.width, halved.height) == (17, 17)
-    camera, small = targets.camera(0), halved.camera(0)
-    assert small.K[0, 0] == pytest.approx(camera.K[0, 0] * 17 / 33)
+    assert halved.camera(0).K[0, 0] == pytest.approx(targets.camera(0).K[0, 0] * 17 / 33)
     white = np.full(3, 255, np.uint8)
     large, low = (one.target(0, 0, white, keep=False).picture.float().mean() for one in (targets, halved))
     assert float(low) == pytest.approx(float(large), abs=1)
-
-
-@pytest.mark.usefixtures("_halved")
-def test_the_share_says_how_many_steps() -> None:
-    targets = [Targets(toy_sequence(timesteps=3, size=32)[1], 0)]
-    found = [coarse_steps(targets, replace(COARSE, coarse=share)) for share in (0.0, 0.5, 1.0)]
-    assert found == [0, 5, 10]
+    assert [coarse_steps([targets], replace(COARSE, coarse=share)) for share in (0.0, 0.5, 1.0)] == [0, 5, 10]

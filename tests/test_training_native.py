@@ -14,6 +14,7 @@ from torch import Tensor
 
 import test_feature_network as features
 import test_point_network as points
+from instruction_sets import by_threads
 from mien import _native
 from mien.adam import FactoredMoments
 from mien.avatar import GaussianStore, Moments
@@ -24,6 +25,8 @@ from mien.avatar.gaussian_avatars.surface_limits import (
     limits_of_triangles,
     pull_colors,
 )
+from mien.avatar.ops.activation import sigmoid
+from mien.avatar.ops.expression_changes import expression_change, expression_change_reference
 from mien.avatar.ops.skin_points import skin_points, skin_points_reference
 from mien.avatar.ops.triangle_frames import bind_to_world
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
@@ -81,10 +84,6 @@ class Kernel:
     compare: Callable[[int, Tensor, Tensor], None]
 
 
-def adam_inputs(count: int) -> Tensors:
-    return [0.1 * random(count, seed=1), random(count, seed=2).square(), random(count, seed=3), random(count, seed=4)]
-
-
 def adam(given: Tensors, native: bool) -> Tensors:
     def update() -> Update:
         first, second, values, gradient = (tensor.clone() for tensor in given)
@@ -124,10 +123,6 @@ def opacity_loss(given: Tensors, native: bool) -> Tensors:
     (gradient,) = torch.autograd.grad(loss, alpha)
     assert not native or not gradient[0].any()
     return [loss.detach(), gradient[1:]]
-
-
-def square_inputs(size: tuple[int, int]) -> Tensors:
-    return [random(*size, 3), (255 * random(*size, 3, seed=1).sigmoid()).to(torch.uint8)]
 
 
 def mean_square(given: Tensors, native: bool) -> Tensors:
@@ -248,23 +243,39 @@ def limited(given: Tensors, native: bool, pulled: bool) -> Tensors:
     return [store[name].detach() for name in names]
 
 
-def feature_inputs(size: features.Sizes) -> Tensors:
-    return [*features.arguments(size), *features.gradients_of(size)]
+def both(native: Callable[..., Tensor], reference: Callable[..., Tensor]) -> Callable[[Tensors, bool], Tensors]:
+    """Values and gradients of a function of some tensors."""
+
+    def run(given: Tensors, own: bool) -> Tensors:
+        leaves = [tensor.clone().requires_grad_() for tensor in given]
+        values = (native if own else reference)(*leaves)
+        return [values.detach(), *torch.autograd.grad(values, leaves, random(*values.shape, seed=9).to(values))]
+
+    return run
 
 
 def feature_network(given: Tensors, native: bool) -> Tensors:
     return (features.ours if native else features.theirs)(given[:-2], (given[-2], given[-1]))
 
 
+def compare_activated(index: int, own: Tensor, truth: Tensor) -> None:
+    near(0, 5e-7 if index else 1.5e-7)(index, own, truth)
+    if index == 0:
+        near(4e-6, 0)(index, own, truth)
+
+
 COUNTS, PICTURES = (0, 1, 15, 16, 4097), ((1, 1), (7, 5), (40, 130), (200, 301))
+CHANGES = tuple((*shape, rank) for shape in ((0,), (1,), (17, 3), (9000, 3)) for rank in range(1, 9))
 KERNELS = {
     # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
-    "adam": Kernel(adam_inputs, adam, COUNTS, 20_000, near(1e-5, 1e-5)),
+    "adam": Kernel(lambda n: [0.1 * random(n, seed=1), random(n, seed=2).square(), random(n, seed=3), random(n)],
+                   adam, COUNTS, 20_000, near(1e-5, 1e-5)),
     "factored": Kernel(factored_inputs, factored, ((1, 1), (16, 3), (19, 1), (32, 3)), (32, 1), near(1e-5, 1e-6)),
     "published": Kernel(published_inputs, published, ((1, 1), (16, 1), (19, 3), (32, 2)), (32, 1), near(1e-5, 1e-6)),
     "observed": Kernel(observed_inputs, observed, COUNTS, 20_000, near(1.3e-6, 1e-5)),
     "alpha": Kernel(opacity_inputs, opacity_loss, PICTURES, (200, 301), near(1e-5, 1e-7)),
-    "squares": Kernel(square_inputs, mean_square, ((0, 5), (1, 1), (40, 130)), (200, 301), near(1e-5, 0)),
+    "squares": Kernel(lambda size: [random(*size, 3), (255 * random(*size, 3).sigmoid().flip(0)).to(torch.uint8)],
+                      mean_square, ((0, 5), (1, 1), (40, 130)), (200, 301), near(1e-5, 0)),
     "penalties": Kernel(penalty_inputs, penalties, COUNTS, 20_000, near(1e-5, 1e-7)),
     "skinned": Kernel(skin_inputs, skinned, ((3000, 1, 6), (7, 3, 2), (1, 1, 1), (0, 2, 3)), (3000, 1, 6),
                       near_by_norm(1e-5)),
@@ -272,7 +283,12 @@ KERNELS = {
                     compare_bound),
     "limited": Kernel(limited_inputs, partial(limited, pulled=False), (0, 1, 5000), 5000, near(1e-5, 1e-6)),
     "pulled": Kernel(limited_inputs, partial(limited, pulled=True), (0, 1, 5000), 5000, near(1e-5, 1e-6)),
-    "features": Kernel(feature_inputs, feature_network, tuple(features.SIZES), features.SIZES[3], near_by_norm(1e-5)),
+    "features": Kernel(lambda size: [*features.arguments(size), *features.gradients_of(size)], feature_network,
+                       tuple(features.SIZES), features.SIZES[3], near_by_norm(1e-5)),
+    "changes": Kernel(lambda size: [random(*size), random(size[-1], seed=1)],
+                      both(expression_change, expression_change_reference), CHANGES, (20_000, 3, 8), near(1e-4, 1e-4)),
+    "sigmoid": Kernel(lambda count: [8 * random(count)], both(sigmoid, torch.sigmoid), (0, 1, 15, 17, 40_001), 50_000,
+                      compare_activated),
     **{
         f"points{number}": Kernel(partial(points.arguments), partial(points.results, sizes), (sizes,), sizes,
                                   near_by_norm(1e-5))
@@ -300,16 +316,15 @@ def test_native_equals_its_reference(isa: str, name: str, monkeypatch: pytest.Mo
 @pytest.mark.exact
 @every_kernel
 def test_threads_do_not_change_a_bit(name: str) -> None:
-    kernel, before, results = KERNELS[name], _native.thread_count(), []
+    kernel = KERNELS[name]
     given = kernel.make(kernel.large)
-    try:
-        for threads in (1, 2, 3):
-            _native.set_thread_count(threads)
-            results.append(kernel.run(given, True))
-    finally:
-        _native.set_thread_count(before)
-    for other in results[1:]:
-        assert all(torch.equal(one, two) for one, two in zip(results[0], other, strict=True))
+    first, *others = by_threads(lambda: kernel.run(given, True), (1, 2, 3))
+    assert all(torch.equal(one, two) for other in others for one, two in zip(first, other, strict=True))
+
+
+def test_sigmoids_far_out_and_of_nan_are_torchs(isa: str) -> None:
+    values = torch.tensor([-1e30, -200.0, 200.0, 1e30, torch.inf, -torch.inf, torch.nan, 0.0])
+    torch.testing.assert_close(sigmoid(values), values.sigmoid(), equal_nan=True, rtol=1e-6, atol=1e-29)
 
 
 def test_adam_takes_what_is_not_dense_by_the_reference() -> None:
@@ -322,8 +337,7 @@ def test_another_epsilon_is_that_of_the_formula() -> None:
     """The core has one epsilon. An update with another is made in PyTorch, and is as small as the formula says."""
     for epsilon, moved in ((1e-15, 0.1), (1e-8, 0.1 / 11), (1e-9, 0.05)):
         values = torch.zeros(3)
-        gradient = torch.full((3,), 1e-9)
-        update_all([Update(values, gradient, Moments.zeros(values), 0.1, epsilon)])
+        update_all([Update(values, torch.full((3,), 1e-9), Moments.zeros(values), 0.1, epsilon)])
         torch.testing.assert_close(values, torch.full((3,), -moved), rtol=1e-4, atol=0)
 
 

@@ -51,9 +51,7 @@ def not_white(images: np.ndarray, mattes: np.ndarray, plate: np.ndarray | None =
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_an_import_is_trained_on_and_scored_by_its_protocol(
-    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_import_is_trained_on_and_scored_by_its_protocol(layout: str, tmp_path, monkeypatch) -> None:
     scene = drawn_person()
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)  # it finds no face in drawings this small
     shutil.copytree(cache_folder() / "face_models", tmp_path / "cache" / "face_models")
@@ -78,9 +76,7 @@ def test_an_import_is_trained_on_and_scored_by_its_protocol(
 
 
 @pytest.mark.usefixtures("short_films")
-def test_people_are_imported_trained_and_scored_by_one_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_people_are_imported_trained_and_scored_by_one_table(tmp_path, monkeypatch, capsys) -> None:
     """A row is a person. The row of a damaged one fails alone, and goes on where it stopped after it is mended."""
     make_quick(monkeypatch)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))

@@ -13,6 +13,7 @@ import pytest
 
 import color_charts
 from dataset_writers import FRONTAL, write_nersemble, write_picture, write_take
+from known import known
 from mien.camera import Camera
 from mien.capture import Capture, read_capture
 from mien.capture.video import write_video
@@ -54,29 +55,22 @@ def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
 
     The colours that the cameras film are others than those that were drawn, until they are corrected.
     """
-    pictures: dict[str, list[np.ndarray]] = {serial: [] for serial in SERIALS}
-    assert rig.background is not None
-    mattes = []
-    for timestep in range(rig.timesteps):
-        for camera, frame in enumerate(rig.timestep_frames(timestep)):
-            pictures[SERIALS[camera]].append(frame.image)
-            if SERIALS[camera] == FRONTAL:
-                mattes.append(frame.matte)
+    drawn = [list(rig.timestep_frames(timestep)) for timestep in range(rig.timesteps)]
+    empty = (255 * known(rig.background)).astype(np.uint8)
 
     def video(path: Path, serial: str) -> None:
-        film(path, [color_charts.filmed(picture, COLORS[serial]) for picture in pictures[serial]], STRIDE)
+        own = (frames[SERIALS.index(serial)].image for frames in drawn)
+        film(path, [color_charts.filmed(picture, COLORS[serial]) for picture in own], STRIDE)
 
     write_nersemble(folder, SERIALS, video, COLORS)
-    empty = (255 * rig.background).astype(np.uint8)
     for serial, matrix in COLORS.items():
         write_picture(folder / f"sequences/BACKGROUND/image_{serial}.jpg", color_charts.filmed(empty, matrix))
-    poses, intrinsics = {}, {}
-    for serial, camera in zip(SERIALS, rig.cameras, strict=True):
-        poses[serial] = camera.viewmat.double().tolist()
-        intrinsics[serial] = (np.diag([FULL, FULL, 1.0]) @ camera.K.double().numpy()).tolist()
+    full, cameras = np.diag([FULL, FULL, 1.0]), dict(zip(SERIALS, rig.cameras, strict=True))
+    poses = {serial: camera.viewmat.double().tolist() for serial, camera in cameras.items()}
+    intrinsics = {serial: (full @ camera.K.double().numpy()).tolist() for serial, camera in cameras.items()}
     content = {"world_2_cam": poses, "intrinsics": intrinsics}
     (folder / "calibration/camera_params.json").write_text(json.dumps(content))
-    return mattes
+    return [frames[SERIALS.index(FRONTAL)].matte for frames in drawn]
 
 
 @pytest.mark.unchecked
@@ -111,19 +105,12 @@ def cropped(capture: Capture, serial: str, drawn: np.ndarray) -> np.ndarray:
 
 
 def check_colors(rig: SyntheticScene, capture: Capture) -> None:
-    """Check that captured pictures have the drawn colours, and that terms in another order would not give them."""
+    """Captured pictures have the drawn colours. tests/test_color_correction.py has the terms in any order."""
     frames = list(rig.timestep_frames(0))
     for index, serial in enumerate(capture.camera_ids):
-        drawn = frames[SERIALS.index(serial)].image
-        found = capture.images[0, index].astype(float)
-        off = np.abs(found - cropped(capture, serial, drawn)).mean((0, 1))
+        drawn = cropped(capture, serial, frames[SERIALS.index(serial)].image)
+        off = np.abs(capture.images[0, index].astype(float) - drawn).mean((0, 1))
         assert off.max() < 1, (serial, off)  # the video is lossy
-        light = color_charts.to_light(color_charts.filmed(drawn, COLORS[serial]).reshape(-1, 3) / 255)
-        *terms, constant = color_charts.ORDERS[20].split()
-        order = " ".join((constant, *terms))  # tests/test_color_correction.py exchanges any two terms
-        others = color_charts.to_srgb(color_charts.polynomial(light, COLORS[serial], order))
-        other = (255 * others).round().astype(np.uint8).reshape(drawn.shape)
-        assert np.abs(found - cropped(capture, serial, other)).mean((0, 1)).max() > 10, serial
 
 
 def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mattes: list[np.ndarray]) -> None:

@@ -1,40 +1,36 @@
-"""Splits, frame order, targets and the optimiser do their parts of training."""
+"""Splits, frame order, targets, also those that a worker prepares, and the optimiser do their parts of training."""
 
+import threading
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from mien.avatar import (
-    GaussianStore,
-    Moments,
-    ParameterGroup,
-    Photometric,
-    Progress,
-    Rate,
-    store_group,
-)
+import train_toy
+from bounded_memory import MIB, allocating_at_most
+from mien import _native
+from mien.avatar import GaussianStore, Moments, ParameterGroup, Photometric, Progress, Rate, store_group
 from mien.errors import UserError
 from mien.render.rendering import Rendering
-from mien.training import held_out
+from mien.training import Sequence, held_out, train
 from mien.training.adam import Adam
-from mien.training.footage.frames import (
-    FrameOrder,
-    background_at,
-    density_random,
-    expression_rarity,
-    training_frames,
-)
-from mien.training.footage.sequence import Target, Targets, composite
+from mien.training.ahead import AHEAD, targets_ahead
+from mien.training.footage.frames import FrameOrder, background_at, density_random, expression_rarity, training_frames
+from mien.training.footage.sequence import Target, Targets, composite, composite_reference
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
 from mien.training.settings import Split
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
 from sh_colors import rgb_from_sh
+from test_training_resume import RESULTS
 from toy_scene import toy_sequence
+from train_toy import stopped_at
 
 
 @pytest.mark.parametrize(
@@ -87,21 +83,22 @@ def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
     )  # fmt: skip
     seen = replace(tracking, valid=torch.tensor([True] * 5 + [False]), cameras=tracking.cameras * 2)
     ring = replace(sequence, capture=both, tracking=seen, scoring=sequence.scoring.repeat(2, 1))
-    frames = training_frames([ring], plain_run(split="none"))
-    assert [(frame.timestep, frame.camera) for frame in frames] == [(t, c) for t in range(5) for c in range(2)]
-    only = training_frames([ring], plain_run(split="none", held_out_cameras=("back",)))
-    assert {frame.camera for frame in only} == {0}
+    for held_out_cameras, cameras in (((), (0, 1)), (("back",), (0,))):
+        frames = training_frames([ring], plain_run(split="none", held_out_cameras=held_out_cameras))
+        assert [(frame.timestep, frame.camera) for frame in frames] == [(t, c) for t in range(5) for c in cameras]
 
 
 def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> None:
-    _, sequence = toy_sequence(12, 16)
-    frames = training_frames([sequence], plain_run(split="none"))
-    order = FrameOrder(frames, seed=5)
-    passes = [[order.at(step)[0] for step in range(start, start + 12)] for start in (0, 12)]
-    assert all(sorted(f.timestep for f in one) == list(range(12)) for one in passes)
-    assert passes[0] != passes[1]
-    assert FrameOrder(frames, seed=5).at(17) == (passes[1][5], 1)
-    assert [FrameOrder(frames, seed=6).at(step)[0] for step in range(12)] != passes[0]
+    frames = training_frames([toy_sequence(12, 16)[1]], plain_run(split="none"))
+    first, second, other = (
+        [FrameOrder(frames, seed).at(step) for step in range(start, start + 12)]
+        for seed, start in ((5, 0), (5, 12), (6, 0))
+    )
+    for number, one in enumerate((first, second)):
+        assert sorted(frame.timestep for frame, _ in one) == list(range(12))
+        assert {passes for _, passes in one} == {number}
+    assert [frame for frame, _ in first] != [frame for frame, _ in second]
+    assert first != other
 
 
 def test_random_backgrounds_and_density_draws_depend_on_seed_and_step() -> None:
@@ -126,76 +123,52 @@ def test_targets_at_half_resolution_show_the_same_view() -> None:
     torch.testing.assert_close(half.camera(0).project(point)[0] * 2, full.camera(0).project(point)[0])
     white = np.full(3, 255, dtype=np.uint8)
     large, small = (targets.target(1, 0, white, keep=True).picture.float() for targets in (full, half))
-    averaged = large.reshape(16, 2, 16, 2, 3).mean((1, 3))
-    assert (averaged - small).abs().mean() < 2
+    assert (large.reshape(16, 2, 16, 2, 3).mean((1, 3)) - small).abs().mean() < 2
     assert Targets(sequence, 4096).width == 32, "pictures are never enlarged"
 
 
 def test_target_is_the_composite_of_the_whole_picture() -> None:
-    _, sequence = toy_sequence(3, 32)
-    background = np.array([10, 200, 99], dtype=np.uint8)
-    targets = Targets(sequence, 0)
+    sequence, background = toy_sequence(3, 32)[1], np.array([10, 200, 99], dtype=np.uint8)
+    targets, matte = Targets(sequence, 0), sequence.scoring[2, 0]
     target = targets.target(2, 0, background, keep=False)
-    whole = composite(sequence.capture.images[2, 0], sequence.scoring[2, 0], background)
-    assert np.array_equal(target.picture.numpy(), whole)
-    assert np.array_equal(target.matte.numpy(), sequence.scoring[2, 0])
-    left, top, width, height = target.box
-    assert sequence.scoring[2, 0][top : top + height, left : left + width].sum() == sequence.scoring[2, 0].sum()
-    assert width < 32
+    assert np.array_equal(target.picture.numpy(), composite(sequence.capture.images[2, 0], matte, background))
+    assert np.array_equal(target.matte.numpy(), matte)
+    assert target.box == cv2.boundingRect(matte)
+    assert target.box[2] < 32
     assert targets.target(2, 0, background, keep=False) is not target
     assert targets.target(1, 0, background, keep=True) is targets.target(1, 0, background, keep=True)
 
 
 @pytest.mark.parametrize(("drawn", "matte"), [((3, 5), (20, 26)), ((30, 31), None), (None, (8, 9)), (None, None)])
-def test_loss_inside_the_box_of_difference_is_that_of_the_whole_picture(
-    drawn: tuple[int, int] | None, matte: tuple[int, int] | None
-) -> None:
-    image, alpha = torch.full((40, 40, 3), 1.0), torch.zeros(40, 40)
-    mask, picture = np.zeros((40, 40), dtype=np.uint8), torch.full((40, 40, 3), 255, dtype=torch.uint8)
+def test_loss_inside_the_box_of_difference_is_that_of_the_whole_picture(drawn, matte) -> None:
+    image, alpha = torch.ones(40, 40, 3), torch.zeros(40, 40)
+    mask, picture = torch.zeros(40, 40, dtype=torch.uint8), torch.full((40, 40, 3), 255, dtype=torch.uint8)
     if drawn is not None:
-        image[drawn[0], drawn[1]], alpha[drawn[0], drawn[1]] = 0.25, 0.9
+        image[drawn], alpha[drawn] = 0.25, 0.9
     if matte is not None:
-        picture[matte[0], matte[1]], mask[matte[0], matte[1]] = 10, 255
+        picture[matte], mask[matte] = 10, 255
     rendering = Rendering(image, alpha, torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
-    left, top, width, height = cv2.boundingRect(mask)
-    target = Target(picture, torch.from_numpy(mask), (left, top, width, height), torch.ones(3))
+    target = Target(picture, mask, _native.box_of_nonzero(mask.float()), torch.ones(3))
     loss = picture_losses(rendering, target, Photometric(alpha_weight=0.5))
     torch.testing.assert_close(loss["photometric"], photometric_loss(image, picture, 0.8, 0.2))
     expected = 0.5 * ((drawn is not None) * 0.9 + (matte is not None)) / 1600
     assert loss["alpha"].item() == pytest.approx(expected)
 
 
-def test_gradient_of_the_loss_of_alpha_is_that_of_the_mean_difference() -> None:
-    random = torch.Generator().manual_seed(0)
-    alpha = torch.rand(7, 9, generator=random).requires_grad_()
-    matte = torch.randint(0, 256, (7, 9), generator=random, dtype=torch.uint8)
-    rendering = Rendering(torch.ones(7, 9, 3), alpha, torch.zeros(1, dtype=torch.int32), torch.zeros(1, 2))
-    target = Target(torch.full((7, 9, 3), 255, dtype=torch.uint8), matte, (0, 0, 9, 7), torch.ones(3))
-    (found,) = torch.autograd.grad(2 * picture_losses(rendering, target, Photometric(alpha_weight=0.5))["alpha"], alpha)
-    (expected,) = torch.autograd.grad((alpha - matte / 255).abs().mean(), alpha)
-    torch.testing.assert_close(found, expected)
-
-
 def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
     store = GaussianStore({"means": torch.linspace(-1, 1, 12).reshape(4, 3)})
-    network = torch.nn.Linear(3, 2)
+    network, adam = torch.nn.Linear(3, 2), Adam()
     twins = [torch.nn.Parameter(tensor.detach().clone()) for tensor in (store["means"], *network.parameters())]
-    reference = torch.optim.Adam(
-        [{"params": twins[:1], "lr": 0.1}, {"params": twins[1:], "lr": 0.02}], eps=1e-15, foreach=False
-    )
-    adam = Adam()
+    rates = [{"params": twins[:1], "lr": 0.1}, {"params": twins[1:], "lr": 0.02}]
+    reference = torch.optim.Adam(rates, eps=1e-15, foreach=False)
     for step in range(5):
-        groups = [
-            store_group(store, "means", Rate(0.1)),
-            ParameterGroup("network", dict(network.named_parameters()), Rate(0.02)),
-        ]
+        of_network = ParameterGroup("network", dict(network.named_parameters()), Rate(0.02))
         network(store["means"]).square().sum().backward()
         (twins[0] @ twins[1].T + twins[2]).square().sum().backward()
-        adam.step(groups, Progress(step, 5))
+        adam.step([store_group(store, "means", Rate(0.1)), of_network], Progress(step, 5))
         reference.step()
         reference.zero_grad()
-    for ours, theirs in zip((store["means"], *network.parameters()), twins, strict=True):
-        torch.testing.assert_close(ours, theirs)
+    torch.testing.assert_close([store["means"], *network.parameters()], twins)
     moments = store.moments["means"]
     assert isinstance(moments, Moments)
     assert moments.step == 5
@@ -204,54 +177,158 @@ def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
 
 
 def test_rates() -> None:
-    """Learning rates fall from start to end, after their beginning."""
-    assert Rate(1.0, 0.01).at(Progress(50, 100)) == pytest.approx(0.1)
-    assert Rate(1.0, 0.01).at(Progress(100, 100)) == pytest.approx(0.01)
-    assert Rate(0.3).at(Progress(70, 100)) == 0.3
+    """Learning rates fall from start to end, after their beginning. One that starts at nothing stays there."""
     late = Rate(1.0, 0.01, begin=0.5)
-    assert (late.at(Progress(49, 100)), late.at(Progress(50, 100))) == (0.0, 1.0)
-    assert late.at(Progress(75, 100)) == pytest.approx(0.1)
+    for rate, step, expected in (
+        (Rate(1.0, 0.01), 50, 0.1), (Rate(1.0, 0.01), 100, 0.01), (Rate(0.3), 70, 0.3), (Rate(0.0, 1e-3), 50, 0.0),
+        (late, 49, 0.0), (late, 50, 1.0), (late, 75, 0.1),
+    ):  # fmt: skip
+        assert rate.at(Progress(step, 100)) == pytest.approx(expected, abs=0)
 
 
 def test_frames_with_rare_expressions_come_more_often() -> None:
     """Ninety timesteps at rest and ten with other expressions: the ten come twice as often as the median."""
     _, sequence = toy_sequence(100, 16)
-    expression = torch.zeros(100, 2)
-    expression[:90] = 0.01 * torch.rand(90, 2, generator=torch.Generator().manual_seed(0))
-    expression[90:] = torch.rand(10, 2, generator=torch.Generator().manual_seed(1))
-    tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, expression=expression))
-    sequence = replace(sequence, tracking=tracking)
+    random = torch.Generator().manual_seed(0)
+    expression = torch.cat([0.01 * torch.rand(90, 2, generator=random), torch.rand(10, 2, generator=random)])
+
+    def tracked(expression: torch.Tensor) -> Sequence:
+        face = replace(sequence.tracking.face, expression=expression)
+        return replace(sequence, tracking=replace(sequence.tracking, face=face))
+
     frames = training_frames([sequence], plain_run(split="none"))
-    weights = expression_rarity([sequence], frames)
+    weights = expression_rarity([tracked(expression)], frames)
     assert float(weights.min()) >= 0.5
     assert float(weights[90:].min()) == float(weights.max()) == 2
     assert float(weights[:90].median()) < 1.2
     order = FrameOrder(frames, 5, weights)
-    drawn = np.zeros(100)
-    for step in range(1000):
-        drawn[order.at(step)[0].timestep] += 1
+    seen = [order.at(step)[0].timestep for step in range(1000)]
     expected = (weights / weights.sum() * 1000).numpy()
-    assert np.abs(drawn - expected).max() < 6, "ten passes, each rounded by less than one"
+    assert np.abs(np.bincount(seen, minlength=100) - expected).max() < 6, "ten passes, each rounded by less than one"
     assert FrameOrder(frames, 5, weights).at(777) == order.at(777), "a function of seed and step"
-    passes = [[order.at(100 * number + step)[0] for step in range(100)] for number in range(2)]
-    assert passes[0] != passes[1]
+    assert seen[:100] != seen[100:200]
     # One expression only gives even weights.
-    still = replace(tracking, face=replace(tracking.face, expression=torch.zeros(100, 2)))
-    assert len(set(expression_rarity([replace(sequence, tracking=still)], frames).tolist())) == 1
+    assert len(set(expression_rarity([tracked(0 * expression)], frames).tolist())) == 1
     assert expression_rarity([sequence], frames[:1]).isfinite().all()
 
 
 @pytest.mark.unchecked
 def test_first_colors_come_from_training_frames_only() -> None:
     face_model, sequence = toy_sequence(60, 24)
-    config, settings = plain_gaussian_avatars(first_colors="pictures"), plain_run(split="blocks")
-    painted = start([sequence], face_model, config, settings).avatar.gaussian_store()["sh_constant"]
-    grey = start([sequence], face_model, plain_gaussian_avatars(), settings).avatar.gaussian_store()["sh_constant"]
-    assert float((rgb_from_sh(grey.detach()) - 0.5).abs().max()) < 0.01
-    assert float((rgb_from_sh(painted.detach()) - 0.5).abs().mean()) > 0.05
-    for timesteps, same in ((slice(40, 50), True), (slice(0, 10), False)):
+
+    def first(black: slice = slice(0), **changes: str) -> torch.Tensor:
         images = sequence.capture.images.copy()
-        images[timesteps] = 0
-        darker = replace(sequence, capture=replace(sequence.capture, images=images))
-        again = start([darker], face_model, config, settings).avatar.gaussian_store()["sh_constant"]
-        assert torch.equal(again, painted) == same
+        images[black] = 0
+        given = replace(sequence, capture=replace(sequence.capture, images=images))
+        state = start([given], face_model, plain_gaussian_avatars(**changes), plain_run(split="blocks"))
+        return state.avatar.gaussian_store()["sh_constant"].detach()
+
+    painted = first(first_colors="pictures")
+    assert float((rgb_from_sh(first()) - 0.5).abs().max()) < 0.01
+    assert float((rgb_from_sh(painted) - 0.5).abs().mean()) > 0.05
+    for black, same in ((slice(40, 50), True), (slice(0, 10), False)):
+        assert torch.equal(first(black, first_colors="pictures"), painted) == same
+
+
+# -- targets that a worker prepares ----------------------------------------------------------------------------------
+
+SETTINGS = plain_run(steps=40, split="none", background="random")
+
+
+def workers() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("mien-targets")]
+
+
+def test_native_composite_has_the_integers_of_the_reference() -> None:
+    random = np.random.default_rng(0)
+    for width in (1, 7, 8, 50, 64) * 20:
+        image = random.integers(0, 256, (9, width, 3), dtype=np.uint8)
+        matte = np.repeat(random.choice([0, 0, 255, 255, 3, 254], (9, -(-width // 5))), 5, axis=1)[:, :width]
+        matte = matte.astype(np.uint8)
+        left, right = sorted(random.integers(0, width + 1, 2).tolist())
+        inside = np.zeros((9, width), bool)
+        inside[2:7, left:right] = True
+        background = random.integers(0, 256, 3, dtype=np.uint8)
+        for seen, box in ((matte, None), (matte * inside, (left, 2, right - left, 5))):
+            expected = composite_reference(image, seen, background, box)
+            np.testing.assert_array_equal(composite(image, seen, background, box), expected)
+
+
+def test_every_integer_is_the_rounded_one() -> None:
+    """All pairs of a value and an opacity, over a few backgrounds."""
+    value, matte = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
+    image = np.repeat(value[..., None], 3, axis=2)
+    for gray in (0, 1, 100, 255):
+        found = composite(image, np.ascontiguousarray(matte), np.full(3, gray, np.uint8))
+        total = value.astype(int) * matte + gray * (255 - matte.astype(int))
+        np.testing.assert_array_equal(found[..., 0], (2 * total + 255) // 510)
+
+
+@pytest.mark.parametrize("resolution", [0, 21])
+@pytest.mark.parametrize("background", ["white", "mixed", "random"])
+def test_the_queue_gives_the_targets_of_the_steps(resolution: int, background: str, monkeypatch) -> None:
+    """No more targets wait than those of the next few steps."""
+    sequence, settings, made = toy_sequence(6, 32)[1], replace(SETTINGS, background=background), []
+    order = FrameOrder(training_frames([sequence], settings), 0)
+    targets, alone = Targets(sequence, resolution), Targets(sequence, resolution)
+    composed = targets.composed
+    monkeypatch.setattr(targets, "composed", lambda *arguments: made.append(arguments) or composed(*arguments))
+    with targets_ahead(order, lambda _: [targets], settings) as queue:
+        for step in (*range(9), *range(30, 40), 3, 4):  # as a run that resumes, too
+            found, (frame, _) = queue.target(step), order.at(step)
+            own = alone.target(frame.timestep, frame.camera, background_at(settings, step), keep=False)
+            assert found.box == own.box
+            for name in ("picture", "matte", "background"):
+                assert getattr(found, name).equal(getattr(own, name)), (step, name)
+    assert not workers()
+    made.clear()
+    with targets_ahead(order, lambda _: [targets], SETTINGS) as queue:
+        for step in range(SETTINGS.steps):
+            queue.target(step)
+            assert len(made) <= step + 1 + AHEAD
+    assert len(made) <= SETTINGS.steps, "nothing is made beyond the last step"
+
+
+@pytest.mark.unchecked
+def test_a_run_has_the_same_bytes_with_and_without_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    face_model, sequence = toy_sequence(6, 32)
+    settings = replace(train_toy.SETTINGS, steps=8, background="random", split="none", resolution=25)
+    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / "ahead")
+    monkeypatch.setattr("mien.training.trainer.targets_ahead", lambda *_: nullcontext())
+    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / "alone")
+    for name in RESULTS:
+        assert (tmp_path / "ahead" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name
+
+
+def test_the_worker_ends_with_an_error_of_its_own_and_with_an_interrupted_run(tmp_path, monkeypatch) -> None:
+    face_model, sequence = toy_sequence(6, 32)
+    run = partial(train, [sequence], face_model, train_toy.CONFIG, train_toy.SETTINGS)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "stopped", stopped_at(1))
+    assert not workers()
+
+    def unreadable(*_: object, **__: object) -> Target:
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(Targets, "composed", unreadable)
+    with pytest.raises(OSError, match="the disk is gone"):
+        run(tmp_path / "run")
+    assert not workers()
+
+
+@pytest.mark.unchecked
+def test_the_pictures_of_a_long_capture_are_never_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its pictures are all the same one in memory."""
+    sequence, size = toy_sequence(80, 8)[1], 256
+    one = np.random.default_rng(0).integers(0, 256, (size, size, 3), dtype=np.uint8)
+    images = np.broadcast_to(one, (80, 1, size, size, 3))
+    mattes = images[..., 0]
+    cameras = tuple(camera.resized(size, size) for camera in sequence.tracking.cameras)
+    capture, tracking = replace(sequence.capture, images=images, mattes=mattes), sequence.tracking
+    sequence = replace(sequence, capture=capture, scoring=mattes, tracking=replace(tracking, cameras=cameras))
+    monkeypatch.setattr("mien.training.footage.sequence.CACHE_BYTES", 4 * MIB)
+    settings = replace(SETTINGS, steps=80, background="white")
+    order, targets = FrameOrder(training_frames([sequence], settings), 0), Targets(sequence, 0)
+    with allocating_at_most(10 * MIB), targets_ahead(order, lambda _: [targets], settings) as queue:
+        for step in range(settings.steps):
+            queue.target(step)

@@ -12,7 +12,7 @@ import torch
 
 import train_toy
 from forked import ForkServer
-from mien import _native
+from instruction_sets import by_threads
 from mien.avatar import Avatar
 from mien.errors import UserError
 from mien.face import load_face_model
@@ -37,21 +37,20 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_dir
 
 
-def train_until_step(run_dir: Path, last: int, stop: Callable[[], None], **changed: Any) -> None:
+def train_until_step(run_dir: Path, last: int, stop: Callable[[], object], **changed: Any) -> None:
     """Train in this process, and call `stop` after a step of this process."""
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     steps = iter(range(1, STEPS + 1))
+    settings = replace(train_toy.SETTINGS, **changed)
 
     def watch(_: Avatar) -> None:
         if next(steps) == last:
             stop()
 
-    settings = replace(train_toy.SETTINGS, **changed)
     train([sequence], face_model, train_toy.CONFIG, settings, run_dir, watch=watch)
 
 
-def interrupt() -> None:
-    signal.raise_signal(signal.SIGINT)
+interrupt = partial(signal.raise_signal, signal.SIGINT)
 
 
 def assert_same_results(run_dir: Path, undisturbed: Path) -> None:
@@ -77,11 +76,8 @@ def test_killed_runs_end_with_the_same_bytes(fork_server: ForkServer, tmp_path: 
 
 
 def test_a_kill_before_the_first_record(tmp_path: Path, undisturbed: Path) -> None:
-    def killed() -> None:
-        raise ZeroDivisionError
-
     with pytest.raises(ZeroDivisionError):
-        train_until_step(tmp_path, 3, killed, checkpoint_every=1)
+        train_until_step(tmp_path, 3, lambda: 1 // 0, checkpoint_every=1)
     assert steps_of_checkpoints(tmp_path) == [1, 2]
     train_toy.main(tmp_path, STEPS)
     assert_same_results(tmp_path, undisturbed)
@@ -94,9 +90,7 @@ def steps_of_checkpoints(run_dir: Path) -> list[int]:
 @pytest.mark.parametrize(
     ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, Terminated)]
 )
-def test_a_stop_leaves_a_checkpoint_of_its_step(
-    number: signal.Signals, kind: type[BaseException], tmp_path: Path, undisturbed: Path
-) -> None:
+def test_a_stop_leaves_a_checkpoint_of_its_step(number, kind, tmp_path, undisturbed) -> None:
     """Also before the first record, when its curves are empty."""
     for last, stopped in ((1, 1), (6, 7)):
         with pytest.raises(kind):
@@ -126,22 +120,19 @@ def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     path = checkpoint_files(tmp_path / "checkpoints")[-1]
     assert path.stem == "step_0000006"
     tensors = read_tensors(path)
-    two_stops = float(tensors["seconds"])
-    assert two_stops > sum(tensors["curves.step_ms"].tolist()) / 1000 > 0
-    tensors |= {"seconds": torch.tensor(1e6 + two_stops, dtype=torch.float64)}
-    tensors |= {"peak_memory_mb": torch.tensor(7e6, dtype=torch.float64)}
-    write_tensors(path, tensors, {"format": "mien.checkpoint", "version": "1"})
+    before = 1e6 + float(tensors["seconds"])
+    assert before - 1e6 > sum(tensors["curves.step_ms"].tolist()) / 1000 > 0
+    changed = {name: torch.tensor(value).double() for name, value in (("seconds", before), ("peak_memory_mb", 7e6))}
+    write_tensors(path, tensors | changed, {"format": "mien.checkpoint", "version": "1"})
     train_toy.main(tmp_path, STEPS)
     summary, curves = read_training_summary(tmp_path), read_curves(tmp_path)
-    assert 1e6 + two_stops < summary["seconds"] < 1e6 + two_stops + 600
+    assert before < summary["seconds"] < before + 600
     assert (summary["steps"], summary["peak_memory_mb"]) == (STEPS, 7e6)
     assert curves["step"].tolist() == list(range(3, STEPS + 1, 3))
     assert curves["step_ms"][:2].tolist() == tensors["curves.step_ms"].tolist()
 
 
-def test_finished_run_is_loaded_and_other_settings_are_refused(
-    undisturbed: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_finished_run_is_loaded_and_other_settings_are_refused(undisturbed: Path, capsys) -> None:
     before = (undisturbed / "training.json").read_bytes()
     train_toy.main(undisturbed, STEPS)
     assert "step" not in capsys.readouterr().out
@@ -158,23 +149,17 @@ def test_finished_run_is_loaded_and_other_settings_are_refused(
 
 @pytest.mark.exact
 def test_threads_do_not_change_a_bit() -> None:
-    """The number of threads does not change a bit, in whole steps with enough Gaussians to divide every native loop."""
-    results = []
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        for threads in (1, 2, 3):
-            _native.set_thread_count(threads)
-            state, data = training_case(load_face_model(), 6000, 128, 160)
-            for _ in range(3):
-                step(state, data, BENCHMARK_SETTINGS)
-            store = state.avatar.gaussian_store()
-            tensors = {name: store[name].detach().clone() for name in store.names()}
-            tensors |= {f"{name}.second": moments.second for name, moments in store.moments.items()}
-            results.append(tensors | state.density.state() | state.track.state())
-    finally:
-        _native.set_thread_count(0)
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        for name, tensor in results[0].items():
-            assert torch.equal(tensor, other[name]), name
+    """In whole steps with enough Gaussians to divide every native loop."""
+
+    def trained() -> dict[str, torch.Tensor]:
+        state, data = training_case(load_face_model(), 6000, 128, 160)
+        for _ in range(3):
+            step(state, data, BENCHMARK_SETTINGS)
+        store = state.avatar.gaussian_store()
+        tensors = {name: store[name].detach().clone() for name in store.names()}
+        tensors |= {f"{name}.second": moments.second for name, moments in store.moments.items()}
+        return tensors | state.density.state() | state.track.state()
+
+    first, *others = by_threads(trained, (1, 2, 3))
+    for name, tensor in first.items():
+        assert all(torch.equal(tensor, other[name]) for other in others), name

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mien import _native
+from instruction_sets import by_threads
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
 from mien.avatar.ops.skin_points import blend_transforms, skin_points_reference, unskin
 from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, frames_to_world, triangle_frames
@@ -49,8 +49,21 @@ def test_frames_are_rotations_and_batch():
     identity = torch.eye(3, dtype=torch.float64).expand_as(frames.R)
     torch.testing.assert_close(frames.R @ frames.R.transpose(-1, -2), identity)
     torch.testing.assert_close(torch.linalg.det(frames.R), torch.ones(2, 3, 30, dtype=torch.float64))
-    alone = triangle_frames(vertices[1, 2], faces)
-    torch.testing.assert_close(frames.k[1, 2], alone.k)
+    torch.testing.assert_close(frames.k[1, 2], triangle_frames(vertices[1, 2], faces).k)
+
+
+def test_a_gaussian_at_rest_takes_its_triangles_frame():
+    """The native core uses each of the four quaternion formulas."""
+    vertices, faces, *_ = random_rig()
+    frames, zeros = triangle_frames(vertices, faces), torch.zeros(30, 3)
+    unit, bound = torch.tensor([3.0, 0, 0, 0]).expand(30, 4), torch.arange(30)
+    for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 2e-6)):
+        local = (one.to(dtype) for one in (zeros, unit, zeros))
+        means, quats, scales = (one.double() for one in bind_to_world(vertices.to(dtype), faces, bound, *local))
+        torch.testing.assert_close(means, frames.T, atol=tolerance, rtol=0)
+        torch.testing.assert_close(matrix_from_quaternion(quats), frames.R, atol=tolerance, rtol=0)
+        torch.testing.assert_close(scales, frames.k[:, None].expand(-1, 3), atol=tolerance, rtol=0)
+        assert set(quats.abs().argmax(-1).tolist()) == {0, 1, 2, 3}
 
 
 def test_gaussians_follow_a_similarity_of_the_mesh():
@@ -62,17 +75,6 @@ def test_gaussians_follow_a_similarity_of_the_mesh():
     torch.testing.assert_close(moved_means, 2 * means @ rotation.T + shift)
     torch.testing.assert_close(matrix_from_quaternion(moved_quats), rotation @ matrix_from_quaternion(quats))
     torch.testing.assert_close(moved_scales, 2 * scales)
-
-
-def test_a_gaussian_at_rest_takes_its_triangles_frame():
-    vertices, faces, face_index, *_ = random_rig()
-    zeros = torch.zeros(100, 3, dtype=torch.float64)
-    unit = torch.tensor([3.0, 0, 0, 0], dtype=torch.float64).expand(100, 4)
-    frames = triangle_frames(vertices, faces)
-    means, quats, scales = bind_to_world(vertices, faces, face_index, zeros, unit, zeros)
-    torch.testing.assert_close(means, frames.T[face_index])
-    torch.testing.assert_close(matrix_from_quaternion(quats), frames.R[face_index])
-    torch.testing.assert_close(scales, frames.k[face_index, None].expand(-1, 3))
 
 
 def test_reference_gradients_equal_finite_differences():
@@ -93,39 +95,21 @@ def test_degenerate_triangles_stay_finite(dtype: torch.dtype):
     # A point, an edge without a length, collinear vertices, a sliver, and a sound one.
     faces = torch.tensor([[0, 0, 0], [0, 1, 2], [0, 2, 4], [0, 3, 2], [0, 5, 2]])
     local = [torch.randn(5, width, dtype=dtype, requires_grad=True) for width in (3, 4, 3)]
-    frames = triangle_frames(vertices, faces)
-    torch.testing.assert_close(frames.k[:4], torch.full((4,), DEGENERATE_LENGTH, dtype=dtype))
+    found = triangle_frames(vertices, faces).k[:4]
+    torch.testing.assert_close(found, torch.full_like(found, DEGENERATE_LENGTH))
     world = bind_to_world(vertices, faces, torch.arange(5), *local)
-    torch.cat([output.square().flatten() for output in world]).sum().backward()
-    for tensor in (*world, vertices.grad, *(tensor.grad for tensor in local)):
-        assert tensor is not None
-        assert tensor.isfinite().all()
-    assert vertices.grad is not None
-    assert vertices.grad[5].abs().sum() > 0
+    loss = torch.cat([output.square().flatten() for output in world]).sum()
+    gradients = torch.autograd.grad(loss, [vertices, *local])
+    assert all(tensor.isfinite().all() for tensor in (*world, *gradients))
+    assert gradients[0][5].abs().sum() > 0
 
 
-def test_native_uses_every_quaternion_formula():
-    _, faces, *_ = random_rig()
-    vertices = random_rig()[0]
-    largest = triangle_frames(vertices, faces).R
-    from_native = bind_to_world(
-        vertices.float(), faces, torch.arange(30), torch.zeros(30, 3), torch.tensor([1.0, 0, 0, 0]).expand(30, 4),
-        torch.zeros(30, 3),
-    )[1]  # fmt: skip
-    assert set(from_native.abs().argmax(-1).tolist()) == {0, 1, 2, 3}
-    torch.testing.assert_close(matrix_from_quaternion(from_native).double(), largest, atol=2e-6, rtol=0)
-
-
-def test_gradients_go_only_where_they_are_wanted():
+def test_gradients_go_only_where_they_are_wanted_and_indices_are_checked():
     vertices, faces, face_index, *local = random_rig(dtype=torch.float32)
     local[0].requires_grad_()
     means, quats, scales = bind_to_world(vertices, faces, face_index, *local)
     assert torch.autograd.grad(quats.sum(), local[0], retain_graph=True)[0].abs().max() == 0
     assert torch.autograd.grad(means.sum() + scales.sum(), local[0])[0].abs().min() > 0
-
-
-def test_indices_are_checked():
-    vertices, faces, face_index, *local = random_rig(dtype=torch.float32)
     with pytest.raises(IndexError, match="vertex"):
         bind_to_world(vertices, faces + 1, face_index, *local)
     with pytest.raises(IndexError, match="face"):
@@ -139,35 +123,30 @@ def test_reference_of_skinning_has_the_gradients_of_finite_differences() -> None
 
 def test_unskin_undoes_blended_transforms() -> None:
     torch.manual_seed(0)
-    face_model = toy_face_model()
     face = replace(toy_face(5), joints=torch.randn(5, 1, 3))
-    weights = torch.rand(20, 3).softmax(-1)
-    transforms = blend_transforms(weights, face_model.joint_transforms(face)[:, :, :3])[2]
-    points = torch.randn(20, 3)
-    moved = torch.stack(
-        [transform[:, :3] @ x + transform[:, 3] for transform, x in zip(transforms, points, strict=True)]
-    )
+    bones = toy_face_model().joint_transforms(face)[:, :, :3]
+    transforms, points = blend_transforms(torch.rand(20, 3).softmax(-1), bones)[2], torch.randn(20, 3)
+    moved = (transforms[:, :, :3] @ points[..., None])[..., 0] + transforms[..., 3]
     torch.testing.assert_close(unskin(moved, transforms), points, atol=1e-5, rtol=1e-5)
 
 
 FACE_FIELDS = ("expression", "joints", "head_rotation", "head_translation")
+STORED = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
 COUNT = 20_000
 
 
 def a_face(face_model: FaceModel) -> FaceParams:
-    generator = torch.Generator().manual_seed(3)
-    neutral = face_model.neutral(1)
-
-    def some(like: Tensor) -> Tensor:
-        return (0.2 * torch.randn(like.shape, generator=generator)).requires_grad_()
-
-    return replace(neutral, **{name: some(getattr(neutral, name)) for name in FACE_FIELDS})
+    generator, neutral = torch.Generator().manual_seed(3), face_model.neutral(1)
+    values = {
+        name: (0.2 * torch.randn(getattr(neutral, name).shape, generator=generator)).requires_grad_()
+        for name in FACE_FIELDS
+    }
+    return replace(neutral, **values)
 
 
 def a_store(face_model: FaceModel) -> GaussianStore:
     generator = torch.Generator().manual_seed(4)
-    shapes = {"means": (COUNT, 3), "quats": (COUNT, 4), "log_scales": (COUNT, 3), "opacity_logits": (COUNT,)}
-    trained = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    trained = {name: torch.randn(COUNT, *shape, generator=generator) for name, shape in STORED.items()}
     face_index = torch.randint(len(face_model.faces), (COUNT,), generator=generator)
     return GaussianStore(trained | {"sh": torch.zeros(COUNT, 1, 3)}, {"face_index": face_index})
 
@@ -178,47 +157,37 @@ def results(gaussians: Gaussians, face: FaceParams, store: GaussianStore) -> lis
     parts += [] if gaussians.T_world_local is None else [gaussians.T_world_local]
     generator = torch.Generator().manual_seed(5)
     loss = torch.stack([(part * torch.randn(part.shape, generator=generator)).sum() for part in parts]).sum()
-    inputs = [getattr(face, name) for name in FACE_FIELDS]
-    inputs += [store[name] for name in ("means", "quats", "log_scales", "opacity_logits")]
-    found = torch.autograd.grad(loss, inputs, allow_unused=True)
-    gradients = [torch.zeros_like(i) if g is None else g for i, g in zip(inputs, found, strict=True)]
-    return [*(part.detach() for part in parts), *gradients]
+    inputs = [*(getattr(face, name) for name in FACE_FIELDS), *(store[name] for name in STORED)]
+    return [*(part.detach() for part in parts), *torch.autograd.grad(loss, inputs)]
 
 
 @pytest.mark.parametrize("in_head", [True, False])
 def test_posing_in_one_call_equals_its_parts_to_the_bit(anny: FaceModel, in_head: bool) -> None:
     face, store = a_face(anny), a_store(anny)
     expected = results(pose_bound_gaussians_reference(anny, face, store, store["sh"], in_head), face, store)
-    before = _native.thread_count()
-    try:
-        for threads in (1, 3):
-            _native.set_thread_count(threads)
-            native = results(pose_bound_gaussians(anny, face, store, store["sh"], in_head), face, store)
-            assert all(torch.equal(one, other) for one, other in zip(native, expected, strict=True))
-            assert all(bool(tensor.abs().sum() > 0) for tensor in native)
-    finally:
-        _native.set_thread_count(before)
-
-
-def test_a_fixed_face_gets_no_gradient(anny: FaceModel) -> None:
-    face, store = a_face(anny).detach(), a_store(anny)
-    gaussians = pose_bound_gaussians(anny, face, store, store["sh"], in_head=True)
-    gaussians.means.sum().backward()
-    assert store["means"].grad is not None
-    assert gaussians.T_world_local is not None
-    torch.testing.assert_close(gaussians.T_world_local, face.T_world_head)
+    for native in by_threads(
+        lambda: results(pose_bound_gaussians(anny, face, store, store["sh"], in_head), face, store)
+    ):
+        assert all(torch.equal(one, other) for one, other in zip(native, expected, strict=True))
+        assert all(bool(tensor.abs().sum() > 0) for tensor in native)
 
 
 def test_a_new_store_and_changed_indices_are_noticed(anny: FaceModel) -> None:
+    """A fixed face gets no gradient."""
     face, store = a_face(anny).detach(), a_store(anny)
-    before = pose_bound_gaussians(anny, face, store, store["sh"], in_head=True).means
+
+    def posed() -> Gaussians:
+        return pose_bound_gaussians(anny, face, store, store["sh"], in_head=True)
+
+    before = posed()
+    torch.testing.assert_close(before.T_world_local, face.T_world_head)
+    assert torch.autograd.grad(before.means.sum(), store["means"])[0].any()
     store["face_index"].copy_(store["face_index"].flip(0))
-    changed = pose_bound_gaussians(anny, face, store, store["sh"], in_head=True).means
     expected = pose_bound_gaussians_reference(anny, face, store, store["sh"], in_head=True).means
-    assert torch.equal(changed, expected)
-    assert not torch.equal(changed, before)
+    assert torch.equal(posed().means, expected)
+    assert not torch.equal(posed().means, before.means)
     store.select(torch.arange(100))
-    assert pose_bound_gaussians(anny, face, store, store["sh"], in_head=True).means.shape == (1, 100, 3)
+    assert posed().means.shape == (1, 100, 3)
     store["face_index"][0] = len(anny.faces)
     with pytest.raises(IndexError, match="face"):
-        pose_bound_gaussians(anny, face, store, store["sh"], in_head=True)
+        posed()

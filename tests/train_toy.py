@@ -1,9 +1,9 @@
-"""Train the toy scene into a folder."""
+"""Train the toy scene into a folder, and progresses of a training that do something after each step."""
 
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,22 +23,39 @@ CONFIG = plain_config(
 SETTINGS = plain_run(steps=30, split="none", background="random", checkpoint_every=4, record_every=3)
 
 
-def main(run_dir: Path | str, steps: int, kill_at: int = 0) -> None:
-    """Train so many steps, print the number of each, and kill this process with SIGKILL after one of them."""
+def progress(each: Callable[[int], object]) -> Callable[[str, int, int], AbstractContextManager[Advance]]:
+    """Return a progress that calls `each` with the number of every step that is done."""
 
     @contextmanager
-    def report_steps(title: str, total: int, completed: int) -> Iterator[Advance]:
+    def report(title: str, total: int, completed: int) -> Iterator[Advance]:
         done = completed
 
         def advance(amount: int = 1, status: str = "") -> None:
             nonlocal done
             done += amount
-            print("step", done, flush=True)
-            if done == kill_at:
-                os.kill(os.getpid(), signal.SIGKILL)
+            each(done)
 
         yield advance
 
+    return report
+
+
+silence = progress(lambda done: None)
+
+
+def stopped_at(step: int) -> Callable[[str, int, int], AbstractContextManager[Advance]]:
+    """Return a progress that raises the error of Ctrl-C after a step."""
+    return progress(lambda done: signal.default_int_handler(signal.SIGINT, None) if done == step else None)
+
+
+def main(run_dir: Path | str, steps: int, kill_at: int = 0) -> None:
+    """Train so many steps, print the number of each, and kill this process with SIGKILL after one of them."""
+
+    def each(done: int) -> None:
+        print("step", done, flush=True)
+        if done == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
     torch.set_num_threads(1)
     face_model, sequence = toy_sequence(timesteps=5, size=32)
-    train([sequence], face_model, CONFIG, replace(SETTINGS, steps=steps), Path(run_dir), report_steps)
+    train([sequence], face_model, CONFIG, replace(SETTINGS, steps=steps), Path(run_dir), progress(each))
