@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from flame_like import exact_landmarks, flame_like, write_npz
-from gnm_like import gnm_landmarks, gnm_like, write_gnm
+from gnm_like import gnm_landmarks, gnm_like
 from mien.face import FaceModel, Landmarks, load_face_model
 from mien.face.model_files import read_model_file
 from mien.tracking.landmarks import with_regions_by_landmarks
@@ -23,14 +23,16 @@ def face_model_named(name: str, folder: Path, test_data: Path | None) -> FaceMod
         return anny
     if name == "flame":
         bare = read_model_file(write_npz(folder / "flame.npz", flame_like(anny)), name, shareable=True)
-        return with_regions_by_landmarks(replace(bare, landmarks=exact_landmarks(anny)))
-    if name == "gnm":
-        bare = read_model_file(write_gnm(folder / "gnm.npz", gnm_like(anny)), name)
-        return with_regions_by_landmarks(replace(bare, landmarks=gnm_landmarks(anny)))
-    assert test_data is not None
-    bare = read_model_file(test_data / "face_models" / "ict_facekit_light_f16.npz", name)
-    own = json.loads((test_data / "face_models" / "ict_vertex_indices.json").read_text())["idx_to_landmark_verts"]
-    return with_regions_by_landmarks(replace(bare, landmarks=_by_registration(anny, bare, np.array(own))))
+        marks = exact_landmarks(anny)
+    elif name == "gnm":
+        bare, marks = read_model_file(write_npz(folder / "gnm.npz", gnm_like(anny)), name), gnm_landmarks(anny)
+    else:
+        assert test_data is not None
+        data = test_data / "face_models"
+        bare = read_model_file(data / "ict_facekit_light_f16.npz", name)
+        own = json.loads((data / "ict_vertex_indices.json").read_text())["idx_to_landmark_verts"]
+        marks = _by_registration(anny, bare, np.array(own))
+    return with_regions_by_landmarks(replace(bare, landmarks=marks))
 
 
 def _by_registration(anny: FaceModel, model: FaceModel, own: np.ndarray) -> dict[str, Landmarks]:
