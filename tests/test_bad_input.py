@@ -1,19 +1,28 @@
-"""Bad input is refused in one line. docs/bad_input.md lists for every command which test shows this."""
+"""Bad input is refused in one line. docs/bad_input.md lists for every command which test shows this.
+
+On a full disk, every writer says so, and keeps the file of before; then the same command succeeds.
+"""
 
 import errno
+import importlib.util
 import os
+import random
 import re
 import resource
 import shutil
+import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import train_toy
+from capture_helpers import write_gradient_video
 from damage import edit_json
 from mien.avatar import load_avatar, write_avatar
 from mien.capture import write_capture
@@ -21,7 +30,7 @@ from mien.capture.video import write_video
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import read_metrics
-from mien.export import in_world, read_ply, write_ply
+from mien.export import write_glb
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from mien.storage import read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
@@ -29,6 +38,8 @@ from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import read_run_config, read_training_summary
 from mien.training.checkpoint import checkpoint_files
 from mien.workspace import Workspace, open_workspace
+from needs import NO_MOUNT
+from shared_things import MadeOnce, toy_workspace
 from toy_scene import toy_sequence
 
 pytestmark = pytest.mark.unchecked
@@ -42,73 +53,24 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@contextmanager
-def small_disk(size: int) -> Iterator[None]:
-    """Limit the size of every file, as a full disk would."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-NOISE = np.random.default_rng(0).integers(0, 255, (4, 64, 64, 3), dtype=np.uint8)
-WRITERS: dict[str, Callable[[Path], object]] = {
-    "json": lambda folder: write_json(folder / "a.json", "x", 1, {"text": "x" * 2000}),
-    "tensors": lambda folder: write_tensors(folder / "a.safetensors", {"a": torch.zeros(1000)}),
-    "arrays": lambda folder: write_arrays(folder / "a.safetensors", {"a": np.zeros(1000)}),
-    "capture": lambda folder: write_capture(folder / "capture", toy_sequence(3, 64)[1].capture),
-    "tracking": lambda folder: write_tracking(folder / "tracking", toy_sequence(30, 32)[1].tracking),
-    "video": lambda folder: write_video(folder / "a.mp4", list(NOISE), 25.0),
-    "film": lambda folder: write_pictures(plan_output(folder / "a:b.mp4", 4), list(NOISE), 25.0),
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_is_told_and_nothing_half_written_stays(name: str, tmp_path: Path) -> None:
-    with small_disk(500), pytest.raises(UserError, match="free disk space") as error:
-        WRITERS[name](tmp_path)
-    assert str(tmp_path) in str(error.value)
-    assert "\n" not in str(error.value)
-    kept = [path for path in tmp_path.rglob("*") if path.is_file() and ".partial" not in str(path)]
-    assert kept == [], "half-written files"
-    WRITERS[name](tmp_path)
-
-
-def test_a_full_disk_leaves_the_avatar_that_was_there(run_dir: Path, tmp_path: Path) -> None:
-    avatar = load_avatar(run_dir)
-    write_avatar(tmp_path, avatar)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    with small_disk(500), pytest.raises(UserError, match="free disk space"):
-        write_avatar(tmp_path, avatar)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-
-
 def test_an_interrupted_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
     path = tmp_path / "a.safetensors"
     write_tensors(path, {"a": torch.ones(3)})
-    with monkeypatch.context() as patched:
-        patched.setattr("pathlib.Path.replace", _interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            write_tensors(path, {"a": torch.zeros(3)})
-    assert read_tensors(path)["a"].tolist() == [1, 1, 1]
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_an_interrupted_scoring_is_written_the_next_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scoring = Scoring(np.zeros((2, 1, 8, 8), np.uint8), np.zeros((2, 1, 4), np.int64))
-    with monkeypatch.context() as patched:
-        patched.setattr("mien.tracking.scoring_files.write_arrays", _interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            write_scoring(tmp_path / "scoring", scoring, "of a capture")
-    assert list(tmp_path.iterdir()) == []
+    for name, write in (
+        ("pathlib.Path.replace", lambda: write_tensors(path, {"a": torch.zeros(3)})),
+        ("mien.tracking.scoring_files.write_arrays", lambda: write_scoring(tmp_path / "scoring", scoring, "x")),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(name, interrupt)
+            pytest.raises(KeyboardInterrupt, write)
+        assert list(tmp_path.iterdir()) == [path]
+    assert read_tensors(path)["a"].tolist() == [1, 1, 1]
     write_scoring(tmp_path / "scoring", scoring, "of a capture")
     assert (tmp_path / "scoring" / "scoring.json").is_file()
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def tensors_file(header: bytes) -> bytes:
@@ -116,14 +78,14 @@ def tensors_file(header: bytes) -> bytes:
 
 
 JSON: dict[bytes, str] = {
-    b"": "cannot be read as json", b"[1, 2": "cannot be read as json", b"[" * 100_000: "cannot be read as json",
+    b"[1, 2": "cannot be read as json", b"[" * 100_000: "cannot be read as json",
     b'{"format": "x", "version": 1, "a": NaN}': "holds the number NaN",
     b'{"format": "x", "version": 9}': "version 9, expected 'x' version 1", b"[1]": "has format None",
+    bytes(1 << 26): "and at most",
 }  # fmt: skip
 TENSORS: dict[bytes, str] = {
     (1 << 62).to_bytes(8, "little") + b"{}": "header does not fit",
     tensors_file(b'{"__metadata__": [1]}'): "metadata is not an object",
-    tensors_file(b'{"__metadata__": "x"}'): "metadata is not an object",
     tensors_file(b"[]"): "metadata is not an object", tensors_file(b"[" * 3000): "too deep",
     tensors_file(b'{"a": ' + b"9" * 400 + b"}"): "400 digits",
     tensors_file(b'{"a": {"dtype": "F32", "shape": [1000000000000], "data_offsets": [0, 4000000000000]}}'): "damaged",
@@ -133,26 +95,20 @@ TENSORS: dict[bytes, str] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("data", "message"), [*JSON.items(), *TENSORS.items()])
-def test_bad_json_and_tensors(data: bytes, message: str, tmp_path: Path) -> None:
-    """Damaged or foreign files are refused with the reason."""
+def test_bad_json_and_tensors(tmp_path: Path) -> None:
+    """Damaged, foreign or huge files are refused with the reason."""
     path = tmp_path / "a"
-    path.write_bytes(data)
-    arrays, tensors = (lambda: read_arrays(path)), (lambda: read_tensors(path))
-    readers = [lambda: read_json(path, "x", 1)] if data in JSON else [arrays] if b"BF16" in data else [arrays, tensors]
-    for read in readers:
-        with pytest.raises(UserError, match=message):
-            read()
-
-
-def test_huge_files_are_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    for data, size, read in ((b"", 1 << 30, lambda: read_json(path, "x", 1)),
-                             (tensors_file(b"{}"), 1 << 40, lambda: read_arrays(path))):  # fmt: skip
+    for data, message in (JSON | TENSORS).items():
         path.write_bytes(data)
-        os.truncate(path, size)
-        with pytest.raises(UserError, match="and at most"):
-            read()
+        readers = [lambda: read_json(path, "x", 1)] if data in JSON else [lambda: read_arrays(path)]
+        readers += [lambda: read_tensors(path)] * (data in TENSORS and b"BF16" not in data)
+        for read in readers:
+            with pytest.raises(UserError, match=message):
+                read()
+    path.write_bytes(tensors_file(b"{}"))
+    os.truncate(path, 1 << 40)
+    with pytest.raises(UserError, match="and at most"):
+        read_arrays(path)
 
 
 def test_an_edited_json_is_noticed(tmp_path: Path) -> None:
@@ -181,9 +137,7 @@ def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_pa
     for name in ("face_model.safetensors", "face_model.json", "avatar.safetensors", "avatar.json"):
         path = tmp_path / "avatar" / name
         path.write_bytes(path.read_bytes()[:40])
-        with pytest.raises(
-            UserError, match=rf"{name}: .*; delete the run's training.json, .* train it again with `mien train`"
-        ):
+        with pytest.raises(UserError, match=rf"{name}: .*; delete the run's training.json, .* again with `mien train`"):
             load_avatar(tmp_path)
     (tmp_path / "avatar" / "avatar.json").write_bytes((run_dir / "avatar" / "avatar.json").read_bytes())
     (tmp_path / "avatar" / "avatar.safetensors").unlink()
@@ -191,51 +145,29 @@ def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_pa
         load_avatar(tmp_path)
 
 
-def test_a_damaged_avatar_is_made_again_as_advised(run_dir: Path, tmp_path: Path) -> None:
-    shutil.copytree(run_dir, tmp_path, dirs_exist_ok=True)
-    (tmp_path / "avatar" / "face_model.safetensors").unlink()
-    (tmp_path / "avatar" / "avatar.safetensors").write_bytes(b"")
-    (tmp_path / "training.json").unlink()
-    train_toy.main(tmp_path, train_toy.SETTINGS.steps)
-    for name in ("avatar.safetensors", "face_model.safetensors"):
-        assert (tmp_path / "avatar" / name).read_bytes() == (run_dir / "avatar" / name).read_bytes()
-
-
-def test_the_command_line_tells_damage_in_one_line(
+def test_a_damaged_run_is_trained_again_as_advised(
     run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = run_dir / "avatar" / "avatar.json"
-    whole = path.read_bytes()
-    try:
-        path.write_bytes(whole[: len(whole) // 2])
-        assert main(["export", str(run_dir.parent.parent), "--out", str(tmp_path / "a.ply")]) == 2
-    finally:
-        path.write_bytes(whole)
-    shown = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
-    assert len(shown) == 1
-    assert "avatar.json" in shown[0]
-    assert not (tmp_path / "a.ply").exists()
-
-
-def test_going_on_from_an_older_checkpoint_is_said(
-    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for path in [run_dir / "config.json", *checkpoint_files(run_dir / "checkpoints")]:
-        copy = tmp_path / path.relative_to(run_dir)
-        copy.parent.mkdir(exist_ok=True)
-        copy.write_bytes(path.read_bytes())
-    older, newest = checkpoint_files(tmp_path / "checkpoints")
-    damaged = bytearray(newest.read_bytes())
-    damaged[-1] ^= 1
-    newest.write_bytes(damaged)
-    train_toy.main(tmp_path, train_toy.SETTINGS.steps)
-    shown = capsys.readouterr()
-    said = " ".join((shown.err + shown.out).split())
-    assert "training continues from the older checkpoint" in said
-    step = int(older.stem.removeprefix("step_"))
-    assert f"at step {step} step {step + 1} step {step + 2}" in said
-    result = "avatar/avatar.safetensors"
-    assert (tmp_path / result).read_bytes() == (run_dir / result).read_bytes()
+    """A damaged avatar is made again, and a damaged checkpoint is replaced by the older one, which is said."""
+    copy = shutil.copytree(run_dir, tmp_path / "copy")
+    (copy / "avatar" / "face_model.safetensors").unlink()
+    (copy / "avatar" / "avatar.safetensors").write_bytes(b"")
+    (copy / "training.json").unlink()
+    older, newest = checkpoint_files(copy / "checkpoints")
+    for damaged in (False, True):
+        if damaged:
+            newest.write_bytes(newest.read_bytes()[:-1] + b"x")
+            shutil.rmtree(copy / "avatar")
+            (copy / "training.json").unlink()
+        capsys.readouterr()
+        train_toy.main(copy, train_toy.SETTINGS.steps)
+        shown = capsys.readouterr()
+        said = " ".join((shown.err + shown.out).split())
+        step = int(older.stem.removeprefix("step_"))
+        assert ("training continues from the older checkpoint" in said) == damaged
+        assert (f"at step {step} step {step + 1} step {step + 2}" in said) == damaged
+        for name in ("avatar.safetensors", "face_model.safetensors"):
+            assert (copy / "avatar" / name).read_bytes() == (run_dir / "avatar" / name).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -256,41 +188,29 @@ def test_a_full_disk_or_memory_anywhere_is_no_bug(
     assert words in capsys.readouterr().err
 
 
-def test_create_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`mien create` into a file says so and leaves the file alone."""
-    write_video(tmp_path / "a.mp4", list(NOISE), 25.0)
+def test_workspaces_in_odd_places(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A workspace in the place of a file or inside another one is refused, and nothing is written."""
+    write_gradient_video(tmp_path / "a.mp4", frames=3)
     (tmp_path / "out").write_text("mine")
-    assert main(["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == 2
-    shown = capsys.readouterr().err
-    assert "is a file" in shown
-    assert "disk space" not in shown
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-@pytest.mark.parametrize("place", ["runs", "sequences/other", "runs/new/deep"])
-@pytest.mark.parametrize("command", ["create", "capture"])
-def test_a_workspace_inside_a_workspace(
-    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str
-) -> None:
-    """A workspace inside a workspace is refused, and nothing is written."""
-    write_video(tmp_path / "a.mp4", list(NOISE), 25.0)
     outer = tmp_path / "outer"
     shutil.copytree(run_dir, outer / "runs/old")
-    before = sorted(outer.rglob("*"))
-    assert main([command, str(tmp_path / "a.mp4"), "--out", str(outer / place)]) == 2
-    assert f"inside the workspace {outer}" in capsys.readouterr().err
-    assert sorted(outer.rglob("*")) == before
-
-
-@torch.no_grad()
-def test_a_ply_with_nan_is_refused(run_dir: Path, tmp_path: Path) -> None:
-    avatar, path = load_avatar(run_dir), tmp_path / "a.ply"
-    write_ply(path, in_world(avatar.pose(avatar.subject).gaussians.timestep(0)))
-    whole = path.read_bytes()
-    start = whole.index(b"end_header\n") + len(b"end_header\n")
-    path.write_bytes(whole[:start] + np.float32(np.nan).tobytes() + whole[start + 4 :])
-    with pytest.raises(UserError, match="position of some Gaussians is NaN"):
-        read_ply(path)
+    before = sorted(tmp_path.rglob("*"))
+    for command in ("create", "capture"):
+        for place, words in (
+            (tmp_path / "out", "is a file"),
+            *((outer / name, f"inside the workspace {outer}") for name in ("runs", "sequences/other", "runs/new/deep")),
+        ):
+            assert main([command, str(tmp_path / "a.mp4"), "--out", str(place)]) == 2
+            shown = capsys.readouterr().err
+            assert words in shown
+            assert "disk space" not in shown
+    assert (tmp_path / "out").read_text() == "mine"
+    assert sorted(tmp_path.rglob("*")) == before
+    with pytest.raises(UserError, match="is a file; give the folder of a workspace"):
+        open_workspace(tmp_path / "a.mp4")
+    (tmp_path / "me/runs").mkdir(parents=True)
+    with pytest.raises(UserError, match="there is no run yet; make one with `mien train"):
+        Workspace(tmp_path / "me").pick_run(None)
 
 
 def test_every_row_of_the_table_names_a_test_that_exists() -> None:
@@ -304,10 +224,128 @@ def test_every_row_of_the_table_names_a_test_that_exists() -> None:
             assert f"def {test}(" in source, f"{file}.py has no {test}"
 
 
-def test_a_file_in_place_of_a_workspace_and_a_workspace_without_runs_are_told_apart(tmp_path):
-    (tmp_path / "video.mp4").write_bytes(b"x")
-    with pytest.raises(UserError, match="is a file; give the folder of a workspace"):
-        open_workspace(tmp_path / "video.mp4")
-    (tmp_path / "me/runs").mkdir(parents=True)
-    with pytest.raises(UserError, match="there is no run yet; make one with `mien train"):
-        Workspace(tmp_path / "me").pick_run(None)
+USD = ("usd", "usda", "usdc", "usdz")
+ENDINGS = ("mien", "html", "packed", "glb", "ply", "spz", "sog", *(USD if importlib.util.find_spec("pxr") else ()))
+COMMANDS: dict[str, tuple[str, ...]] = {
+    **{ending: ("export", "W", "--out", f"D/a.{ending}") for ending in ENDINGS},
+    "series": ("export", "W", "--out", "D/a.ply", "--series", "clip"),
+    "folder": ("export", "W", "--out", "D/a", "--format", "gaussian-avatars"),
+    "converted": ("export", "me.mien", "--out", "D/a.html"),
+    "picture": ("render", "W", "--out", "D/a.png", "--size", "32"),
+    "pictures": ("render", "W", "--out", "D/a", "--size", "32", "--path", "sway", "--frames", "3"),
+    "mp4": ("render", "W", "--out", "D/a.mp4", "--size", "64", "--path", "sway", "--frames", "4"),
+    "webm": ("render", "W", "--out", "D/a.webm", "--size", "64", "--path", "sway", "--frames", "4"),
+    "drive": ("drive", "W", "--by", "W", "--out", "D/a.mp4", "--size", "32"),
+    **({"usd series": ("export", "W", "--out", "D/a.usdz", "--series", "clip")} if "usdz" in ENDINGS else {}),
+}
+NOISE = np.random.default_rng(0).integers(0, 255, (4, 64, 64, 3), dtype=np.uint8)
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "json": lambda folder: write_json(folder / "a.json", "x", 1, {"text": "x" * 2000}),
+    "tensors": lambda folder: write_tensors(folder / "a.safetensors", {"a": torch.zeros(1000)}),
+    "arrays": lambda folder: write_arrays(folder / "a.safetensors", {"a": np.zeros(1000)}),
+    "capture": lambda folder: write_capture(folder / "capture", toy_sequence(3, 64)[1].capture),
+    "tracking": lambda folder: write_tracking(folder / "tracking", toy_sequence(30, 32)[1].tracking),
+    "video": lambda folder: write_video(folder / "a.mp4", list(NOISE), 25.0),
+    "film": lambda folder: write_pictures(plan_output(folder / "a:b.mp4", 4), list(NOISE), 25.0),
+}
+
+
+@contextmanager
+def small_disk(size: int) -> Iterator[None]:
+    """Limit the size of every file, as a full disk would. This needs no rights."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def files_of(disk: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(disk)): path.read_bytes() for path in disk.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_told_and_nothing_half_written_stays(name: str, tmp_path: Path) -> None:
+    with small_disk(500), pytest.raises(UserError, match="free disk space") as error:
+        WRITERS[name](tmp_path)
+    assert str(tmp_path) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert [path for path in files_of(tmp_path) if ".partial" not in path] == [], "half-written files"
+    WRITERS[name](tmp_path)
+
+
+@pytest.fixture
+def given(made_once: MadeOnce) -> Path:
+    """Return a folder with a workspace, W and an avatar."""
+
+    def make(folder: Path) -> None:
+        shutil.copytree(toy_workspace(made_once), folder / "W")
+        assert main(["export", str(folder / "W"), "--out", str(folder / "me.mien")]) == 0
+
+    return made_once("given_to_full_disks", make)
+
+
+def test_a_full_disk_leaves_the_avatar_that_was_there(given: Path, tmp_path: Path) -> None:
+    avatar = load_avatar(given / "W/runs/toy")
+    write_avatar(tmp_path, avatar)
+    before = files_of(tmp_path)
+    with small_disk(500), pytest.raises(UserError, match="free disk space"):
+        write_avatar(tmp_path, avatar)
+    assert files_of(tmp_path) == before
+
+
+@pytest.fixture(params=["limit", "mount"])
+def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Return a folder, and what fills its disk: a limit, or a disk of 16 MiB in memory.
+
+    On the latter, the temporary files of libraries are on the full disk, too.
+    """
+    if request.param == "limit":
+        yield tmp_path, small_disk
+        return
+    place = Path(tempfile.mkdtemp(prefix="mien-disk-"))
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        place.rmdir()
+        pytest.skip(NO_MOUNT)
+    (place / "out").mkdir()
+
+    @contextmanager
+    def filled(left: int) -> Iterator[None]:
+        filler = place / "filler"
+        with filler.open("wb") as file, monkeypatch.context() as patched:
+            os.posix_fallocate(file.fileno(), 0, shutil.disk_usage(place).free - left // 4096 * 4096)
+            patched.setattr(tempfile, "tempdir", str(place))
+            yield
+        filler.unlink()
+
+    yield place / "out", filled
+    subprocess.run(["umount", "-l", str(place)], check=True)
+    place.rmdir()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_export_on_a_full_disk_keeps_the_earlier_file(
+    name: str, given: Path, disk: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Write once, then on a disk that is filled at a random place, then again."""
+    monkeypatch.setattr(write_glb, "__defaults__", (128,))  # the usual size takes ten seconds
+    folder, filled = disk
+    places = {"W": given / "W", "me.mien": given / "me.mien"}
+    line = [str(places.get(word, word)) for word in COMMANDS[name]]
+    line = [word.replace("D/", f"{folder}/") if word.startswith("D/") else word for word in line]
+    assert main(line) == 0
+    before = files_of(folder)
+    capsys.readouterr()
+    with filled(random.Random(1).randrange(0, max(map(len, before.values())) * 9 // 10)):
+        assert main(line) == 2
+        kept = files_of(folder)
+    (said,) = (text for text in capsys.readouterr().err.splitlines() if text.startswith("mien: "))
+    assert f"mien: {folder}" in said
+    assert "free disk space" in said
+    assert set(kept) == set(before), "nothing half-written"
+    if name not in ("series", "pictures"):  # of these, files that were whole before the disk was full are new
+        assert kept == before
+    assert main(line) == 0
+    assert set(files_of(folder)) == set(before)

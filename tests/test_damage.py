@@ -5,46 +5,93 @@ The readers are the table `fuzzing.targets`, the damage is `fuzzing.faults`, `fo
 Cases run in other processes, so that a crashing decoder spares the tests.
 """
 
+import os
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
+import torch
 
 from forked import ForkServer
+from fuzzing import campaign
 from fuzzing.faults import FIXED
-from fuzzing.material import quick_material
-from fuzzing.values import VALUES
+from fuzzing.judge import Result
+from fuzzing.material import make_material
+from fuzzing.targets import TARGETS, present, spread
+from fuzzing.values import SANE, VALUES, concrete, edit
 from shared_things import MadeOnce
 
+CHECKS = {
+    **{f"damage: {kind}": ("check_damage", kind) for kind in FIXED},
+    **{f"values: {name}": ("check_values", name) for name in VALUES},
+    "random": ("check_random", 0, 150), "repairs": ("check_repairs",), "judge": ("check_judge",),
+}  # fmt: skip
 
-@pytest.fixture
-def material(made_once: MadeOnce) -> Path:
-    """Return a folder with a whole file of each kind."""
-    return quick_material(made_once)
 
-
-def check(server: ForkServer, name: str, tmp_path: Path, material: Path, *arguments: object) -> None:
-    process = server.call(f"fuzzing.checks:{name}", str(tmp_path / "b"), str(material), *arguments)
+@pytest.mark.parametrize("name", CHECKS)
+def test_every_reader_by_every_damage(name: str, fork_server: ForkServer, tmp_path: Path, made_once: MadeOnce) -> None:
+    """A check ends with a table of what was found, and with the command that repeats it."""
+    check, *arguments = CHECKS[name]
+    material = made_once("material", lambda folder: make_material(folder, whole=False))
+    process = fork_server.call(f"test_damage:{check}", str(tmp_path / "b"), str(material), *arguments)
     assert process.wait() == 0, process.stdout + process.stderr[-6000:]
 
 
-@pytest.mark.parametrize("kind", FIXED)
-def test_any_file_can_be_damaged(kind: str, fork_server: ForkServer, tmp_path: Path, material: Path) -> None:
-    check(fork_server, "check_damage", tmp_path, material, kind)
+def results_of(cases: Iterable[str], folder: str, material: str) -> list[Result]:
+    torch.set_num_threads(1)
+    os.environ["MIEN_THREADS"] = "1"
+    results = list(campaign.run_cases(list(cases), Path(folder), Path(material)))
+    assert not any(result.outcome == "finding" for result in results), campaign.table_of(results)
+    return results
 
 
-@pytest.mark.parametrize("name", VALUES)
-def test_values_that_cannot_be(name: str, fork_server: ForkServer, tmp_path: Path, material: Path) -> None:
-    """Every file has the right checksum, or none, since whoever makes a file can make its checksum."""
-    check(fork_server, "check_values", tmp_path, material, name)
+def check_damage(folder: str, material: str, kind: str) -> None:
+    """Damage the file of every reader. Readers of exact content refuse it; only an analysis that is missing is made."""
+    names = [name for name in present(Path(material)) if "**" not in TARGETS[name].files]
+    cases = []
+    for name in names:
+        files = TARGETS[name].files
+        amount = len(list(Path(material).glob(files))) if files.endswith("/*") else 1
+        cases += [f"{name}:{kind}:{number}" for number in range(min(amount, 6))]
+    silent = [result.case for result in results_of(cases, folder, material) if result.outcome != "refused"]
+    silent = [case for case in silent if TARGETS[case.split(":")[0]].exact and case != "analysis.json:missing:0"]
+    assert not silent, silent
 
 
-def test_random_faults(fork_server: ForkServer, tmp_path: Path, material: Path) -> None:
-    check(fork_server, "check_random", tmp_path, material, 0, 150)
+def check_values(folder: str, material: str, name: str) -> None:
+    """Put values that the reader must refuse into each file with such a place. Its checksum is right, or there is none.
+
+    Whoever makes a file can make its checksum.
+    """
+    files = list(enumerate(sorted(path for path in Path(material).glob(TARGETS[name].files) if path.is_file())))
+    cases = [
+        f"{name}:{row}/{index}:{number}"
+        for row, one in enumerate(VALUES[name])
+        for number, file in (files[-1:] if name == "checkpoints" else files)
+        for index, (where, value) in enumerate(concrete(one, file))
+        if edit(file, where, value) is not None
+    ]
+    results = results_of(cases, folder, material)
+    refused = {result.case.split(":")[1].split("/")[0] for result in results if result.outcome == "refused"}
+    missed = [one[0] for row, one in enumerate(VALUES[name]) if str(row) not in refused]
+    assert not missed, f"no file has these places: {missed}"
 
 
-def test_corrected_checksums_hide_no_fault(fork_server: ForkServer, tmp_path: Path, material: Path) -> None:
-    check(fork_server, "check_repairs", tmp_path, material)
+def check_random(folder: str, material: str, seed: int, cases: int) -> None:
+    numbered = [case.format(seed=seed) for case in spread(cases, present(Path(material)))]
+    outcomes = Counter(result.outcome for result in results_of(numbered, folder, material))
+    assert outcomes["refused"] > cases / 3, outcomes
+    assert outcomes["accepted"] > cases / 10, outcomes
 
 
-def test_readers_that_are_wrong_are_found(fork_server: ForkServer, tmp_path: Path, material: Path) -> None:
-    check(fork_server, "check_judge", tmp_path, material)
+def check_repairs(folder: str, material: str) -> None:
+    """Edits that are sane are accepted, once all checksums around them are corrected: these would hide faults."""
+    results = results_of([f"{name}:sane:0" for name in SANE], folder, material)
+    assert all(result.outcome == "accepted" for result in results), campaign.table_of(results)
+
+
+def check_judge(folder: str, material: str) -> None:
+    """The judge finds readers that are wrong in every way."""
+    missed = campaign.missed(Path(folder), Path(material))
+    assert not missed, "\n".join(missed)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -33,19 +34,13 @@ def toy() -> tuple[FaceModel, Sequence]:
     count = len(model.template)
     faces = torch.cat([model.faces, model.faces + count])
     nested = replace(
-        model,
-        template=torch.cat([model.template, 0.9 * model.template]),
-        faces=faces,
-        uv=torch.zeros(2 * count, 2),
-        uv_faces=faces,
-        region_names=("skin", "mouth"),
+        model, template=torch.cat([model.template, 0.9 * model.template]), faces=faces, uv=torch.zeros(2 * count, 2),
+        uv_faces=faces, region_names=("skin", "mouth"), identity_basis=torch.zeros(2, 2 * count, 3),
         face_regions=torch.arange(2).repeat_interleave(len(model.faces)),
-        identity_basis=torch.zeros(2, 2 * count, 3),
         expression_basis=torch.zeros(2, 2 * count, 3),
         skinning_weights=torch.tensor([[1.0, 0, 0]]).repeat(2 * count, 1),
-    )
-    tracking = replace(sequence.tracking, face_model_hash=nested.content_hash)
-    return nested, replace(sequence, tracking=tracking)
+    )  # fmt: skip
+    return nested, replace(sequence, tracking=replace(sequence.tracking, face_model_hash=nested.content_hash))
 
 
 def facing(model: FaceModel) -> torch.Tensor:
@@ -54,52 +49,39 @@ def facing(model: FaceModel) -> torch.Tensor:
     return normalize(torch.linalg.cross(b - a, c - a), dim=-1)[:, 2]
 
 
-def made(toy: tuple[FaceModel, Sequence], method: str = "gaussian_avatars") -> Avatar:
-    return METHODS[method].avatar(plain_config(method), toy[0], toy[1].tracking.face)
+def open_mouth(model: FaceModel) -> FaceModel:
+    """The nested heads with a hole in front."""
+    kept = (model.face_regions == 1) | (facing(model) < 0.9)
+    return replace(model, faces=model.faces[kept], uv_faces=model.faces[kept], face_regions=model.face_regions[kept])
 
 
-def test_what_a_closed_mouth_hides_is_hidden(toy: tuple[FaceModel, Sequence]) -> None:
+def made(toy: tuple[FaceModel, Sequence], degree: int = 0) -> Avatar:
+    config = plain_gaussian_avatars(sh_degree=degree)
+    return METHODS["gaussian_avatars"].avatar(config, toy[0], toy[1].tracking.face)
+
+
+def test_what_a_mouth_hides_is_hidden(toy: tuple[FaceModel, Sequence]) -> None:
+    """An open one shows its front. A picture does not show what is beside it. Targets say it if they are asked."""
     model, sequence = toy
     inside, camera = inside_triangles(model), sequence.tracking.cameras[0]
     assert torch.equal(inside, model.face_regions == 1)
-    vertices = model(toy_face(1))[0]
-    assert torch.equal(hidden_triangles(vertices, model, inside, camera), inside)
-
-
-def test_what_an_open_mouth_shows_is_not_hidden(toy: tuple[FaceModel, Sequence]) -> None:
-    model, sequence = toy
-    camera, opened = sequence.tracking.cameras[0], open_mouth(model)
-    inside = inside_triangles(opened)
-    hidden = hidden_triangles(opened(toy_face(1))[0], opened, inside, camera)
-    front = inside & (facing(opened) > 0.94)
+    assert torch.equal(hidden_triangles(model(toy_face(1))[0], model, inside, camera), inside)
+    aside = replace(toy_face(1), head_translation=torch.tensor([[0.6, 0.0, -0.5]]))
+    assert hidden_triangles(model(aside)[0], model, torch.ones(len(model.faces), dtype=torch.bool), camera).all()
+    opened = open_mouth(model)
+    within = inside_triangles(opened)
+    hidden = hidden_triangles(opened(toy_face(1))[0], opened, within, camera)
+    front = within & (facing(opened) > 0.94)
     assert front.any()
     assert not hidden[front].any()
-    assert hidden[inside & (opened.template[opened.faces].mean(1)[:, 1].abs() > 0.06)].all()
-    assert not hidden[~inside].any()
-
-
-def test_a_picture_does_not_show_what_is_beside_it(toy: tuple[FaceModel, Sequence]) -> None:
-    model, sequence = toy
-    inside = torch.ones(len(model.faces), dtype=torch.bool)
-    face = replace(toy_face(1), head_translation=torch.tensor([[0.6, 0.0, -0.5]]))
-    assert hidden_triangles(model(face)[0], model, inside, sequence.tracking.cameras[0]).all()
-
-
-def test_targets_say_what_is_hidden_if_they_are_asked(toy: tuple[FaceModel, Sequence]) -> None:
-    model, sequence = toy
-    inside = inside_triangles(model)
-    white = torch.full((3,), 255, dtype=torch.uint8).numpy()
+    assert hidden[within & (opened.template[opened.faces].mean(1)[:, 1].abs() > 0.06)].all()
+    assert not hidden[~within].any()
+    white = np.full(3, 255, np.uint8)
     asked = Targets(sequence, 0, face_model=model, inside=inside).target(1, 0, white, keep=False)
     assert asked.hidden is not None
     assert torch.equal(asked.hidden, inside)
     assert asked.to(torch.zeros((), dtype=torch.float64)).hidden is not None
     assert Targets(sequence, 0, face_model=model).target(1, 0, white, keep=False).hidden is None
-
-
-def open_mouth(model: FaceModel) -> FaceModel:
-    """The nested heads with a hole in front."""
-    kept = (model.face_regions == 1) | (facing(model) < 0.9)
-    return replace(model, faces=model.faces[kept], uv_faces=model.faces[kept], face_regions=model.face_regions[kept])
 
 
 @pytest.mark.parametrize("opened", [False, True])
@@ -133,13 +115,12 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
 @pytest.mark.parametrize("degree", [0, 2])
 def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceModel, Sequence], degree: int) -> None:
     model, sequence = toy
-    config = plain_gaussian_avatars(sh_degree=degree)
-    avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
-    hidden = model.face_regions == 1
+    avatar, hidden = made(toy, degree), model.face_regions == 1
     posed = avatar.pose(sequence.tracking.face[0])
     changed = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(3))
+    color = torch.rand(3, generator=torch.Generator().manual_seed(3))
     colors = rgb_from_sh(changed.gaussians.sh[hidden, 0])
-    torch.testing.assert_close(colors, torch.rand(3, generator=torch.Generator().manual_seed(3)).expand_as(colors))
+    torch.testing.assert_close(colors, color.expand_as(colors))
     assert not changed.gaussians.sh[hidden, 1:].any()
     assert torch.equal(changed.gaussians.sh[~hidden], posed.gaussians.sh[~hidden])
     assert torch.equal(changed.gaussians.opacities, posed.gaussians.opacities)
@@ -150,28 +131,20 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
         assert gradient is not None
         assert bool(gradient[hidden].any()) == trained, name
         assert gradient[~hidden].any(), name
-
-
-def test_the_fast_disguise_is_the_reference(toy: tuple[FaceModel, Sequence]) -> None:
-    config = plain_gaussian_avatars(sh_degree=1)
-    avatar = METHODS["gaussian_avatars"].avatar(config, toy[0], toy[1].tracking.face)
-    posed = avatar.pose(toy[1].tracking.face[0])
+    # The fast disguise is the reference, with its gradients.
     sh, opacities = (getattr(posed.gaussians, name).detach().requires_grad_() for name in ("sh", "opacities"))
-    hidden = torch.arange(len(sh)) % 3 == 0
     posed = replace(posed, gaussians=replace(posed.gaussians, sh=sh, opacities=opacities))
-    fast = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(5)).gaussians
-    color = sh_from_rgb(torch.rand(3, generator=torch.Generator().manual_seed(5)))
-    plain = covered_reference(sh, opacities, hidden, color)
+    fast = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(3)).gaussians
+    plain = covered_reference(sh, opacities, hidden, sh_from_rgb(color))
     factors = torch.rand_like(sh), torch.rand_like(opacities)
     found = torch.autograd.grad((fast.sh, fast.opacities), (sh, opacities), factors)
     expected = torch.autograd.grad(plain, (sh, opacities), factors)
-    assert torch.equal(fast.sh, plain[0])
-    assert torch.equal(fast.opacities, plain[1])
-    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+    for one, other in zip((fast.sh, fast.opacities, *found), (*plain, *expected), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_other_methods_have_nothing_to_cover(toy: tuple[FaceModel, Sequence]) -> None:
-    avatar = made(toy, "headgas")
+    avatar = METHODS["headgas"].avatar(plain_config("headgas"), toy[0], toy[1].tracking.face)
     posed = avatar.pose(toy[1].tracking.face[0])
     assert avatar.surface() is None
     assert cover_hidden(posed, avatar, toy[0].face_regions == 1, torch.Generator()) is posed
@@ -198,38 +171,27 @@ def test_open_surface_is_closed_and_the_rest_stays(toy: tuple[FaceModel, Sequenc
     torch.testing.assert_close(store["sh_constant"][opened, 0], sh_from_rgb(colors[opened]))
 
 
-@torch.no_grad()
-def inner_share(avatar: Avatar, model: FaceModel, sequence: Sequence) -> float:
-    """How much of the head in a picture is painted by what is inside, 0..1."""
-    gaussians = avatar.pose(sequence.tracking.face[0]).gaussians.detach().timestep(0)
-    triangles = surface_of(avatar).triangles()
-    own = (model.face_regions[triangles] == 1).float()[:, None, None].expand(-1, 1, 3)
-    shown = rasterize(replace(gaussians, sh=sh_from_rgb(own)), sequence.tracking.cameras[0], torch.zeros(3))
-    return float(shown.image[..., 0].sum() / shown.alpha.sum())
-
-
 def test_skin_is_painted_by_skin(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
     """A mouth that no picture shows paints a good part of the skin, unless it is covered."""
     model, sequence = toy
     shares = {}
     for inside in ("free", "covered"):
         avatar = train([sequence], model, plain_gaussian_avatars(), replace(SETTINGS, inside=inside), tmp_path / inside)
-        shares[inside] = inner_share(avatar, model, sequence)
+        own = (model.face_regions[surface_of(avatar).triangles()] == 1).float()[:, None, None].expand(-1, 1, 3)
+        with torch.no_grad():
+            gaussians = avatar.pose(sequence.tracking.face[0]).gaussians.timestep(0)
+            shown = rasterize(replace(gaussians, sh=sh_from_rgb(own)), sequence.tracking.cameras[0], torch.zeros(3))
+        shares[inside] = float(shown.image[..., 0].sum() / shown.alpha.sum())
     assert shares["free"] > 0.1
     assert shares["covered"] < 0.5 * shares["free"]
 
 
 def test_a_run_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
     """It stops after the step at which the surface is closed, and before it."""
-    model, sequence = toy
-    settings, config = (
-        replace(SETTINGS, inside="filled", steps=6, checkpoint_every=2, record_every=1),
-        plain_gaussian_avatars(),
-    )
-    whole = train([sequence], model, config, settings, tmp_path / "cut")
-    means = whole.gaussian_store()["means"].clone()
+    settings = replace(SETTINGS, inside="filled", steps=6, checkpoint_every=2, record_every=1)
+    given = [toy[1]], toy[0], plain_gaussian_avatars(), settings, tmp_path / "cut"
+    means = train(*given).gaussian_store()["means"].clone()
     for lost in ("6", "[46]"):
         for path in (tmp_path / "cut/training.json", *(tmp_path / "cut/checkpoints").glob(f"*{lost}.safetensors")):
             path.unlink()
-        again = train([sequence], model, config, settings, tmp_path / "cut")
-        assert torch.equal(again.gaussian_store()["means"], means)
+        assert torch.equal(train(*given).gaussian_store()["means"], means)

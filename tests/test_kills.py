@@ -14,13 +14,10 @@ from pathlib import Path
 import pytest
 
 from forked import ForkServer
-from fuzzing.same_bytes import differing_files, hidden_files
+from fuzzing.kills import SIGNALS, differing_files, hidden_files
 from mien.cli import main
 from two_commands import RANK, Studio, run, toy_studio
 
-TESTS = Path(__file__).parent
-KILLS = 12
-"""Number of kills of the long test."""
 STAGES = {
     "capture": ("capture {pictures} --out {box}/new --name clip", signal.SIGKILL, 2),
     "train": ("train {box} --run new --steps 6 --split tail --training.checkpoint-every 2", signal.SIGTERM, 3),
@@ -28,7 +25,6 @@ STAGES = {
     "export": ("export {box} --run alone --out {box}/me.mien", signal.SIGKILL, 1),
 }
 """Name of a stage -> its command, a signal, and before which of its files it comes."""
-CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 143, signal.SIGINT: 130}
 
 
 @pytest.fixture(scope="module")
@@ -50,20 +46,14 @@ def test_a_command_that_is_stopped_before_it_puts_a_file_in_place_goes_on(
     box, whole = tmp_path / "box", tmp_path / "whole"
     words = [word.format(box=box, pictures=studio.video) for word in line.split()]
     words += studio.capture_options if stage == "capture" else RANK if stage == "train" else []
-
-    def begin() -> None:
-        shutil.copytree(studio.root, box)
-
-    def ended(function: str, *more: int) -> int:
-        return fork_server.call(function, words, *more, exits=True).wait()
-
-    begin()
-    assert ended("two_commands:run") == 0
+    shutil.copytree(studio.root, box)
+    assert fork_server.call("two_commands:run", words, exits=True).wait() == 0
     box.rename(whole)
-    begin()
-    assert ended("test_kills:run_until_a_file", int(number), file) == CODES[number]
+    shutil.copytree(studio.root, box)
+    stopped = fork_server.call("test_kills:run_until_a_file", words, int(number), file, exits=True)
+    assert stopped.wait() == SIGNALS[number]
     assert differing_files(whole, box) != [], "the command was not stopped"
-    assert ended("two_commands:run") == 0
+    assert fork_server.call("two_commands:run", words, exits=True).wait() == 0
     assert differing_files(whole, box) == []
     assert number == signal.SIGKILL or not hidden_files(box)
 
@@ -86,7 +76,7 @@ def run_until_a_file(words: list[str], number: int, file: int) -> int:
 @pytest.mark.long
 def test_random_kills_leave_nothing_to_do_by_hand(tmp_path: Path) -> None:
     seed, findings = os.environ.get("MIEN_SEED", "0"), tmp_path / "kills.jsonl"
-    words = ["-m", "fuzzing.kills", "--kills", str(KILLS), "--seed", seed, "--findings", str(findings)]
-    result = subprocess.run([sys.executable, *words], cwd=TESTS, capture_output=True, text=True, check=False)
+    words = ["-m", "fuzzing.kills", "--kills", "12", "--seed", seed, "--findings", str(findings)]
+    result = subprocess.run([sys.executable, *words], cwd=Path(__file__).parent, capture_output=True, text=True)
     assert result.returncode == 0, f"seed {seed}:\n{result.stdout}\n{result.stderr[-3000:]}\n{findings.read_text()}"
     assert " kills; " in result.stdout

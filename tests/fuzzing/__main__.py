@@ -46,9 +46,8 @@ def main() -> int:
             return int(result.outcome == "finding")
         missed = campaign.missed(folder / "self", material) if asked.self_check else []
         until = None if asked.minutes is None else time.monotonic() + 60 * asked.minutes
-        results = campaign.run(
-            asked.seed, asked.cases, folder, material, asked.only, asked.workers, until, asked.findings
-        )
+        given = asked.seed, asked.cases, folder, material, asked.only, asked.workers, until, asked.findings
+        results = campaign.run(*given)
         print(campaign.table_of(results), *(f"missed by the fuzzers: {one}" for one in missed), sep="\n")
         return int(bool(missed) or any(result.outcome == "finding" for result in results))
     finally:

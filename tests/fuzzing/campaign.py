@@ -5,25 +5,24 @@ A process runs many cases in a row, until one ends it. A finding is then tried a
 
 import faulthandler
 import json
+import multiprocessing
 import os
-import select
 import signal
 import socket
 import sys
 import tempfile
 import time
-import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fuzzing.edges import SCRIPT
 from fuzzing.faults import Place
 from fuzzing.judge import Bench, Result, limit_this_process, run_case, snapshot
+from fuzzing.kinds import SCRIPT
 from fuzzing.targets import TARGETS, Target, present, spread
 from mien import terminal
 from mien.errors import UserError
@@ -65,8 +64,8 @@ def run(
     results, began = list[Result](), time.monotonic()
     while True:
         numbered = [case.format(seed=seed) for case in spread(cases, only or present(material))]
-        jobs = [(numbered[index::workers], folder / f"worker{index}") for index in range(workers)]
-        for result in _side_by_side(jobs, material, until) if workers > 1 else run_cases(*jobs[0], material, until):
+        jobs = [(numbered[index::workers], folder / f"worker{index}", material, until) for index in range(workers)]
+        for result in _side_by_side(jobs) if workers > 1 else run_cases(*jobs[0]):
             results.append(result)
             if result.outcome == "finding" and log is not None:
                 log.parent.mkdir(parents=True, exist_ok=True)
@@ -79,21 +78,12 @@ def run(
             return results
 
 
-@contextmanager
-def bench_in(folder: Path, material: Path, **limits: Any) -> Iterator[Bench]:
-    """Return a bench with a socket of its own."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen(64)
-        yield Bench(folder, material, listener, **limits)
-
-
 def run_cases(
-    cases: list[str], folder: Path, material: Path, until: float | None = None, **limits: float
+    cases: list[str], folder: Path, material: Path, until: float | None = None, **limits: Any
 ) -> Iterator[Result]:
     """Yield results in order. No case starts after `until` (`time.monotonic`); `limits` are those of `Bench`."""
-    with bench_in(folder, material, **limits) as bench:
-        waiting = list(cases)
+    with socket.create_server(("127.0.0.1", 0), backlog=64) as listener:
+        bench, waiting = Bench(folder, material, listener, **limits), list(cases)
         while waiting and (until is None or time.monotonic() < until):
             done = 0
             for result in _batch(waiting[:BATCH], bench):
@@ -106,43 +96,44 @@ def run_cases(
             waiting = waiting[done:]
 
 
-def _forked(work: Callable[[Callable[[Result], None]], None]) -> tuple[int, int]:
-    """Start `work` in another process; return its number, and the end of a pipe from which its results come."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child:
-        os.close(writing)
-        return child, reading
-    code = 1
-    try:
-        os.close(reading)
-        work(lambda result: None if os.write(writing, json.dumps(asdict(result)).encode() + b"\n") else None)
-        code = 0
-    except BaseException:
-        traceback.print_exc()
-        sys.stderr.flush()
-    finally:
-        os._exit(code)
+def _forked(work: Callable[..., None], *given: Any) -> tuple[Any, Connection]:
+    """Start `work` in another process; return that, and the end of a pipe from which its results come."""
+    reading, writing = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(target=work, args=(writing.send, *given))
+    process.start()
+    writing.close()
+    return process, reading
 
 
-def _side_by_side(jobs: list[tuple[list[str], Path]], material: Path, until: float | None) -> Iterator[Result]:
+def _tell_all(tell: Callable[[Result], None], *job: Any) -> None:
+    for result in run_cases(*job):
+        tell(result)
+
+
+def _side_by_side(jobs: list[Any]) -> Iterator[Result]:
     """Yield the results of jobs, each in a process of its own, as they come."""
-
-    def work(cases: list[str], folder: Path, tell: Callable[[Result], None]) -> None:
-        for result in run_cases(cases, folder, material, until):
-            tell(result)
-
-    started = [_forked(lambda tell, job=job: work(*job, tell)) for job in jobs]
-    waiting = [os.fdopen(reading) for _, reading in started]
+    started = [_forked(_tell_all, *job) for job in jobs]
+    waiting: list[Any] = [reading for _, reading in started]
     while waiting:
-        for pipe in select.select(waiting, [], [])[0]:
-            # A line arrives whole: it is shorter than a pipe's buffer, or its rest follows at once.
-            if line := pipe.readline():
-                yield Result(**json.loads(line))
+        for pipe in wait(waiting):
+            if isinstance(result := _received(pipe, None), Result):
+                yield result
             else:
                 waiting.remove(pipe)
-    if any(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child, _ in started):
-        raise RuntimeError("a worker of the fuzzer itself failed; what it said is above")
+    for process, _ in started:
+        process.join()
+        if process.exitcode:
+            raise RuntimeError("a worker of the fuzzer itself failed; what it said is above")
+
+
+def _received(pipe: Any, patience: float | None) -> Result | str:
+    """Return the next result, or how its process ends: by a signal, or not at all."""
+    if not pipe.poll(patience):
+        return "hang"
+    try:
+        return pipe.recv()
+    except EOFError:
+        return "signal"
 
 
 def _batch(cases: list[str], bench: Bench) -> Iterator[Result]:
@@ -151,52 +142,45 @@ def _batch(cases: list[str], bench: Bench) -> Iterator[Result]:
     bench.prepare()
     os.chdir(here)
     before = snapshot(bench)
-
-    def work(tell: Callable[[Result], None]) -> None:
-        os.setpgid(0, 0)
-        bench.prepare()
-        limit_this_process()
-        told = os.open(bench.told, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
-        for stream, target in ((0, os.open(os.devnull, os.O_RDONLY)), (1, told), (2, told)):
-            os.dup2(target, stream)
-        for case in cases:
-            os.ftruncate(told, 0)
-            os.lseek(told, 0, os.SEEK_SET)
-            faulthandler.dump_traceback_later(bench.patience(), file=sys.__stderr__ or sys.stderr)
-            result = run_case(case, bench)
-            faulthandler.cancel_dump_traceback_later()
-            tell(result)
-            if result.megabytes > _GROWN or result.findings:
-                break  # later cases must not suffer from it
-
-    child, reading = _forked(work)
-    pending, done, status = b"", 0, None
-    while done < len(cases):
-        ready, _, _ = select.select([reading], [], [], bench.patience() + _SPARE)
-        data = os.read(reading, 1 << 20) if ready else None
-        if data:
-            *lines, pending = (pending + data).split(b"\n")
-            done += len(lines)
-            yield from (Result(**json.loads(line)) for line in lines)
+    process, reading = _forked(_run_in_a_row, cases, bench)
+    for case in cases:
+        result = _received(reading, bench.patience() + _SPARE)
+        if isinstance(result, Result):
+            yield result
             continue
-        # The case neither ended nor raised an error: its process ended or hangs.
-        if data is None:
-            os.killpg(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-        if data is None or os.waitstatus_to_exitcode(status) != 0:
-            yield _ended(cases[done], bench, before, "hang" if data is None else "signal", status)
+        if result == "hang":
+            os.killpg(process.pid, signal.SIGKILL)
+        process.join()
+        if process.exitcode:
+            yield _ended(case, bench, before, result, process.exitcode)
         break
-    os.close(reading)
-    if status is None:
-        os.waitpid(child, 0)
+    process.join()
+    reading.close()
 
 
-def _ended(case: str, bench: Bench, before: dict[str, Any], finding: str, status: int) -> Result:
+def _run_in_a_row(tell: Callable[[Result], None], cases: list[str], bench: Bench) -> None:
+    os.setpgid(0, 0)
+    bench.prepare()
+    limit_this_process()
+    told = os.open(bench.told, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+    for stream, target in ((0, os.open(os.devnull, os.O_RDONLY)), (1, told), (2, told)):
+        os.dup2(target, stream)
+    for case in cases:
+        os.ftruncate(told, 0)
+        os.lseek(told, 0, os.SEEK_SET)
+        faulthandler.dump_traceback_later(bench.patience(), file=sys.__stderr__ or sys.stderr)
+        result = run_case(case, bench)
+        faulthandler.cancel_dump_traceback_later()
+        tell(result)
+        if result.megabytes > _GROWN or result.findings:
+            break  # later cases must not suffer from it
+
+
+def _ended(case: str, bench: Bench, before: dict[str, Any], finding: str, code: int) -> Result:
     """Return the result of a case that ended its process."""
     told = bench.told.read_text(errors="replace")[-4000:] if bench.told.exists() else ""
     lines = [line.strip() for line in told.splitlines() if line.strip()]
     frames = [line.rpartition("/")[2] for line in lines if line.startswith('File "') and "/mien/" in line]
-    code = os.waitstatus_to_exitcode(status)
     message = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     findings = [finding] + ["outside"] * (snapshot(bench) != before)
     cause = f"{finding}: {message} at {(frames or [case])[0]}"
@@ -219,11 +203,6 @@ def _complain_as_it_comes(root: Path, file: Path) -> None:
     raise UserError(f"{file}: two\nlines")
 
 
-def _call(root: Path, file: Path) -> None:
-    with socket.socket() as caller:
-        caller.connect(("127.0.0.1", int((root / "port").read_text())))
-
-
 WRONG: dict[str, Callable[[Path, Path], Any]] = {
     "signal": lambda root, file: os.kill(os.getpid(), signal.SIGSEGV),
     "hang": lambda root, file: time.sleep(60),
@@ -233,7 +212,7 @@ WRONG: dict[str, Callable[[Path, Path], Any]] = {
     "nameless": _raising(UserError("a file: cannot be read")),
     "outside": lambda root, file: (root.parent / "outside/victim").write_bytes(b"gone"),
     "leftover": lambda root, file: tempfile.mkdtemp(),
-    "connection": _call,
+    "connection": lambda root, file: socket.create_connection(("127.0.0.1", int((root / "port").read_text()))),
     "printed": lambda root, file: print("\x1b[2J", file=sys.stderr, flush=True),
     "script": lambda root, file: (root / "report.html").write_text(f"<p>{SCRIPT}</p>"),
 }

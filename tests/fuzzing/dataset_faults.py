@@ -3,7 +3,6 @@
 Other lengths, NaN and the like are faults of a format (`fuzzing.formats`).
 """
 
-import io
 import json
 import os
 import pickle
@@ -14,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from fuzzing.formats import bomb_of, members_of, zip_of
+from fuzzing.formats import bomb_of, members_of, npy_of, zip_of
 
 _BOMB = 320 << 20
 """Bytes that a bomb unpacks to. All of them are zeros."""
-_ARCHIVES = (".frame", ".npz")
+_INTRINSICS = ("intrinsics", "world_mat", "transform_matrix", "fl_x", "fx", "cx", "cy")
 
 
 class RunsCode:
@@ -32,28 +31,24 @@ class RunsCode:
 
 
 def faulty_dataset(root: Path, canary: Path, dice: Random, only: str | None = None) -> str:
-    """Make one fault in a copy of a dataset, and return what it is.
+    """Make one fault in a copy of a dataset, of any kind or of one, and return what it is.
 
-    Args:
-        root: The copy.
-        canary: Folder outside of it, into which links lead and in which hostile pickles make a folder.
-        dice: Random numbers.
-        only: One of `KINDS`, or None for any.
+    Links lead into the folder `canary` outside, and hostile pickles make a folder there.
     """
     kinds = list(KINDS)
     dice.shuffle(kinds)
+    files = sorted(each for each in root.rglob("*") if each.is_file() and each.name != "truth.npz")  # for the tests
     for kind in kinds if only is None else [only]:
-        told = _FAULTS[kind](root, canary, dice)
-        if told is not None:
-            return f"{kind}: {told}"
+        suffixes, fault = _FAULTS[kind]
+        if fitting := [each for each in files if not suffixes or each.suffix in suffixes]:
+            file = dice.choice(fitting)
+            if told := fault(file, root, canary, dice):
+                return f"{kind}: {told} of {file.relative_to(root)}"
     raise AssertionError("no fault fits")
 
 
-def _missing_camera(root: Path, canary: Path, dice: Random) -> str | None:
+def _missing_camera(file: Path, root: Path, canary: Path, dice: Random) -> str:
     """Take a camera out of a calibration, out of a list of frames, or the intrinsics out of a file."""
-    file = _pick(root, dice, (".json",))
-    if file is None:
-        return None
     content = json.loads(file.read_text())
     if isinstance(content.get("world_2_cam"), dict):
         told = dice.choice(sorted(content["world_2_cam"]))
@@ -67,72 +62,54 @@ def _missing_camera(root: Path, canary: Path, dice: Random) -> str | None:
         content["frames"] = [frame for frame in content["frames"] if frame not in gone]
     else:
         owner = dice.choice([content, *content.get("frames", [])])
-        names = ("intrinsics", "world_mat", "transform_matrix", "fl_x", "fx", "cx", "cy")
-        keys = [key for key in owner if key in names]
-        if not keys:
-            return None
-        told = dice.choice(keys)
-        del owner[told]
+        told = dice.choice([key for key in owner if key in _INTRINSICS] or [""])
+        owner.pop(told, None)
     file.write_text(json.dumps(content))
-    return f"{told} of {file.relative_to(root)}"
+    return told
 
 
-def _hostile_pickle(root: Path, canary: Path, dice: Random) -> str | None:
+def _hostile_pickle(file: Path, root: Path, canary: Path, dice: Random) -> str:
     """Put a pickle that runs code where arrays are: in a checkpoint, or as an array of objects."""
-    file, hostile = _pick(root, dice, (*_ARCHIVES, ".npy")), RunsCode(canary / "ran")
-    if file is None:
-        return None
-    if file.suffix == ".frame":
-        arrays = pickle.loads(members_of(file.read_bytes())["archive/data.pkl"])
-        arrays[dice.choice(sorted(arrays))] = dice.choice([hostile, {"exp": hostile}, [hostile]])
-        data = pickle.dumps(hostile if dice.random() < 0.3 else arrays, dice.choice([0, 2, 4]))
-        file.write_bytes(zip_of({"archive/data.pkl": data, "archive/version": b"3\n"}))
-        return f"{file.relative_to(root)}"
-    stored = io.BytesIO()
+    hostile, name = RunsCode(canary / "ran"), "archive/data.pkl"
     objects = np.empty(2, object)
     objects[:] = hostile
-    np.save(stored, objects, allow_pickle=True)
     if file.suffix == ".npy":
-        file.write_bytes(dice.choice([stored.getvalue(), pickle.dumps(hostile)]))
-        return f"{file.relative_to(root)}"
+        file.write_bytes(dice.choice([npy_of(objects), pickle.dumps(hostile)]))
+        return "array"
     members = members_of(file.read_bytes())
-    name = dice.choice(sorted(members))
-    file.write_bytes(zip_of({**members, name: stored.getvalue()}))
-    return f"{name} of {file.relative_to(root)}"
+    if file.suffix == ".frame":
+        arrays = pickle.loads(members[name])
+        arrays[dice.choice(sorted(arrays))] = dice.choice([hostile, {"exp": hostile}, [hostile]])
+        members[name] = pickle.dumps(hostile if dice.random() < 0.3 else arrays, dice.choice([0, 2, 4]))
+    else:
+        name = dice.choice(sorted(members))
+        members[name] = npy_of(objects)
+    file.write_bytes(zip_of(members))
+    return name
 
 
-def _bomb(root: Path, canary: Path, dice: Random) -> str | None:
+def _bomb(file: Path, root: Path, canary: Path, dice: Random) -> str:
     """Put a small archive that unpacks to much in the place of an archive."""
-    file = _pick(root, dice, _ARCHIVES)
-    if file is None:
-        return None
     member = "archive/data.pkl" if file.suffix == ".frame" else dice.choice(sorted(members_of(file.read_bytes())))
     file.write_bytes(bomb_of(member, _BOMB))
-    return f"{member} of {file.relative_to(root)}"
+    return member
 
 
-def _link(root: Path, canary: Path, dice: Random) -> str | None:
-    """Put a link in the place of a file or of a folder: out of the dataset, to itself, or to nothing."""
-    place = dice.choice(sorted(each for each in root.rglob("*") if not each.is_symlink()))
+def _link(file: Path, root: Path, canary: Path, dice: Random) -> str:
+    """Put a link in the place of a file or of its folder: out of the dataset, to itself, or to nothing."""
+    place = dice.choice([file, *(each for each in file.parents if root in each.parents)])
     aside = canary / f"moved{place.suffix}"
     target = dice.choice([canary / "file", canary, aside, place, root / "nothing", Path("/"), Path("..")])
-    if target == aside and not aside.exists():
-        place.rename(aside)  # the link leads to what was there, and yet it leads out
-    elif place.is_dir():
-        place.rename(root.parent / f"{root.name}-aside")
+    if target == aside or place.is_dir():  # the link leads to what was there, and yet it leads out
+        place.rename(aside if target == aside else root.parent / f"{root.name}-aside")
     else:
         place.unlink()
     place.symlink_to(target)
-    return f"{place.relative_to(root)} to {target}"
+    return f"{place.name} to {target}"
 
 
-_FAULTS: dict[str, Callable[[Path, Path, Random], str | None]] = {
-    "camera": _missing_camera, "pickle": _hostile_pickle, "bomb": _bomb, "link": _link,
+_FAULTS: dict[str, tuple[tuple[str, ...], Callable[[Path, Path, Path, Random], str]]] = {
+    "camera": ((".json",), _missing_camera), "pickle": ((".frame", ".npz", ".npy"), _hostile_pickle),
+    "bomb": ((".frame", ".npz"), _bomb), "link": ((), _link),
 }  # fmt: skip
 KINDS = tuple(_FAULTS)
-
-
-def _pick(root: Path, dice: Random, suffixes: tuple[str, ...]) -> Path | None:
-    files = sorted(each for each in root.rglob("*") if each.is_file() and each.suffix in suffixes)
-    files = [each for each in files if each.name != "truth.npz"]  # belongs to the tests
-    return dice.choice(files) if files else None

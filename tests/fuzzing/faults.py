@@ -10,26 +10,14 @@ from pathlib import Path
 from random import Random
 
 from damage import flip_or_cut
-from fuzzing.edges import CANARY, DEEP, PORT, playlists
 from fuzzing.formats import FORMATS
-from fuzzing.kinds import faulty_bytes
+from fuzzing.kinds import CANARY, DEEP, PORT, faulty_bytes
 from fuzzing.repairs import repair_around
 
 DAMAGE = "damage"
 """Name of the faults that a checksum must notice."""
-
-
 SPARSE = 3 << 30
 """Size in bytes of a file that takes no room on the disk."""
-NAMES = (
-    "take:1", "http:x", f"http:127.0.0.1:{PORT}", "file:x", "concat:a|b", "pipe:1", "data:,x", "-", "--help", "-i",
-    "a b", " ", "...", "%d", "%06d", "%s%n",
-    "a\nb", "a\x1b]0;own\x07\x1b[31m", "\x9b31m", "a\rb", "\x7f", "\u202eabc", "größer", "x" * 240, "con", "*", "?",
-    "[a]", "{a,b}", "~", "$HOME", "`id`",
-    "a'b", 'a"b', "\\", "@x", "#x", "<script>mien_fuzz(1)</script>".replace("/", "∕"), "\udcff", "\u2028", "é",
-    ".hidden", "capture.json",
-)  # fmt: skip
-"""Names of files without their ending. None has a slash."""
 
 
 @dataclass
@@ -53,26 +41,20 @@ class Place:
 
 def faulty_file(place: Place, dice: Random) -> str:
     """Damage a file, put something else in its place, or make a fault of its format with correct checksums."""
-    chance = dice.random()
-    if chance < 0.12:
-        place.file.write_bytes(flip_or_cut(place.file.read_bytes(), dice))
-        return DAMAGE
-    return faulty_place(place, dice) if chance < 0.22 else faulty_format(place, dice)
-
-
-def faulty_without_damage(place: Place, dice: Random) -> str:
-    """Make a fault, but no unrepaired damage, for files that may also be read from elsewhere."""
-    return faulty_place(place, dice) if dice.random() < 0.3 else faulty_format(place, dice)
+    if dice.random() > 0.12:
+        return any_fault(place, dice, 0.12)
+    place.file.write_bytes(flip_or_cut(place.file.read_bytes(), dice))
+    return DAMAGE
 
 
 def faulty_place(place: Place, dice: Random) -> str:
-    """Put something else where the file is."""
     return "place: " + put_something_else(place.file, place.canary, dice)
 
 
-def any_fault(place: Place, dice: Random) -> str:
-    """Make any fault."""
-    return faulty_place(place, dice) if place.file.is_dir() or dice.random() < 0.4 else faulty_format(place, dice)
+def any_fault(place: Place, dice: Random, elsewhere: float = 0.35) -> str:
+    """Make a fault, but no unrepaired damage, for folders and files that may also be read from elsewhere."""
+    chosen = faulty_place if place.file.is_dir() or dice.random() < elsewhere else faulty_format
+    return chosen(place, dice)
 
 
 def faulty_new_name(place: Place, dice: Random) -> str:
@@ -83,28 +65,7 @@ def faulty_new_name(place: Place, dice: Random) -> str:
     return kind
 
 
-def rename(place: Place, dice: Random) -> str:
-    """Give the file an odd name."""
-    name = dice.choice(NAMES).replace(PORT, str(place.port)) + place.file.suffix
-    place.file = place.file.rename(place.file.with_name(name))
-    return ascii(place.file.stem)[:30]
-
-
-def write_playlist(place: Place, dice: Random) -> str:
-    """Write a list of other files under a video's name."""
-    clip = place.canary / "clip.mp4"
-    if not clip.exists():
-        clip.write_bytes(place.file.read_bytes())
-    names = ("clip.mp4", f"{CANARY}/clip.mp4", f"file:{CANARY}/clip.mp4", f"http://127.0.0.1:{PORT}/x.mp4",
-             f"tcp://127.0.0.1:{PORT}", "concat:clip.mp4|clip.mp4")  # fmt: skip
-    ending, text = dice.choice(list(playlists(dice.choice(names)).items()))
-    place.file = place.file.with_name(f"list{dice.choice((ending, '.mp4', '.mov', '.avi', '.png'))}")
-    place.write(text.encode())
-    return ending
-
-
 def faulty_format(place: Place, dice: Random) -> str:
-    """Make a fault of the file's own format."""
     kind, data = FORMATS.get(place.file.suffix, faulty_bytes)(place.file.read_bytes(), dice)
     place.write(data)
     return kind
@@ -154,15 +115,15 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _socket(path: Path, canary: Path, was_folder: bool) -> None:
+def _socket(path: Path) -> None:
     # The path of a socket may have only a hundred characters, so it is made from within its folder.
     with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as made:
         made.bind(path.name[:90])
 
 
-def _sparse(path: Path, canary: Path, was_folder: bool) -> None:
-    with path.open("wb") as file:
-        file.truncate(SPARSE)
+def _sparse(path: Path) -> None:
+    path.touch()
+    os.truncate(path, SPARSE)
 
 
 def _victim(path: Path, canary: Path, was_folder: bool = False) -> Path:
@@ -176,22 +137,21 @@ PLACES: dict[str, Callable[[Path, Path, bool], object]] = {
     "folder": lambda path, canary, was_folder: path.write_bytes(b"text") if was_folder else path.mkdir(),
     "full folder": lambda path, canary, was_folder: (path / "a" / "b").mkdir(parents=True),
     "pipe": lambda path, canary, was_folder: os.mkfifo(path),
-    "socket": _socket,
+    "socket": lambda path, canary, was_folder: _socket(path),
     "link outside": lambda path, canary, was_folder: path.symlink_to(_victim(path, canary, was_folder)),
     "link upwards": lambda path, canary, was_folder: path.symlink_to(
-        os.path.relpath(_victim(path, canary), path.parent)
-    ),
+        os.path.relpath(_victim(path, canary), path.parent)),
     "link beyond": lambda path, canary, was_folder: path.symlink_to(canary / f"new{path.suffix}"),
     "link to itself": lambda path, canary, was_folder: path.symlink_to(path.name),
     "endless": lambda path, canary, was_folder: path.symlink_to("/dev/zero"),
     "null": lambda path, canary, was_folder: path.symlink_to("/dev/null"),
-    "sparse": _sparse,
+    "sparse": lambda path, canary, was_folder: _sparse(path),
     "text": lambda path, canary, was_folder: path.write_text(f"{{}} {DEEP}"),
-}
+}  # fmt: skip
 """Things that may lie in the place of a file or folder."""
 
 
-def _changed(change: Callable[[bytes], bytes]) -> Callable[[Place], str]:
+def _damaged(change: Callable[[bytes], bytes]) -> Callable[[Place], str]:
     def fault(place: Place) -> str:
         place.file.write_bytes(change(place.file.read_bytes()))
         return DAMAGE
@@ -203,31 +163,20 @@ def _placed(kind: str) -> Callable[[Place], str]:
     return lambda place: put_something_else(place.file, place.canary, Random(0), kind)
 
 
-def _with_a_bit(data: bytes) -> bytes:
-    middle = len(data) // 3
-    return data[:middle] + bytes([data[middle] ^ 4]) + data[middle + 1 :]
+def _flipped(data: bytes, at: int, bit: int) -> bytes:
+    changed = bytearray(data)
+    changed[at] ^= bit
+    return bytes(changed)
 
 
 FIXED: dict[str, Callable[[Place], str]] = {
-    **{
-        kind: _placed(kind)
-        for kind in ("missing", "empty", "folder", "pipe", "link outside", "link beyond", "endless", "sparse", "text")
-    },
-    "cut": _changed(lambda data: data[: len(data) // 2]),
-    "a bit": _changed(_with_a_bit),
-    "the first byte": _changed(lambda data: bytes([data[0] ^ 1]) + data[1:]),
-    "the last byte": _changed(lambda data: data[:-1] + bytes([data[-1] ^ 1])),
-    "zeros": _changed(lambda data: bytes(len(data))),
-}
+    **{kind: _placed(kind) for kind in (
+        "missing", "empty", "folder", "pipe", "link outside", "link beyond", "endless", "sparse", "text")},
+    "cut": _damaged(lambda data: data[: len(data) // 2]),
+    "a bit": _damaged(lambda data: _flipped(data, len(data) // 3, 4)),
+    "the first byte": _damaged(lambda data: _flipped(data, 0, 1)),
+    "the last byte": _damaged(lambda data: _flipped(data, -1, 1)),
+    "zeros": _damaged(lambda data: bytes(len(data))),
+}  # fmt: skip
 """Damage that every reader gets."""
-_KINDS = (
-    *PLACES,
-    "link outside",
-    "link outside",
-    "link beyond",
-    "moved out",
-    "moved out",
-    "swapped",
-    "copied",
-    "twice",
-)
+_KINDS = (*PLACES, *("link outside", "link beyond") * 2, *("moved out",) * 2, "swapped", "copied", "twice")

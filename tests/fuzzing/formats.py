@@ -16,77 +16,108 @@ import numpy as np
 import safetensors.numpy
 
 from damage import flip_or_cut
-from fuzzing.edges import INTEGERS, SMALL_PICKLES, USD_LINES, edge_number, packed_integer, put
-from fuzzing.kinds import (
-    edge_for,
-    entries,
-    faulty_array,
-    faulty_bytes,
-    faulty_json,
-    faulty_lines,
-    faulty_list,
-    faulty_text,
-    faulty_value,
-    written,
-)
-from fuzzing.repairs import joined, repair_glb, repair_portable, repair_tensors, split
+from fuzzing import kinds
+from fuzzing.kinds import INTEGERS, SMALL_PICKLES, USD_LINES, edge_number, packed_integer, put
+from fuzzing.repairs import joined, repair_glb, repair_portable, repair_tensors, split, with_checksum
 
 Fault = Callable[[bytes, Random], tuple[str, bytes]]
 
 
+def faulty_json(data: bytes, dice: Random) -> tuple[str, bytes]:
+    """Make a fault in a json file: in its text, or in its values with a checksum that is mostly correct."""
+    if dice.random() < 0.15:
+        return kinds.faulty_text(data, dice)
+    content = json.loads(data)
+    checksum = content.pop("checksum", None) if isinstance(content, dict) else None
+    frame = {}
+    if isinstance(content, dict) and dice.random() < 0.8:
+        frame = {name: content.pop(name) for name in ("format", "version") if name in content}
+    kind, content = kinds.faulty_value(content, dice)
+    if isinstance(content, dict):
+        content = {**frame, **content}
+        chance = dice.random()
+        if checksum is not None and chance < 0.75:
+            content = with_checksum(content)
+        elif checksum is not None and chance > 0.9:
+            content["checksum"] = checksum
+    return kind, kinds.written(content, dice)
+
+
+def faulty_lines(data: bytes, dice: Random) -> tuple[str, bytes]:
+    lines = data.splitlines()
+    index = dice.choice((dice.randrange(len(lines)), len(lines) - 1, len(lines) - 1))
+    kind, lines[index] = faulty_json(lines[index], dice)
+    lines[index] = lines[index].replace(b"\n", b" ")
+    lines += [lines[index]] * dice.choice((0, 0, 0, 1, 1000))
+    return kind, b"\n".join(lines) + dice.choice((b"\n", b"\n", b""))
+
+
+def faulty_members(
+    members: dict[str, Any], dice: Random, fault: Callable[[str, Any], tuple[str, Any]]
+) -> tuple[str, dict[str, Any]]:
+    """Make a fault in a member, in its name, or in the list of them."""
+    name, kind = dice.choice(list(members)), dice.choice(("member",) * 8 + ("list", "name"))
+    if kind == "list":
+        return kind, dict(zip(members, kinds.faulty_list(list(members.values()), dice), strict=False))
+    if kind == "name":
+        odd = ("../x", "/x", f"{name}.npy", f"{name}s", "", "a\x1b[31m", "f" * 10_000, "__metadata", *members)
+        return kind, {**{key: one for key, one in members.items() if key != name}, dice.choice(odd): members[name]}
+    told, changed = fault(name, members[name])
+    return f"{name[:20]} {told}", {**members, name: changed}
+
+
 def faulty_tensors(data: bytes, dice: Random) -> tuple[str, bytes]:
     """Make one fault in a safetensors file. Checksums are not repaired here."""
-    kind = dice.choice((*("array",) * 9, "list", "name", *("header",) * 4, "length"))
+    kind = dice.choice(("arrays",) * 11 + ("header",) * 4 + ("length",))
     header, body = split(data)
-    kept = {"__metadata__": header["__metadata__"]} if "__metadata__" in header else {}
-    if kind in ("array", "list", "name"):
+    if kind == "arrays":
         arrays = dict(sorted(safetensors.numpy.load(data).items()))  # in a fixed order
-        name = dice.choice(list(arrays))
-        if kind == "array":
-            told, arrays[name] = faulty_array(arrays[name], dice)
-            kind = f"array {told}"
-        elif kind == "list":
-            values = faulty_list(list(arrays.values()), dice)
-            arrays = dict(zip(arrays, values, strict=False))
-        else:
-            arrays[dice.choice((name + "s", "", "x" * 10_000, "a\x1b[31m", "__metadata", *arrays))] = arrays.pop(name)
+        kind, arrays = faulty_members(arrays, dice, lambda name, array: kinds.faulty_array(array, dice))
+        kept = {"__metadata__": header["__metadata__"]} if "__metadata__" in header else {}
         header, body = split(safetensors.numpy.save(arrays))
         return kind, joined({**kept, **header}, body)
     if kind == "header":
-        told, header = faulty_value(header, dice)
-        return f"header {told}", joined(written(header, dice), body)
+        told, header = kinds.faulty_value(header, dice)
+        return f"header {told}", joined(kinds.written(header, dice), body)
     length = dice.choice((*INTEGERS[:20], len(data), len(data) - 8, len(data) - 7)) % 2**64
     return kind, length.to_bytes(8, "little") + data[8:]
 
 
+def faulty_repaired_tensors(data: bytes, dice: Random) -> tuple[str, bytes]:
+    kind, data = faulty_tensors(data, dice)
+    return kind, repair_tensors(data)
+
+
 def faulty_portable(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Make a fault in a .mien file: in its arrays, or in its content."""
     if dice.random() < 0.5:
         kind, data = faulty_tensors(data, dice)
         return kind, repair_portable(data)
-    kind, content = faulty_value(json.loads(split(data)[0]["__metadata__"]["mien"])["content"], dice)
+    kind, content = kinds.faulty_value(json.loads(split(data)[0]["__metadata__"]["mien"])["content"], dice)
     return f"content {kind}", repair_portable(data, content)
 
 
 def faulty_npy(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Make a fault in a .npy file: in its array, or in its header."""
     if dice.random() < 0.6:
-        kind, array = faulty_array(np.load(io.BytesIO(data)), dice)
+        kind, array = kinds.faulty_array(np.load(io.BytesIO(data)), dice)
         return kind, npy_of(array)
     size = int.from_bytes(data[8:10], "little")
     odd = ("", "{", "__import__('os')", "(" * 5000, "{'descr': 1}", "1" * 5000)
-    kinds = ("|O", "<f8", ">f4", "<U1000", "<c16", "[('a', '<f4')]", "<M8[s]", "x")
+    types = ("|O", "<f8", ">f4", "<U1000", "<c16", "[('a', '<f4')]", "<M8[s]", "x")
     shapes = (*((one,) for one in INTEGERS[:23]), (), (-1,), (1.5,), "x", (1,) * 40, (5_000_000_000, 3))
-    made = f"{{'descr': {dice.choice(kinds)!r}, 'fortran_order': False, 'shape': {dice.choice(shapes)!r}, }}"
+    made = f"{{'descr': {dice.choice(types)!r}, 'fortran_order': False, 'shape': {dice.choice(shapes)!r}, }}"
     _, text = dice.choice(
-        (("", dice.choice(odd).encode()), ("", made.encode()), faulty_text(data[10 : 10 + size], dice))
+        (("", dice.choice(odd).encode()), ("", made.encode()), kinds.faulty_text(data[10 : 10 + size], dice))
     )
     text = text[:65_000]
-    return "header", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text + b"\n" + data[10 + size :]
+    return "header", npy_head(text) + data[10 + size :]
+
+
+def npy_head(text: bytes) -> bytes:
+    """Return what stands before the numbers of a .npy file."""
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text + b"\n"
 
 
 def npy_of(array: np.ndarray) -> bytes:
-    """Return a .npy file."""
     out = io.BytesIO()
     np.save(out, array)
     return out.getvalue()
@@ -99,7 +130,6 @@ def zeros(amount: int) -> bytes:
 
 
 def members_of(data: bytes) -> dict[str, bytes]:
-    """Return the members of a zip archive by name."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         return {info.filename: archive.read(info) for info in archive.infolist()}
 
@@ -126,27 +156,21 @@ def bomb_of(name: str, amount: int, head: bytes = b"") -> bytes:
 
 def faulty_zip(data: bytes, dice: Random) -> tuple[str, bytes]:
     """Make a fault in a member of an archive by its own kind, or in the archive around it."""
-    members, kind = (
-        members_of(data),
-        dice.choice((*("member",) * 7, "list", "name", "bytes", "bytes", "method", "bomb")),
-    )
-    name, method = dice.choice(list(members)), zipfile.ZIP_STORED
-    if kind == "member":
-        told, members[name] = FORMATS.get(Path(name).suffix, faulty_bytes)(members[name], dice)
-        kind = f"{name[:20]} {told}"
-    elif kind == "list":
-        members = dict(zip(members, faulty_list(list(members.values()), dice), strict=False))
-    elif kind == "name":
-        members[dice.choice(("../x", "/x", f"{name}.npy", "", "a\x1b[31m", "f" * 5000))] = members.pop(name)
-    elif kind == "bomb":
-        amount = dice.choice((1 << 30, 3 << 30, 6 << 30))
-        head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({amount // 12}, 3), }}\n".encode()
-        head = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head if name.endswith(".npy") else b""
-        return kind, bomb_of(name, amount, head)
-    elif kind == "method":
-        method = dice.choice((zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2))
-    whole = zip_of(members, method)
-    return (kind, faulty_bytes(whole, dice, 150)[1]) if kind == "bytes" else (kind, whole)
+
+    def fault(name: str, content: bytes) -> tuple[str, bytes]:
+        return FORMATS.get(Path(name).suffix, kinds.faulty_bytes)(content, dice)
+
+    members, kind = members_of(data), dice.choice(("members",) * 9 + ("bytes", "bytes", "method", "bomb"))
+    if kind == "members":
+        kind, members = faulty_members(members, dice, fault)
+        return kind, zip_of(members)
+    if kind == "bomb":
+        name, amount = dice.choice(list(members)), dice.choice((1 << 30, 3 << 30, 6 << 30))
+        head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({amount // 12}, 3), }}"
+        return kind, bomb_of(name, amount, npy_head(head.encode()) if name.endswith(".npy") else b"")
+    if kind == "method":
+        return kind, zip_of(members, dice.choice((zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2)))
+    return kind, kinds.faulty_bytes(zip_of(members), dice, 150)[1]
 
 
 def _gzip_of_zeros(head: bytes, amount: int) -> bytes:
@@ -165,8 +189,8 @@ def faulty_spz(data: bytes, dice: Random) -> tuple[str, bytes]:
     if kind == "bomb":
         return kind, _gzip_of_zeros(plain, dice.choice((1 << 30, 6 << 30)))
     if kind == "gzip":
-        return kind, faulty_bytes(data, dice, 30)[1]
-    told, plain = faulty_bytes(plain, dice, 16) if kind == "inner" else (kind, plain)
+        return kind, kinds.faulty_bytes(data, dice, 30)[1]
+    told, plain = kinds.faulty_bytes(plain, dice, 16) if kind == "inner" else (kind, plain)
     return told, gzip.compress(plain, 1, mtime=0) * (dice.choice((2, 1000)) if kind == "members" else 1)
 
 
@@ -175,18 +199,18 @@ def _faulty_header(content: Any, body: bytes, dice: Random) -> tuple[str, bytes,
     kind = dice.choice(("value",) * 6 + ("numbers", "cut", "text"))
     if kind == "numbers":
         for _ in range(dice.choice((1, 30))):
-            number = edge_for(np.dtype("<f4"), dice).tobytes()
+            number = kinds.edge_for(np.dtype("<f4"), dice).tobytes()
             body = put(body, 4 * dice.randrange(len(body) // 4), number)
     elif kind == "cut":
         body = dice.choice((body[: dice.randrange(len(body))], b"\xff" * len(body), body + body))
     elif kind == "text":
-        return kind, faulty_text(json.dumps(content).encode(), dice)[1], body
+        return kind, kinds.faulty_text(json.dumps(content).encode(), dice)[1], body
     else:
-        large = [place for place in entries(content) if isinstance(place[0][place[1]], (dict, list))]
+        large = [place for place in kinds.entries(content) if isinstance(place[0][place[1]], (dict, list))]
         container, key = dice.choice([({"": content}, ""), *large[:200]])
-        kind, container[key] = faulty_value(container[key], dice)
+        kind, container[key] = kinds.faulty_value(container[key], dice)
         content = container[key] if key == "" else content
-    return kind, written(content, dice), body
+    return kind, kinds.written(content, dice), body
 
 
 def faulty_packed(data: bytes, dice: Random) -> tuple[str, bytes]:
@@ -216,7 +240,6 @@ def faulty_glb(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def png_of(chunks: Sequence[tuple[bytes, bytes]]) -> bytes:
-    """Return a PNG with these chunks and correct checksums."""
     parts = [struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
              for name, body in chunks]  # fmt: skip
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
@@ -238,25 +261,23 @@ def faulty_png(data: bytes, dice: Random) -> tuple[str, bytes]:
         size = int.from_bytes(data[at : at + 4], "big")
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
         at += 12 + size
+    (_, head), *others = chunks
+    raw = zlib.decompress(b"".join(body for name, body in chunks if name == b"IDAT"))
+    lines = (raw[: len(raw) // 2], raw + raw, b"", bytes([dice.randrange(256)]) * len(raw), raw[1:])
+    at, side = dice.randrange(len(chunks) + 1), dice.choice((20_000, 30_000, 60_000))
+    changes: dict[str, Callable[[], list[tuple[bytes, bytes]]]] = {
+        "size": lambda: [(b"IHDR", put(head, dice.choice((0, 4)), struct.pack(">I", dice.choice(_SIDES)))), *others],
+        "header": lambda: [
+            (b"IHDR", put(head, dice.randrange(8, 13), bytes([dice.choice((0, 1, 2, 3, 6, 7, 16, 255))]))), *others],
+        "pixels": lambda: [chunks[0], (b"IDAT", dice.choice((zlib.compress, bytes))(dice.choice(lines))), chunks[-1]],
+        "extra": lambda: [*chunks[:at], dice.choice(_CHUNKS), *chunks[at:]],
+        "list": lambda: kinds.faulty_list(chunks, dice),
+        "bomb": lambda: [
+            (b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)),
+            (b"IDAT", b"\x78\x9c" + zeros(side * (side // 8 + 1) + (1 << 20)) + bytes(4)), chunks[-1]],
+    }  # fmt: skip
     kind = dice.choice(("size", "header", "pixels", "extra", "list", "bytes") * 3 + ("bomb",))
-    head, pixels = chunks[0][1], b"".join(body for name, body in chunks if name == b"IDAT")
-    if kind == "size":
-        chunks[0] = chunks[0][0], put(head, dice.choice((0, 4)), struct.pack(">I", dice.choice(_SIDES)))
-    elif kind == "header":
-        chunks[0] = chunks[0][0], put(head, dice.randrange(8, 13), bytes([dice.choice((0, 1, 2, 3, 6, 7, 16, 255))]))
-    elif kind == "pixels":
-        raw = zlib.decompress(pixels)
-        raw = dice.choice((raw[: len(raw) // 2], raw + raw, b"", bytes([dice.randrange(256)]) * len(raw), raw[1:]))
-        chunks = [chunks[0], (b"IDAT", dice.choice((zlib.compress(raw), raw))), chunks[-1]]
-    elif kind == "bomb":
-        side = dice.choice((20_000, 30_000, 60_000))
-        packed = b"\x78\x9c" + zeros(side * (side // 8 + 1) + (1 << 20)) + bytes(4)
-        chunks = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", packed), chunks[-1]]
-    elif kind == "extra":
-        chunks.insert(dice.randrange(len(chunks) + 1), dice.choice(_CHUNKS))
-    elif kind == "list":
-        chunks = faulty_list(chunks, dice)
-    return (kind, faulty_bytes(data, dice)[1]) if kind == "bytes" else (kind, png_of(chunks))
+    return kind, png_of(changes[kind]()) if kind in changes else kinds.faulty_bytes(data, dice)[1]
 
 
 _OPERATIONS = (*(bytes([one]) for one in b"(]}NtRb.02Q\x93\x81oeua"), b"cos\nsystem\n", b"cbuiltins\neval\n",
@@ -274,7 +295,7 @@ def faulty_pickle(data: bytes, dice: Random) -> tuple[str, bytes]:
         index = dice.randrange(len(operations))
         one = operations[index]
         if kind == "list":
-            operations = faulty_list(operations, dice) or operations
+            operations = kinds.faulty_list(operations, dice) or operations
         elif kind == "insert":
             operations[index : index + dice.randrange(2)] = [dice.choice(_OPERATIONS)]
         elif kind == "argument" and len(one) > 1:
@@ -284,28 +305,23 @@ def faulty_pickle(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Make a fault in the header of a .ply, or in its numbers."""
     head, mark, body = data.partition(b"end_header\n")
     if dice.random() < 0.6:
         numbers = " ".join(str(edge_number(dice)) for _ in range(dice.choice((0, 1, 16, 17, 10_000))))
         lines = (f"comment mien frame {numbers}", f"comment T_world_local {numbers}", "property list uchar int x",
                  "property double x", "element face 9", f"element vertex {edge_number(dice)}", "format ascii 1.0",
                  "format binary_big_endian 1.0", *head.decode("latin1").splitlines())  # fmt: skip
-        kind, head = faulty_text(head, dice, lines)
+        kind, head = kinds.faulty_text(head, dice, lines)
     else:
         kind, _, body = _faulty_header({}, body, dice)
     return kind, head + dice.choice((mark,) * 9 + (b"", b"end_header\r\n", b"x" * 1_000_000)) + body
 
 
 FORMATS: dict[str, Fault] = {
-    ".json": faulty_json, ".partial": faulty_lines, ".csv": faulty_text, ".ply": faulty_ply, ".npy": faulty_npy,
-    ".safetensors": lambda data, dice: _repaired(*faulty_tensors(data, dice)), ".mien": faulty_portable,
+    ".json": faulty_json, ".partial": faulty_lines, ".csv": kinds.faulty_text, ".ply": faulty_ply, ".npy": faulty_npy,
+    ".safetensors": faulty_repaired_tensors, ".mien": faulty_portable,
     **dict.fromkeys((".npz", ".sog", ".usdz", ".frame"), faulty_zip), ".spz": faulty_spz, ".packed": faulty_packed,
     ".glb": faulty_glb, ".png": faulty_png, ".pkl": faulty_pickle,
-    ".usda": lambda data, dice: faulty_text(data, dice, USD_LINES),
+    ".usda": lambda data, dice: kinds.faulty_text(data, dice, USD_LINES),
 }  # fmt: skip
 """Faults by the ending of a file; others get faults of their bytes."""
-
-
-def _repaired(kind: str, data: bytes) -> tuple[str, bytes]:
-    return kind, repair_tensors(data)

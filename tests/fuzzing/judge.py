@@ -13,15 +13,17 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
+from torch import Tensor, nn
+
 from fuzzing import uses
-from fuzzing.content import content_of
-from fuzzing.edges import SCRIPT
 from fuzzing.faults import DAMAGE, FIXED, Place, outside_of
+from fuzzing.kinds import SCRIPT
 from fuzzing.material import copy_of
 from fuzzing.targets import TARGETS, Target
 from fuzzing.values import SANE, VALUES, concrete, edit
@@ -38,7 +40,7 @@ _LARGEST_FILE = 4 << 30
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e]")
 
 
-@dataclass(frozen=True)
+@dataclass
 class Bench:
     """Folders in which cases run."""
 
@@ -51,18 +53,10 @@ class Bench:
     expected: dict[str, Any] = field(default_factory=dict)
     """Content of undamaged files, by target and file."""
 
-    @property
-    def root(self) -> Path:
-        return self.folder / "case"
-
-    @property
-    def canary(self) -> Path:
-        return self.folder / "outside"
-
-    @property
-    def told(self) -> Path:
+    def __post_init__(self) -> None:
+        self.root, self.canary = self.folder / "case", self.folder / "outside"
+        self.told = self.folder / "told.txt"
         """File with the output of the case."""
-        return self.folder / "told.txt"
 
     def patience(self) -> float:
         """Return the seconds after which a case hangs; they are longer if others keep the machine busy."""
@@ -87,11 +81,11 @@ class Result:
     """Verdict on a case."""
 
     case: str
-    """Name of the case: TARGET:SEED:NUMBER."""
+    """TARGET:SEED:NUMBER."""
     kind: str = ""
     """Kind of the fault."""
     outcome: str = ""
-    """Outcome: refused, accepted or finding."""
+    """refused, accepted or finding."""
     findings: list[str] = field(default_factory=list)
     message: str = ""
     cause: str = ""
@@ -105,7 +99,6 @@ class Result:
 
 
 def limit_this_process() -> None:
-    """Set the limits that hold for all cases of a process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -121,10 +114,9 @@ def run_case(case: str, bench: Bench) -> Result:
     copy_of(bench.material, target.needs, bench.root)
     files = sorted(path for path in bench.root.glob(target.files) if not path.is_dir() or "**" in target.files)
     place = Place(bench.root, files[int(number) % len(files)], bench.canary, bench.listener.getsockname()[1])
-    if seed.isdigit():
-        return judge(target, Result(case), bench, place, lambda: target.fault(place, dice), dice)
-    if seed in FIXED:
-        return judge(target, Result(case), bench, place, lambda: FIXED[seed](place), dice)
+    if seed.isdigit() or seed in FIXED:
+        fault = (lambda: FIXED[seed](place)) if seed in FIXED else lambda: target.fault(place, dice)
+        return judge(target, Result(case), bench, place, fault, dice)
     row, _, index = seed.partition("/")
     rows = [SANE[name]] if row == "sane" else concrete(VALUES[name][int(row)], place.file)
     where, value = rows[int(index or 0)]
@@ -182,17 +174,35 @@ def _expected(target: Target, file: Path, bench: Bench) -> Any:
     return bench.expected[key]
 
 
+def content_of(value: Any) -> Any:
+    """Return a value in a form that can be compared."""
+    if isinstance(value, nn.Module):
+        return content_of(dict(value.state_dict()))
+    if isinstance(value, Tensor):
+        return content_of(value.detach().numpy())
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if is_dataclass(value):
+        return {field.name: content_of(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {name: content_of(item) for name, item in value.items()}
+    return [content_of(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
 def snapshot(bench: Bench) -> dict[str, Any]:
-    """Return the state of everything outside of the copies."""
     found: dict[str, Any] = {}
     for folder in (bench.canary, bench.folder / "here", bench.folder / "home"):
-        for path in sorted([folder, *folder.rglob("*")]):
-            status, whole = path.lstat(), path.is_file() and not path.is_symlink()
-            small = whole and status.st_size < _LARGEST_FILE / 64
-            digest = hashlib.sha256(path.read_bytes()).hexdigest() if small else None
+        for path in (folder, *folder.rglob("*")):
+            status = path.lstat()
+            digest = hashlib.sha256(path.read_bytes()).hexdigest() if _is_small(path) else None
             changed = None if path.is_dir() else status.st_mtime_ns
             found[str(path.relative_to(bench.folder))] = status.st_mode, digest, changed
     return found
+
+
+def _is_small(path: Path) -> bool:
+    """Return whether it is a file that may be read: a fault may have made it longer than memory."""
+    return path.is_file() and not path.is_symlink() and path.stat().st_size < _LARGEST_FILE / 64
 
 
 def _judge_traces(result: Result, bench: Bench, before: dict[str, Any]) -> None:
@@ -221,9 +231,8 @@ def _judge_traces(result: Result, bench: Bench, before: dict[str, Any]) -> None:
         result.traceback.append(f"printed: {ascii(told[-300:])}")
     for report in bench.root.rglob("*.html"):
         with contextlib.suppress(OSError):
-            # A fault may have made it longer than memory.
-            if report.is_file() and not report.is_symlink() and report.stat().st_size < _LARGEST_FILE / 64:
-                result.findings += ["script"] * (SCRIPT in report.read_text(errors="replace"))
+            if _is_small(report) and SCRIPT in report.read_text(errors="replace"):
+                result.findings.append("script")
 
 
 def faults_of_message(message: str, root: str) -> list[str]:
@@ -239,10 +248,8 @@ def faults_of_message(message: str, root: str) -> list[str]:
 
 def _add_traceback(result: Result, error: BaseException) -> None:
     frames = traceback.extract_tb(error.__traceback__)
-    result.traceback = [
-        f"{Path(frame.filename).name}:{frame.lineno} {frame.name}: {(frame.line or '').strip()[:120]}"
-        for frame in frames[-6:]
-    ]
+    places = [f"{Path(frame.filename).name}:{frame.lineno} {frame.name}: {frame.line or ''}" for frame in frames]
+    result.traceback = [place[:160] for place in places[-6:]]
     last = [frame for frame in frames if "/mien/" in frame.filename][-1:] or frames[-1:]
     where = f"{Path(last[0].filename).name}:{last[0].name}"
     if type(error).__name__ == "CommandError":

@@ -8,6 +8,7 @@ import argparse
 import itertools
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -20,8 +21,9 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from safetensors.numpy import load_file
+
 from forked import Forked, ForkServer
-from fuzzing.same_bytes import differing_files, hidden_files
 from mien.lab.synthetic import RECIPES, write_synthetic_video
 
 CLIP, FRAMES, SIDE = "clip.mp4", 10, 192
@@ -64,10 +66,9 @@ class Tally:
     findings: list[dict[str, Any]] = field(default_factory=list)
 
     def table(self) -> str:
-        """Return the kills as a table of Markdown."""
         rows = ["| stage | SIGKILL | SIGTERM | SIGINT | chains | findings |", "|---|---|---|---|---|---|"]
         for stage in STAGES:
-            counts = [self.kills[stage, name] for name in ("SIGKILL", "SIGTERM", "SIGINT")]
+            counts = [self.kills[stage, number.name] for number in SIGNALS]
             found = sum(each["stage"] == stage for each in self.findings)
             rows.append(f"| {' | '.join(map(str, [stage, *counts, self.chains[stage], found]))} |")
         more = f"{self.kills.total()} kills; {self.late} signals came too late; at most {self.slowest:.1f} s from one "
@@ -78,56 +79,40 @@ class Place:
     """A folder in which commands run, always under the same path, and the files of the uninterrupted commands."""
 
     def __init__(self, folder: Path, server: ForkServer) -> None:
-        self.box, self._kept, self._server = folder / "box", folder / "kept", server
-        self.seconds: dict[str, float] = {}
-
-    def make_reference(self) -> None:
         """Draw a clip and run all stages undisturbed; keep the files before and after each."""
-        recipe = RECIPES["demo"]
+        self.box, self.kept, self._server = folder / "box", folder / "kept", server
+        began, recipe = time.monotonic(), RECIPES["demo"]
+        subprocess.run([sys.executable, "-c", "import mien.commands.stages.evaluating"], check=True)
+        self.seconds = {"start": time.monotonic() - began}
         self.box.mkdir(parents=True)
         small = replace(recipe, seconds=FRAMES / recipe.fps, width=SIDE, height=SIDE, supersample=1, texture_size=256)
         write_synthetic_video(small, self.box / CLIP, 0)
         for stage in STAGES:
-            shutil.copytree(self.box, self._kept / f"before {stage}")
+            shutil.copytree(self.box, self.kept / f"before {stage}")
             began = time.monotonic()
-            code, told, _ = self.run(stage, apart=False)
+            code, told, _ = self.run(stage)
             self.seconds[stage] = time.monotonic() - began
             assert code == 0, f"{stage}: exit code {code}\n{told[-2000:]}"
-            shutil.copytree(self.box, self._kept / f"after {stage}")
-
-    def begin(self, stage: str) -> None:
-        """Put the files there that an uninterrupted command found."""
-        shutil.rmtree(self.box)
-        shutil.copytree(self._kept / f"before {stage}", self.box)
-
-    def differences(self, stage: str) -> list[str]:
-        """Return the names of the files that are not as an uninterrupted command leaves them."""
-        return differing_files(self._kept / f"after {stage}", self.box)
+            shutil.copytree(self.box, self.kept / f"after {stage}")
 
     def run(
-        self, stage: str, apart: bool, number: int = signal.SIGKILL, moment: float = _TO_FINISH
+        self, stage: str, apart: bool = False, number: int = signal.SIGKILL, moment: float = _TO_FINISH
     ) -> tuple[int | None, str, float]:
-        """Run a stage's command, which gets a signal at a moment.
+        """Run a stage's command, as a fork or as a new process (`apart`), which gets a signal at a moment in seconds.
 
-        Args:
-            stage: name of the stage.
-            apart: whether the command is a new process.
-            number: the signal.
-            moment: seconds from the start.
-
-        Returns:
-            The exit code (None if it hangs), what it told, and its seconds after the signal (-1 without one).
+        Return the exit code (None if it hangs), what it told, and its seconds after the signal.
         """
         start = self._server.call("fuzzing.kills:run_anew", STAGES[stage], cwd=self.box, exits=True) if apart else None
         command = start or self._server.mien(*STAGES[stage], cwd=self.box)
-        if _ended(command, moment):
-            return command.poll(), command.stdout + command.stderr, -1.0
         sent = time.monotonic()
-        command.send_signal(number)
-        hangs = not _ended(command, _TO_END)
-        command.kill()
-        code = command.wait()
-        return None if hangs else code, command.stdout + command.stderr, time.monotonic() - sent
+        if not _ended(command, moment):
+            sent = time.monotonic()
+            command.send_signal(number)
+            hangs = not _ended(command, _TO_END)
+            command.kill()
+            if hangs:
+                return None, command.stdout + command.stderr, _TO_END
+        return command.wait(), command.stdout + command.stderr, time.monotonic() - sent
 
 
 def run_anew(words: list[str]) -> None:
@@ -144,48 +129,93 @@ def _ended(command: Forked, seconds: float) -> bool:
 
 
 def run_chain(case: str, stage: str, place: Place, tally: Tally) -> None:
-    """Kill a command once or several times, let it finish, and compare what it leaves."""
-    dice, told, faults = Random(case), [], []
-    place.begin(stage)
-    hard = False
+    """Put the files there that an uninterrupted command found, kill it up to five times, let it finish, and compare."""
+    dice, told, faults, hard = Random(case), [], [], False
+    shutil.rmtree(place.box)
+    shutil.copytree(place.kept / f"before {stage}", place.box)
     for _ in range(dice.randint(1, 5)):
         number, apart = dice.choice(list(SIGNALS)), dice.random() < _APART
         moment = dice.uniform(0, _LATE * (place.seconds[stage] + (place.seconds["start"] if apart else 0)))
         code, text, after = place.run(stage, apart, number, moment)
-        told.append(f"{signal.Signals(number).name} after {moment:.2f} s{', apart' * apart}: {code}; {text[-1500:]}")
+        told.append(f"{number.name} after {moment:.2f} s{', apart' * apart}: {code}; {text[-1500:]}")
         if code == 0:
             # It took less time than the last one: other programs may have used the cores then.
             place.seconds[stage] = min(place.seconds[stage], moment)
             tally.late += 1
             continue
-        tally.kills[stage, signal.Signals(number).name] += 1
+        tally.kills[stage, number.name] += 1
         hard |= number == signal.SIGKILL
-        if number != signal.SIGKILL:
-            tally.slowest = max(tally.slowest, after)
+        tally.slowest = max(tally.slowest, after if number != signal.SIGKILL else 0)
         faults += _faults(number, code, text)
     began = time.monotonic()
-    code, text, _ = place.run(stage, apart=False)
+    code, text, _ = place.run(stage)
     place.seconds[stage] = max(place.seconds[stage], time.monotonic() - began)
     told.append(f"then: {code}; {text[-1500:]}")
     tally.chains[stage] += 1
-    faults += [f"other bytes: {name}" for name in place.differences(stage)] if code == 0 else ["does not go on"]
-    left = hidden_files(place.box)
+    other = differing_files(place.kept / f"after {stage}", place.box)
+    faults += [f"other bytes: {name}" for name in other] if code == 0 else ["does not go on"]
+    left = sorted(hidden_files(place.box))
     tally.leftovers += len(left) if hard else 0
-    if left and not hard:
-        faults.append(f"left: {', '.join(sorted(left)[:5])}")
+    faults += [f"left: {', '.join(left[:5])}"] if left and not hard else []
     if faults:
         tally.findings.append({"case": case, "stage": stage, "faults": faults, "told": told})
 
 
-def _faults(number: int, code: int | None, told: str) -> list[str]:
+def _faults(number: signal.Signals, code: int | None, told: str) -> list[str]:
     if code is None:
         return ["hangs"]
-    if code == SIGNALS[signal.Signals(number)]:
+    if code == SIGNALS[number]:
         lines = [line for line in told.splitlines() if line.startswith("mien: ")]
         quiet = number == signal.SIGKILL or len(lines) == 1
         return ([] if quiet else ["not one line"]) + (["traceback"] if "Traceback" in told else [])
     # Before and after the work, a signal ends a process as it ends any other.
     return [] if code == -number else [f"exit code {code}"]
+
+
+# What two folders differ in, apart from what a clock or a meter has measured
+
+_MEASURED = frozenset({"seconds", "seconds_per_frame", "step_ms_median", "peak_memory_mb", "fingerprint", "checksum"})
+"""Entries of json files: times and memory, the times of files in a cache's fingerprint, and the sum over all."""
+_MEASURED_TENSORS = frozenset({"step_ms", "curves.step_ms", "seconds", "peak_memory_mb"})
+_MEASURED_TEXT = r"<b>[\d.]+ (?:m?s|min \d+ s)</b>|Peak memory [\d,.]+ MB|<h3>Step time, ms</h3>.*?</svg>"
+"""Times, memory, and a chart of times."""
+
+
+def differing_files(one: Path, other: Path) -> list[str]:
+    """Return the names of the visible files in which two folders differ. Of checkpoints, both must have one: a stop
+    leaves one of its own."""
+    ours, theirs = visible_files(one), visible_files(other)
+    alone = sorted(name for name in ours ^ theirs if "/checkpoints/" not in name)
+    return alone + [name for name in sorted(ours & theirs) if not _same(one / name, other / name)]
+
+
+def visible_files(folder: Path) -> set[str]:
+    paths = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+    return {str(path) for path in paths if not any(part.startswith(".") for part in path.parts)}
+
+
+def hidden_files(folder: Path) -> set[str]:
+    """Return the paths of what is hidden: unfinished files, locks and kept pieces."""
+    return {str(path.relative_to(folder)) for path in folder.rglob(".*")}
+
+
+def _same(one: Path, other: Path) -> bool:
+    return one.read_bytes() == other.read_bytes() or _content(one) == _content(other)
+
+
+def _content(path: Path) -> Any:
+    if path.suffix == ".json":
+        return json.loads(path.read_text(), object_hook=_without_measured)
+    if path.suffix == ".safetensors":
+        tensors = load_file(path).items()
+        return {name: (one.dtype, one.shape, one.tobytes()) for name, one in tensors if name not in _MEASURED_TENSORS}
+    if path.suffix == ".html":
+        return re.sub(_MEASURED_TEXT, "", path.read_text(), flags=re.DOTALL)
+    return path.read_bytes()
+
+
+def _without_measured(entries: dict[str, Any]) -> dict[str, Any]:
+    return {name: each for name, each in entries.items() if name not in _MEASURED}
 
 
 def main() -> int:
@@ -202,8 +232,6 @@ def main() -> int:
     until = None if asked.minutes is None else time.monotonic() + 60 * asked.minutes
     with tempfile.TemporaryDirectory(prefix="mien-kills-") as folder, ForkServer() as server:
         place = Place(Path(folder), server)
-        place.make_reference()
-        place.seconds["start"] = _seconds_of_start()
         for chain in itertools.count():
             if sum(tally.kills.values()) >= asked.kills or (until is not None and time.monotonic() > until):
                 break
@@ -218,12 +246,6 @@ def main() -> int:
     for each in tally.findings:
         print(f"{each['case']}: {'; '.join(each['faults'])}")
     return int(bool(tally.findings))
-
-
-def _seconds_of_start() -> float:
-    began = time.monotonic()
-    subprocess.run([sys.executable, "-c", "import mien.commands.stages.evaluating"], check=True)
-    return time.monotonic() - began
 
 
 if __name__ == "__main__":

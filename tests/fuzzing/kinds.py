@@ -1,6 +1,7 @@
-"""Make faults of every kind of content: bytes, lists, texts, values of json and arrays."""
+"""Values at edges that break readers, and faults of every kind of content: bytes, lists, texts, json and arrays."""
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from random import Random
@@ -8,19 +9,93 @@ from typing import Any
 
 import numpy as np
 
-from fuzzing.edges import (
-    DEEP,
-    FLOATS,
-    INTEGERS,
-    LITERALS,
-    TEXTS,
-    edge_integer,
-    edge_number,
-    edge_value,
-    packed_integer,
-    put,
-)
-from fuzzing.repairs import with_checksum
+INTEGERS = (
+    0, 1, -1, 2, 7, 255, 256, 65535, 65536, 2**24 + 1, 4 * 10**8, 2**31 - 1, 2**31, -(2**31), 2**32 - 1, 2**32,
+    2**53 + 1, 2**63 - 1, 2**63, -(2**63), 2**64 - 1, 2**64, 10**400, -(10**400),
+)  # fmt: skip
+FLOATS = (math.nan, math.inf, -math.inf, 3e38, -3e38, 3.5e38, 1e308, 1e-320, -0.0, 0.5, 1e16, 1e-9, 1e30, -1e30)
+CANARY, PORT = "@CANARY@", "@PORT@"
+"""Placeholders for the folder that nothing may be written into, and for the port that nothing may connect to."""
+DEEP = "@DEEP"
+"""Placeholder for nested brackets; the digits after it give the depth."""
+SCRIPT = "<script>mien_fuzz(1)</script>"
+"""Text that must be escaped in every report."""
+TEXTS = (
+    "", " ", "text", "0", "nan", "null", "x" * 300, "x" * 100_000, "a\nb", "\x1b]0;own\x07\x1b[31mred", "a\x00b",
+    "\u202eabc", "\ud800", "\x9b31m", "..", ".", "/", "../../x", "../" * 12 + "etc/passwd", f"{CANARY}/victim.json",
+    f"../../../..{CANARY}/victim", "C:\\x", "con", "-", "--help", "a:b", f"http://127.0.0.1:{PORT}/x", "%s%n", "{0}",
+    SCRIPT, "größer", "\U0001f600", "é" * 200,
+)  # fmt: skip
+LITERALS = (
+    "NaN", "inf", "-inf", "1e400", "-1e999", "3e38", "9" * 400, "9" * 5000, "0x10", "01", "1.", ".5", "1e", "--1",
+    "1_0", "\u0663", "1,5", "1.2.3", "=1+1", "x" * 200_000, "99:59:59:59", "-1:0:0:0", "0:0:0:1e9",
+    "9" * 400 + ":0:0:0", "0:0:0:0." + "9" * 400, "24:00:00:00", "0:00:00;29", "\u0663:00:00:00", "5000:0:0:0",
+    ":::", "double", "uchar", "int",
+)  # fmt: skip
+"""Words of a text that is no json."""
+USD_LINES = tuple(line.replace("{name}", name) for name in ("other.usda", f"{CANARY}/x.usda") for line in (
+    "subLayers = [@{name}@]", "references = @{name}@", "payload = @{name}@", 'def "a" ( references = @{name}@ ) {}',
+    "asset file = @{name}@", "point3f[] positions.timeSamples = { 0: [(1, 2, 3)] }", "float[] opacities = [inf]",
+    "point3f[] positions.connect = </avatar.x>", 'variants = { string v = "x" }',
+    "matrix4d xformOp:transform = ((1,0,0,0),(0,1,0,0),(0,0,1,0),(0,0,0,nan))",
+))  # fmt: skip
+_TEBIBYTE = (1 << 40).to_bytes(8, "little")
+SMALL_PICKLES = {
+    "bytes of a tebibyte": b"\x80\x04\x8e" + _TEBIBYTE + b".",
+    "a bytearray of a tebibyte": b"\x80\x05\x96" + _TEBIBYTE + b".",
+    "a text of a tebibyte": b"\x80\x04\x8d" + _TEBIBYTE + b".",
+    "a frame of a tebibyte": b"\x80\x04\x95" + _TEBIBYTE + b"N.",
+    "a memo of two billion": b"]r\xff\xff\xff\x7f.",
+    "a memo of digits": b"]p" + b"9" * 4000 + b"\n.",
+    "a number of two gigabytes": b"\x8b\xff\xff\xff\x7f.",
+    "digits": b"I" + b"9" * 10_000 + b"\n.",
+    "a doubled tuple": b"}(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"u.",
+    "a doubled tuple for a key": b"}(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"N" + b"u.",
+    "a doubled set": b"\x8f(X\x01\x00\x00\x00a" + b"2\x86" * 200 + b"\x90.",
+    "thousands of dictionaries": b"}" * 20_000 + b".",
+    "names without end": b"ca\nb\n" * 20_000 + b".",
+    "nested lists": b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b".",
+    "a stack that is empty": b"0.",
+    "a mark that is missing": b"t.",
+    "marks": b"(" * 10**5 + b".",
+    "a persistent name": b"Pname\n.",
+    "an extension": b"\x82\x01.",
+    "a cycle": b"}(X\x01\x00\x00\x00fca\nb\n)\x81q\x01}X\x01\x00\x00\x00xh\x01sbu.",
+}
+"""Pickles that ask for much memory or time."""
+_DEPTHS = (2, 100, 500, 990, 1000, 5000, 100_000)
+
+
+def edge_integer(dice: Random) -> int:
+    return dice.choice(INTEGERS) + dice.choice((0, 0, 0, 1, -1))
+
+
+def edge_number(dice: Random) -> int | float:
+    return edge_integer(dice) if dice.random() < 0.5 else dice.choice(FLOATS)
+
+
+def edge_value(dice: Random) -> Any:
+    kind = dice.randrange(8)
+    if kind < 3:
+        return edge_number(dice)
+    if kind < 5:
+        return dice.choice(TEXTS)
+    if kind == 5:
+        return f"{DEEP}{dice.choice(_DEPTHS)}"
+    return dice.choice(
+        (None, True, False, [], {}, [[]], [None], {"": 0}, [0] * 1000, [[0, 0], [0]], {"tensor": "x"}, {"kind": "x"})
+    )
+
+
+def packed_integer(dice: Random, size: int, order: str = "little") -> bytes:
+    """Return an edge as an unsigned field of this many bytes."""
+    value = edge_integer(dice) if dice.random() < 0.8 else dice.getrandbits(8 * size)
+    return (value % (1 << 8 * size)).to_bytes(size, "little" if order == "little" else "big")
+
+
+def put(data: bytes, at: int, field: bytes) -> bytes:
+    return data[:at] + field + data[at + len(field) :]
+
 
 # Bytes, lists and texts -----------------------------------------------------------------------------------------------
 
@@ -46,7 +121,6 @@ def faulty_bytes(data: bytes, dice: Random, head: int = 512) -> tuple[str, bytes
 
 
 def faulty_list(items: Sequence[Any], dice: Random) -> list[Any]:
-    """Remove, repeat, swap or shuffle items."""
     items, kind = list(items), dice.choice(("remove", "double", "swap", "shuffle", "cut"))
     one, other = dice.randrange(len(items)), dice.randrange(len(items))
     if kind == "remove":
@@ -64,18 +138,14 @@ _TOKEN = re.compile(r"[^\s,\[\]{}()\"=]+")
 
 
 def faulty_text(data: bytes, dice: Random, lines: tuple[str, ...] = ()) -> tuple[str, bytes]:
-    """Make a fault in a text: in its words and numbers, its lines, its columns or its encoding.
-
-    Args:
-        data: The text.
-        dice: Random numbers.
-        lines: Lines that may be inserted.
-    """
+    """Make a fault in a text: in its words and numbers, its lines (some may be inserted), columns or encoding."""
     text = data.decode("utf-8", "replace")
     kind = dice.choice(("token",) * 6 + ("lines", "lines", "columns", "encoding", "encoding", "deep") + ("insert",) * 3)
     if kind == "token":
         found = list(_TOKEN.finditer(text))
-        for one in reversed(sorted(dice.sample(found, min(len(found), dice.choice((1, 1, 3, 20)))), key=_start)):
+        for one in reversed(
+            sorted(dice.sample(found, min(len(found), dice.choice((1, 1, 3, 20)))), key=re.Match.start)
+        ):
             other = dice.choice((*LITERALS, *TEXTS, repr(edge_number(dice)), *(dice.choice(found)[0],) * 20))
             text = text[: one.start()] + other + text[one.end() :]
     elif kind == "lines" and text:
@@ -92,10 +162,6 @@ def faulty_text(data: bytes, dice: Random, lines: tuple[str, ...] = ()) -> tuple
         text = dice.choice((nested(dice.choice((900, 1000, 100_000))), "\n" * 100_000, "," * 100_000, ""))
     whole = text.encode("utf-8", "surrogatepass")
     return kind, _faulty_encoding(whole, dice) if kind == "encoding" else whole
-
-
-def _start(found: "re.Match[str]") -> int:
-    return found.start()
 
 
 def _faulty_encoding(data: bytes, dice: Random) -> bytes:
@@ -172,38 +238,7 @@ def written(value: Any, dice: Random) -> bytes:
 
 
 def nested(depth: int) -> str:
-    """Return brackets nested in brackets."""
     return "[" * depth + "]" * depth
-
-
-def faulty_json(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Make a fault in a json file: in its text, or in its values with a checksum that is mostly correct."""
-    if dice.random() < 0.15:
-        return faulty_text(data, dice)
-    content = json.loads(data)
-    checksum = content.pop("checksum", None) if isinstance(content, dict) else None
-    frame = {}
-    if isinstance(content, dict) and dice.random() < 0.8:
-        frame = {name: content.pop(name) for name in ("format", "version") if name in content}
-    kind, content = faulty_value(content, dice)
-    if isinstance(content, dict):
-        content = {**frame, **content}
-        chance = dice.random()
-        if checksum is not None and chance < 0.75:
-            content = with_checksum(content)
-        elif checksum is not None and chance > 0.9:
-            content["checksum"] = checksum
-    return kind, written(content, dice)
-
-
-def faulty_lines(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Make a fault in one of the json lines of a file."""
-    lines = data.splitlines()
-    index = dice.choice((dice.randrange(len(lines)), len(lines) - 1, len(lines) - 1))
-    kind, lines[index] = faulty_json(lines[index], dice)
-    lines[index] = lines[index].replace(b"\n", b" ")
-    lines += [lines[index]] * dice.choice((0, 0, 0, 1, 1000))
-    return kind, b"\n".join(lines) + dice.choice((b"\n", b"\n", b""))
 
 
 # Arrays ---------------------------------------------------------------------------------------------------------------
@@ -211,24 +246,28 @@ def faulty_lines(data: bytes, dice: Random) -> tuple[str, bytes]:
 _KINDS = (np.float64, np.float32, np.float16, np.int64, np.int32, np.int8, np.uint8, np.uint64, np.bool_)
 
 
+_SIDES = (0, 2**20, 2**31, 2**32 + 4, 2**40, 2**57)
+"""Sides of arrays without numbers."""
+
+
 def faulty_array(array: np.ndarray, dice: Random) -> tuple[str, np.ndarray]:
     """Change the size, the axes, the type or some numbers of an array."""
     kind = dice.choice(
-        (*("numbers",) * 6, "scaled", "longer", "shorter", "none", "type", "type", "axis", "flat", "turn")
+        ("numbers",) * 6 + ("scaled", "longer", "shorter", "none", "type", "type", "axis", "flat", "turn")
     )
     axis = dice.randrange(max(1, array.ndim))
-    if kind in ("numbers", "scaled") and array.size:
-        flat = array.reshape(-1).copy()
-        some = [dice.randrange(flat.size) for _ in range(dice.choice((1, 1, 3, 30)))]
-        places: Any = slice(None) if dice.random() < 0.2 else some
-        with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):
+        if kind in ("numbers", "scaled") and array.size:
+            flat = array.reshape(-1).copy()
+            some = [dice.randrange(flat.size) for _ in range(dice.choice((1, 1, 3, 30)))]
+            places: Any = slice(None) if dice.random() < 0.2 else some
             factor = np.array(dice.choice((-1, 2, 100))).astype(flat.dtype) if flat.dtype.kind in "fiu" else 1
             flat[places] = flat[places] * factor if kind == "scaled" else edge_for(flat.dtype, dice)
-        return kind, flat.reshape(array.shape)
-    with np.errstate(all="ignore"):
+            return kind, flat.reshape(array.shape)
         changes: dict[str, Callable[[], np.ndarray]] = {
             "longer": lambda: np.repeat(array, dice.choice((2, 3)), axis=axis if array.ndim else None),
-            "shorter": lambda: array[: len(array) // 2] if array.ndim else array[None],
+            "shorter": lambda: array[: dice.choice((len(array) // 2, -1))] if array.ndim else array[None],
+            "huge": lambda: np.empty((0, dice.choice(_SIDES), *array.shape[2:]), array.dtype),
             "none": lambda: np.take(array, [], axis=axis if array.ndim else None),
             "type": lambda: array.astype(dice.choice(_KINDS)),
             "axis": lambda: array[None] if dice.random() < 0.5 else array[..., None],
@@ -238,7 +277,6 @@ def faulty_array(array: np.ndarray, dice: Random) -> tuple[str, np.ndarray]:
 
 
 def edge_for(dtype: np.dtype, dice: Random) -> Any:
-    """Return a number at an edge of a type."""
     if dtype.kind == "f":
         with np.errstate(all="ignore"):
             return np.array(dice.choice(FLOATS)).astype(dtype)

@@ -1,28 +1,27 @@
 """Command lines of all sub-commands on faulty workspaces, with values at edges and little memory or disk."""
 
-import dataclasses
-import importlib
+import contextlib
+import functools
+import io
 import os
+import re
 import resource
 import shlex
 import signal
-import types
-from collections.abc import Iterator
 from pathlib import Path
 from random import Random
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
-
-import tyro
+from typing import Any
 
 from fuzzing import faults
-from fuzzing.edges import LITERALS, PORT, TEXTS
 from fuzzing.faults import Place
-from fuzzing.uses import run_line, run_words
+from fuzzing.kinds import LITERALS, PORT, TEXTS
+from fuzzing.uses import run_words
+from mien import cli
 from mien.avatar import METHODS
 from mien.cli import COMMANDS
 
 PARTS = ("given", "pictures", "videos", "flame", "gaussian_avatars", "flame_avatars", "head.mien", "head.ply", "cache")
-LINES = (
+_BASES = (
     "render {W} --out {root}/o.png --width 16 --height 16", "render {W} --out {root}/o.png --size 16 --path captured",
     "render {W} --out {root}/o.png --size 16 --sequence clip", "export {W} --out {root}/o.ply",
     "render {W} --out {root}/o_%03d.png --size 16 --frames 2", "export {W} --out {root}/o.mien",
@@ -30,11 +29,8 @@ LINES = (
     "export {W} --out {root}/o --format gaussian-avatars",
     "evaluate {W} --no-perceptual", "evaluate {W} --compare", "evaluate {W} --compare --json",
     "train {W} --steps 1 --run other", "train {W} --steps 1 --run toy", "track {W} --again", "track {W}",
-    "track {W} --hold-out clip", "face-models", "face-models --json", "analyze gaussian-avatars {W} --parts growth",
-    "analyze gaussian-avatars {W} --parts growth --json",
-)  # fmt: skip
-_BASES = (
-    *LINES, "render {W} --out {root}/o.webm --size 16 --frames 2 --background transparent",
+    "track {W} --hold-out clip", "face-models --json", "analyze gaussian-avatars {W} --parts growth",
+    "render {W} --out {root}/o.webm --size 16 --frames 2 --background transparent",
     "render {W} --cameras {root}/given/cameras.json --out {root}/o_%d.png",
     "drive {W} --by {root}/given/take.csv --out {root}/o.mp4 --size 16",
     "drive {W} --by {root}/given/take.json --out {root}/o.mp4 --size 16",
@@ -56,30 +52,17 @@ _PATHS = (
     "a\x1b[31m.png", "a\nb.mp4", "größer.png", "\udcff.png", "%s.png", "%d%d.png", "o.png", "o.mp4", "o.webm", "o.ply",
     "o.json", "o.html", "o", "o_%06d.png", "out/deep/o.png", "W/o.png", "head.ply/x.png", "/dev/full", "/proc/x.png",
 )  # fmt: skip
-_METHODS: dict[str, Any] = {"method": Literal[tuple(METHODS)], "methods": tuple[Literal[tuple(METHODS)], ...]}
-
-
-def run_a_line(root: Path, found: Any, dice: Random) -> None:
-    """Run one command on the faulty workspace, in this process."""
-    run_line(dice.choice(LINES), root)
-
-
-def run_an_import(root: Path, found: Any, dice: Random) -> None:
-    """Import the faulty folder, in this process, and draw what was made of it."""
-    run_line("import {root}/gaussian_avatars --out {root}/new" + dice.choice(("", " --run other")), root)
-    run_line("render {root}/new --out {root}/o.png --size 16 --timestep 1", root)
 
 
 def faulty_or_not(place: Place, dice: Random) -> str:
-    """Make a fault in the workspace of some lines."""
-    return faults.any_fault(place, dice) if dice.random() < 0.4 else "none"
+    return faults.any_fault(place, dice) if dice.random() < 0.6 else "none"
 
 
 def run_an_odd_line(root: Path, found: Any, dice: Random) -> None:
     """Run a command with some odd options, sometimes on a full disk or with little memory."""
     words = [word.format(W=root / "W", root=root) for word in shlex.split(dice.choice(_BASES))]
-    options = list(options_of(words[0]))
-    for _ in range(dice.choice((0, 1, 1, 2)) if options else 0):
+    options = options_of(words[0]) if words[0] in COMMANDS else []
+    for _ in range(dice.choice((0, 0, 1, 2)) if options else 0):
         words += _with_value(dice.choice(options), dice)
     if dice.random() < 0.1:
         words[dice.randrange(len(words))] = dice.choice((*TEXTS[:40], *_PATHS, *COMMANDS))
@@ -101,47 +84,30 @@ def run_an_odd_line(root: Path, found: Any, dice: Random) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def options_of(command: str) -> Iterator[tuple[str, Any]]:
-    """Yield all options of a sub-command with their types, as tyro derives them from its classes."""
-    if command in COMMANDS:
-        yield from _options(importlib.import_module(f"mien.commands.{command.replace('-', '_')}").Command, "")
+@functools.cache
+def options_of(command: str) -> list[tuple[str, str]]:
+    """Return all options of a sub-command with what they take, as its help says them."""
+    told = io.StringIO()
+    with contextlib.redirect_stdout(told), contextlib.suppress(SystemExit):
+        cli.main([command, "--help-all"])
+    return re.findall(r"^ +(--[a-z][\w.-]*) ?(\[?(?:\{[^}\s]+\}|INT|FLOAT|STR|PATH)(?: \[)?|)", told.getvalue(), re.M)
 
 
-def _options(kind: type, prefix: str) -> Iterator[tuple[str, Any]]:
-    hints = get_type_hints(kind, include_extras=True)
-    for each in dataclasses.fields(kind):
-        hint, name, more = hints[each.name], each.name, ()
-        if get_origin(hint) is Annotated:
-            hint, *more = get_args(hint)
-        for extra in more:
-            name = getattr(extra, "name", None) if getattr(extra, "name", None) is not None else name
-        if any(extra is tyro.conf.Positional for extra in more):
-            continue
-        inner = [one for one in (hint, *get_args(hint)) if isinstance(one, type) and dataclasses.is_dataclass(one)]
-        inner += [get_args(one)[0] for one in get_args(hint) if get_origin(one) is Annotated]
-        for one in inner:
-            yield from _options(one, f"{prefix}{name}." if name else prefix)
-        if not inner:
-            yield f"--{prefix}{name}".replace("_", "-"), _METHODS.get(each.name, hint)
-
-
-def _with_value(option: tuple[str, Any], dice: Random) -> list[str]:
-    name, hint = option
-    if hint is bool:
+def _with_value(option: tuple[str, str], dice: Random) -> list[str]:
+    name, kind = option
+    if not kind:
         return [dice.choice((name, name.replace("--", "--no-", 1)))]
-    count = dice.choice((0, 1, 1, 2, 30)) if get_origin(hint) is tuple else 1
-    return [name, *(_value(hint, dice) for _ in range(count))]
+    count = dice.choice((0, 1, 1, 2, 30)) if kind.endswith("[") else 1
+    return [name, *(_value(kind.strip("[ "), dice) for _ in range(count))]
 
 
-def _value(hint: Any, dice: Random) -> str:
-    if get_origin(hint) in (tuple, Union, types.UnionType):
-        return _value(next(one for one in get_args(hint) if one is not type(None)), dice)
+def _value(kind: str, dice: Random) -> str:
     if dice.random() < 0.04:
         return dice.choice((*TEXTS[:40], *LITERALS, *_PATHS))
-    if get_origin(hint) is Literal:
-        return dice.choice(list(map(str, get_args(hint))))
-    if hint in (int, float):
+    if kind.startswith("{"):
+        return dice.choice(kind.strip("{}").split(","))
+    if kind in ("INT", "FLOAT"):
         return dice.choice((*LITERALS, "0", "-1", "2147483648", *("1", "2", "3", "16", "20") * 5))
-    if hint is Path:
+    if kind == "PATH":
         return dice.choice(_PATHS)
-    return dice.choice((*TEXTS[:40], "clip", "toy", "anny", "drop=0.5", "drop=nan", "white", "#12345", "jawOpen=1"))
+    return dice.choice((*TEXTS[:40], *METHODS, "clip", "toy", "anny", "drop=0.5", "drop=nan", "white", "jawOpen=1"))

@@ -6,7 +6,6 @@ import pickle
 import shutil
 import subprocess
 import wave
-from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,9 +14,11 @@ from typing import Any
 import av
 import cv2
 import numpy as np
+import pytest
 import torch
 
 import train_toy
+from capture_helpers import write_rig
 from flame_like import write_pickle
 from fuzzing.formats import npy_of, zip_of
 from mien.avatar import METHODS, Avatar, as_array, bake_rig, load_avatar, make_portable, write_avatar
@@ -54,7 +55,7 @@ from mien.training import read_face_track
 from photometric_case import make_photometric_case, make_textured_model
 from plain_settings import plain_config
 from recordings import LAYOUTS
-from toy_scene import toy_camera, toy_face_model, toy_sequence
+from toy_scene import sphere, toy_camera, toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 from what_users_give import write_what_users_give
 
@@ -72,14 +73,14 @@ _WEB = Path(__file__).parents[2] / "web"
 def make_material(root: Path, whole: bool = True) -> None:
     """Write everything below `root`, with the same bytes every time on one machine.
 
-    Args:
-        root: The folder.
-        whole: Whether to write what takes seconds as well: the pieces of a tracking, and the runtime of pages.
+    What takes seconds is only there if it is to be `whole`: the pieces of a tracking, and the runtime of pages.
     """
     torch.set_num_threads(1)
     root.mkdir(parents=True, exist_ok=True)
     write_toy_workspace(root / "W")
-    _evaluate_and_keep_the_partial_file(root)
+    with pytest.MonkeyPatch.context() as kept:
+        kept.setattr(PartialScores, "remove", lambda self: None)
+        evaluate(root / RUN, [root / SEQUENCE], QUICK)
     avatar = load_avatar(root / RUN)
     write_portable(root / "head.mien", make_portable(avatar, toy_camera(32), "toy"))
     track = read_face_track(root / RUN, avatar.face_model)
@@ -95,26 +96,16 @@ def make_material(root: Path, whole: bool = True) -> None:
     _write_sounds(root / "sounds")
     _write_study(root / "study")
     _write_configs(root / "configs", root / RUN)
-    _write_rig(root / "rig")
+    one = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
+    bent = {"id": "08", **one, "offset": 2, "distortion": [0.1, -0.05, 0.001, 0.0, 0.0]}
+    (root / "rig").mkdir()
+    write_rig(root / "rig" / "rig.json", {"id": "00", **one}, bent)
     (root / "takes").mkdir()
     for write in (write for writers in LAYOUTS.values() for write in writers):
         write(root / "takes", [{"jawOpen": index / 8, "eyeBlinkLeft": 0.5} for index in range(4)])
     if whole:
         _write_pieces(root / PIECES)
         _write_packed(root)
-
-
-def quick_material(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
-    """Return a folder with what is made quickly, which is for reading. `made_once` is the fixture of that name."""
-    return made_once("material", lambda folder: make_material(folder, whole=False))
-
-
-def _evaluate_and_keep_the_partial_file(root: Path) -> None:
-    removed, PartialScores.remove = PartialScores.remove, lambda self: None  # type: ignore[method-assign]
-    try:
-        evaluate(root / RUN, [root / SEQUENCE], QUICK)
-    finally:
-        PartialScores.remove = removed  # type: ignore[method-assign]
 
 
 def _write_pictures(folder: Path) -> None:
@@ -141,8 +132,8 @@ def _write_face_models(folder: Path) -> None:
 def tiny_flame() -> dict[str, np.ndarray]:
     """Return a head of 200 vertices in FLAME's schema: an egg with two eyeballs, four identities, three expressions."""
     dice = np.random.default_rng(0)
-    egg, egg_faces = _ball(14, 12)
-    ball, ball_faces = _ball(6, 5)
+    egg, egg_faces = map(as_array, sphere(12, 14, margin=0.1))
+    ball, ball_faces = map(as_array, sphere(5, 6, margin=0.1))
     sides = [ball * 0.013 + np.array([x, 0.02, 0.08]) for x in (0.032, -0.032)]
     template = np.concatenate([egg * np.array([0.075, 0.12, 0.09]), *sides])
     faces = np.concatenate([egg_faces, ball_faces + len(egg), ball_faces + len(egg) + len(ball)])
@@ -162,20 +153,6 @@ def tiny_flame() -> dict[str, np.ndarray]:
         "posedirs": dice.normal(0, 1e-4, (v, 3, 36)).astype(np.float32), "J_regressor": regressor, "weights": weights,
         "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]], np.int64), "identities": np.array(4),
     }  # fmt: skip
-
-
-def _ball(around: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
-    polar, angle = np.meshgrid(
-        np.linspace(0.1, np.pi - 0.1, rings), np.arange(around) * 2 * np.pi / around, indexing="ij"
-    )
-    points = np.stack([np.sin(polar) * np.sin(angle), np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1).reshape(
-        -1, 3
-    )
-    ring, column = (axis.reshape(-1) for axis in np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij"))
-    first, second = ring * around + column, ring * around + (column + 1) % around
-    return points, np.concatenate(
-        [np.stack([first, first + around, second], 1), np.stack([second, first + around, second + around], 1)]
-    )
 
 
 def _write_flame(root: Path) -> None:
@@ -200,7 +177,6 @@ def _write_videos(folder: Path) -> None:
 
 
 def new_avatar(method: str) -> Avatar:
-    """Return an untrained avatar of a method on the toy head."""
     face_model, sequence = toy_sequence(5, 32)
     torch.manual_seed(0)
     return METHODS[method].avatar(plain_config(method), face_model, sequence.tracking.face)
@@ -263,14 +239,6 @@ def _write_sounds(folder: Path) -> None:
             container.mux(stream.encode())
 
 
-def _write_rig(folder: Path) -> None:
-    folder.mkdir()
-    K = [[40.0, 0.0, 16.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]
-    one = {"K": K, "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
-    cameras = [{"id": "00", **one}, {"id": "08", **one, "offset": 2, "distortion": [0.1, -0.05, 0.001, 0.0, 0.0]}]
-    (folder / "rig.json").write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": cameras}))
-
-
 def _write_study(folder: Path) -> None:
     """Write the key of a study of two runs and two clips, and the answers of one participant."""
     folder.mkdir()
@@ -299,23 +267,19 @@ def _write_configs(folder: Path, run: Path) -> None:
 def _write_pieces(folder: Path) -> None:
     """Write every piece of a tracking that was stopped, none of them dropped, and its capture."""
     capture = make_photometric_case(4).capture
-    drop, forget = StageCache.drop, StageCache.forget
-    StageCache.drop = StageCache.forget = lambda *_: None  # type: ignore[method-assign, assignment]
-    try:
+    with pytest.MonkeyPatch.context() as kept:
+        for name in ("drop", "forget"):
+            kept.setattr(StageCache, name, lambda *_: None)
         track_subject([capture], make_textured_model(), _TRACKING, folder)
-    finally:
-        StageCache.drop, StageCache.forget = drop, forget  # type: ignore[method-assign]
     (folder / "capture.pickle").write_bytes(pickle.dumps(capture))
 
 
 def go_on(folder: Path) -> None:
-    """Continue a tracking from the pieces in a folder."""
     capture = pickle.loads((folder / "capture.pickle").read_bytes())
     track_subject([capture], make_textured_model(), _TRACKING, folder)
 
 
 def copy_of(material: Path, parts: tuple[str, ...], root: Path) -> None:
-    """Make fresh copies of some parts of the material."""
     root.mkdir(parents=True)
     for part in parts:
         (shutil.copytree if (material / part).is_dir() else shutil.copy2)(material / part, root / part)

@@ -58,13 +58,13 @@ class Call:
             return self.maybe(self.array(text[1:]))
         kind = text[0] if text[0] in "=+%<" else ""
         words, _, dtype = text.removeprefix(kind).partition(":")
-        first, *others = words.split()
-        names = others if kind == "<" else [first, *others]
+        names = words.split()
+        most = self.size(names.pop(0)) if kind == "<" else 0
         shape = [self.size(word) for word in names if word != "3?" or self.size(word)]
         if kind == "=":
             return np.zeros(shape, dtype or F32)
         if kind == "<":
-            return self.rng.integers(0, self.size(first), shape).astype(dtype or np.int64)
+            return self.rng.integers(0, most, shape).astype(dtype or np.int64)
         numbers = self.rng.random(shape) if kind == "%" else self.rng.standard_normal(shape)
         return (np.abs(numbers) if kind == "+" else numbers).astype(F32)
 
@@ -98,12 +98,6 @@ class Call:
 def network(c: Call) -> Arguments:
     bases = [c.FeatureBases("n k f", "k", False), c.FeatureBases("j n f", "j", True)]
     return [c.FeatureNetwork("n f", "n x", "h f+x", "h", "o+1 h", "o+1"), bases]
-
-
-def feature_network_backward(c: Call) -> Arguments:
-    layers = "=h f+x", "=h", "=o+1 h", "=o+1"
-    gradients = c.FeatureGradients("n o", "n", "=n f", *layers, "=k+j", "=n x" if c.flag() else "=0 0")
-    return [*network(c), c.FeatureKept("n f", "n h^"), gradients]
 
 
 def factored(c: Call, *others: Any) -> Arguments:
@@ -150,11 +144,6 @@ def posing(c: Call) -> Arguments:
     return [c.make_face_model(*make_face_model(c)), c.FaceArrays("v 3", "j+1 3", "b e", "b j 3", *head)]
 
 
-def pose_face_backward(c: Call) -> Arguments:
-    outputs = c.FaceArrays("=b v 3", "=b j+1 3", "=b e", "=b j 3", "=b 3", "=b 3")
-    return [*posing(c), *c.given("b v 3", "b v 3"), outputs]
-
-
 def rig_forward(c: Call) -> Arguments:
     world = c.WorldShapes("=a n 3", "=a n 4", "=a n 3")
     return c.given("a v 3", "<v t 3", "<t n", c.LocalShapes("n 3", "n 4", "n 3"), "=a t 20", world)
@@ -196,13 +185,13 @@ def view(c: Call) -> Any:
     return c.RasterizeView(gaussians, np.ones(3, F32), viewmat, K, "=H W 3", "=H W", "=g:i4")
 
 
-def rasterize_views(c: Call) -> Arguments:
-    return [[view(Call(c.native, c.rng)) for _ in range(c.size("a"))], c.flag(0.7)]
+def views(c: Call) -> list[Any]:
+    return [view(Call(c.native, c.rng)) for _ in range(c.size("a"))]
 
 
 def rasterize_views_backward(c: Call) -> Arguments:
-    views, tasks = rasterize_views(c)[0], []
-    for own, frame in zip(views, c.native.rasterize_views(views, True), strict=True):
+    drawn, tasks = views(c), []
+    for own, frame in zip(drawn, c.native.rasterize_views(drawn, True), strict=True):
         c.sizes |= dict(zip("HW", own.alpha.shape, strict=True))
         gradients = c.native.GaussianArrays(*(np.zeros_like(array) for array in own.gaussians))
         of_view = f"={len(gradients.means)} 2", "=4 4", "=3 3"
@@ -226,6 +215,11 @@ def fragments(c: Call) -> Arguments:
     return [out, np.ascontiguousarray(points, F32), faces]
 
 
+def drawn(c: Call) -> tuple[Any, Any]:
+    """Return the triangles of pixels and the places in them."""
+    return fragments(c)[0][:2]
+
+
 def with_edges(c: Call) -> Arguments:
     """Return a drawn mesh with all edges of all faces; half of the edges have a second triangle."""
     out, points, faces = fragments(c)
@@ -237,11 +231,6 @@ def with_edges(c: Call) -> Arguments:
     return [out, points, faces, c.native.MeshEdges(*(np.ascontiguousarray(array) for array in arrays))]
 
 
-def interpolated(c: Call, *others: str) -> Arguments:
-    (face_index, barycentric, _), _, faces = fragments(c)
-    return c.given(face_index, barycentric, "V c", faces, *others)
-
-
 def mesh_loss(c: Call) -> Arguments:
     target = c.LossTarget("H W 3", "+H W", 0.1)
     gradients = c.LossGradients("=V 3:f8", "=V 3", "=m n 3", "=9 3:f8")
@@ -249,57 +238,33 @@ def mesh_loss(c: Call) -> Arguments:
     return c.given(*with_edges(c), surface, target, "=H W 3", gradients)
 
 
-def align_surface(c: Call) -> Arguments:
-    return c.given("<V t 3", "%t 3 2", "<2 t:u1", "+G U 3", "+G U", 0.1, 3.0, 0.05)
+SURFACE = ("<V t 3", "%t 3 2", "<2 t:u1", "+G U 3", "+G U", 0.1, 3.0, 0.05)
 
 
 def sighting(c: Call, *others: Any) -> Arguments:
     """Return a surface and a picture of it."""
     seen = c.SightingArrays("V 3", "V 3", *c.camera(), "H W 3", np.ones(c.picture(), F32), "9 3")
-    return c.given(c.AlignSurface(*align_surface(c)), seen, *others)
+    return c.given(c.AlignSurface(*SURFACE), seen, *others)
 
 
-def align_mesh(c: Call) -> Arguments:
-    outputs = c.given(c.AlignDerivatives("V 3 p", "=p p", "=p"), "=H W 3", "=H W 3")
-    return sighting(c, int(c.rng.integers(0, 9)), *(c.maybe(one, 0.7) for one in outputs))
-
-
-def bake_texture(c: Call) -> Arguments:
-    sums = c.TextureSums("=G U", "=G U 3", "=G U 3", "=G U 3")
-    return sighting(c, c.array("<t+1 G U:i4") - np.int32(1), "G U 3", sums)
-
-
-# Training
-
-
-def photometric_loss(c: Call) -> Arguments:
-    target = "<256 H W 3:u1" if c.flag() else "H W 3"
-    return c.given(tuple(c.box()), (0.8, 0.2), "H W 3", target, "?+H W", "?=H W 3", np.zeros((), F32))
-
-
-def adam_update(c: Call) -> Arguments:
-    def task() -> Any:
-        own, steps = Call(c.native, c.rng), np.array(c.rng.integers(0, 9), F32)
-        return own.AdamTask("n d", "n d", "n d", "+n d", steps, 0.01)
-
-    return [[task() for _ in range(c.size("a"))]]
-
-
-def number() -> np.ndarray:
-    return np.zeros((), F32)
+def steps(c: Call) -> np.ndarray:
+    return np.array(c.rng.integers(0, 9), F32)
 
 
 MAKERS: dict[str, Callable[[Call], Arguments]] = {
-    "AlignSurface": align_surface,
-    "absolute_difference": lambda c: c.given("H W", "<256 H W:u1", 0.5, "=H W", number()),
+    "AlignSurface": lambda c: c.given(*SURFACE),
+    "absolute_difference": lambda c: c.given("H W", "<256 H W:u1", 0.5, "=H W", "="),
     "activate_points": lambda c: [
         c.RawPoints("n 11", "n 3", "n 4", "n", "n 3"), 0.5, 0.1, c.ActivatedPoints("=n 3", "=n 4", "=n", "=n 1 3")],
-    "adam_update": adam_update,
+    "adam_update": lambda c: [[
+        Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01) for _ in range(c.size("a"))]],
     "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),
-    "align_mesh": align_mesh,
+    "align_mesh": lambda c: sighting(c, int(c.rng.integers(0, 9)), *(c.maybe(one, 0.7) for one in c.given(
+        c.AlignDerivatives("V 3 p", "=p p", "=p"), "=H W 3", "=H W 3"))),
     "antialias": lambda c: c.given(*with_edges(c), "H W d", "=H W d"),
     "antialias_backward": lambda c: c.given(*with_edges(c), "H W d", "H W d", "=H W d", "=V 3:f8"),
-    "bake_texture": bake_texture,
+    "bake_texture": lambda c: sighting(
+        c, c.array("<t+1 G U:i4") - np.int32(1), "G U 3", c.TextureSums("=G U", "=G U 3", "=G U 3", "=G U 3")),
     "barycentric_backward": lambda c: c.given(*fragments(c), "H W 3", "=V 3:f8"),
     "box_of_nonzero": lambda c: [np.maximum(c.array("H W") - 2, 0)],
     "clear_rows": lambda c: [c.array("<2 n:u1"), c.given("n", "n 3", "n 2 4")],
@@ -310,14 +275,16 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "expression_activations_backward": lambda c: c.given("i", "i", "i r", "k r", "r", "=i"),
     "expression_change": lambda c: c.given("n 3? r", "r", "=n 3?"),
     "expression_change_backward": lambda c: c.given("n 3? r", "r", "n 3?", "=n 3? r", "=r"),
-    "factored_adam_update": lambda c: factored(c, "n k f", "+n k f", np.array(c.rng.integers(0, 9), F32)),
+    "factored_adam_update": lambda c: factored(c, "n k f", "+n k f", steps(c)),
     "factored_update": lambda c: factored(c, "+n f", "+n"),
     "feature_network": lambda c: c.given(*network(c), c.maybe(c.FeatureKept("=n f", "=n h^")), "=n o", "=n"),
-    "feature_network_backward": feature_network_backward,
+    "feature_network_backward": lambda c: [
+        *network(c), c.FeatureKept("n f", "n h^"), c.FeatureGradients(
+            "n o", "n", "=n f", "=h f+x", "=h", "=o+1 h", "=o+1", "=k+j", "=n x" if c.flag() else "=0 0")],
     "head_poses": lambda c: c.given("n 3", "n 3", "=n 4 4"),
     "head_poses_backward": lambda c: c.given("n 3", "n 4 4", "=n 3"),
-    "interpolate_mesh": lambda c: interpolated(c, "=H W c"),
-    "interpolate_mesh_backward": lambda c: interpolated(c, "H W c", "=V c", "=H W 3"),
+    "interpolate_mesh": lambda c: c.given(*drawn(c), "V c", "<V t 3", "=H W c"),
+    "interpolate_mesh_backward": lambda c: c.given(*drawn(c), "V c", "<V t 3", "H W c", "=V c", "=H W 3"),
     "keep_on_surface": lambda c: c.given("<r n", "r 5", 1.6, "n 3", "n 4", "n 3", "?r 4", "n 3"),
     "light_equations": lambda c: sighting(c, "=3 9 9:f8", "=3 9:f8"),
     "make_face_model": make_face_model,
@@ -325,14 +292,16 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "mean_squared_difference": lambda c: c.given("H W 3", "<256 H W 3:u1"),
     "mesh_loss": mesh_loss,
     "observe_view": lambda c: c.given((2.0, 3.0), "n 2", "<3 n:i4", "n", "=n", "=n", "=n:i4", "=n"),
-    "photometric_loss": photometric_loss,
+    "photometric_loss": lambda c: c.given(
+        tuple(c.box()), (0.8, 0.2), "H W 3", "<256 H W 3:u1" if c.flag() else "H W 3", "?+H W", "?=H W 3", "="),
     "point_network": lambda c: c.given(*point_layers(c), "?=n y", "=n l"),
     "point_network_backward": point_network_backward,
     "pose_face": lambda c: c.given(*posing(c), "=b v 3", "=b v 3"),
-    "pose_face_backward": pose_face_backward,
+    "pose_face_backward": lambda c: c.given(
+        *posing(c), "b v 3", "b v 3", c.FaceArrays("=b v 3", "=b j+1 3", "=b e", "=b j 3", "=b 3", "=b 3")),
     "rasterize_isa": lambda c: [],
     "rasterize_mesh": rasterize_mesh,
-    "rasterize_views": rasterize_views,
+    "rasterize_views": lambda c: [views(c), c.flag(0.7)],
     "rasterize_views_backward": rasterize_views_backward,
     "recycled": lambda c: [[c.size("n"), c.size("m")]],
     "ride": ride,
@@ -350,7 +319,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
         skinned(c), c.SkinPointsGradients("B n 3", "=n 3", "=B n 3", "=n K", "=B K 3 4")],
     "thread_count": lambda c: [],
     "triangle_penalties": lambda c: c.given(
-        (1.0, 0.6), (0.01, 1.0), "n 3", "n 3", "<3 n:i4", "=n 3", "=n 3", number(), number()),
+        (1.0, 0.6), (0.01, 1.0), "n 3", "n 3", "<3 n:i4", "=n 3", "=n 3", "=", "="),
 }  # fmt: skip
 """Name of a native function -> the parts that make the arguments of a valid call."""
 

@@ -10,6 +10,7 @@ that runs that call alone. Every call has its own random numbers, which depend o
 
 import argparse
 import collections
+import contextlib
 import importlib.util
 import os
 import signal
@@ -19,24 +20,23 @@ import sysconfig
 import tempfile
 import types
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 
-from fuzzing.native_baselines import MAKERS, Rng, arguments_of
+from fuzzing import kinds
+from fuzzing.kinds import edge_number
+from fuzzing.native_baselines import MAKERS, arguments_of
 
 REFUSALS = (TypeError, ValueError, IndexError, OverflowError, MemoryError, BufferError)
 SECONDS_A_CALL = 20
 MOST_FINDINGS = 20
 SETTINGS_FOR = 50
 """Number of consecutive calls with the same number of threads and the same instruction set."""
-INTEGERS = [0, 1, -1, 2, 3, 15, 255, 2**15, 2**16, 2**24, 2**31 - 1, 2**31 - 2, 2**31, -(2**31), 2**32, 2**62]
-INTEGERS += [2**63 - 1, -(2**63), 2**63, 2**64, 10**30]
-FLOATS = [0.0, -0.0, 1.0, -1.0, 1e-45, 1e-30, 1e30, 3.4e38, 1e300, float("inf"), float("-inf"), float("nan")]
-DTYPES = ["f4", "f8", "f2", "i4", "i8", "u1", "u4", "?", "c8", ">f4", "O", "U3"]
-LENGTHS = [0, 1, 2, 3, 4, 7, 64]
-STRANGERS = ["ride_backward", "rasterize_views_backward", "align_mesh", "pose_face"]
+STRANGERS = ("ride_backward", "rasterize_views_backward", "align_mesh", "pose_face")
 """Functions whose arguments are passed to others. Together they take every class."""
 
 
@@ -65,11 +65,8 @@ def bound_names(native: Any) -> set[str]:
 
 
 def places(value: Any, path: tuple[int, ...] = ()) -> list[tuple[int, ...]]:
-    found = [path] if path else []
-    if isinstance(value, list | tuple):
-        for index, one in enumerate(value):
-            found += places(one, (*path, index))
-    return found
+    inner = enumerate(value) if isinstance(value, list | tuple) else ()
+    return [path] * bool(path) + [place for index, one in inner for place in places(one, (*path, index))]
 
 
 def at(value: Any, path: tuple[int, ...]) -> Any:
@@ -88,145 +85,75 @@ def like(value: Any, items: list[Any]) -> Any:
 def put(value: Any, path: tuple[int, ...], new: Any) -> Any:
     if not path:
         return new
-    items = list(value)
-    items[path[0]] = put(items[path[0]], path[1:], new)
-    return like(value, items)
+    return like(value, [put(one, path[1:], new) if index == path[0] else one for index, one in enumerate(value)])
 
 
-def other_shape(rng: Rng, array: np.ndarray) -> np.ndarray:
-    """Return the same numbers, repeated or cut, in another shape, or no numbers in a huge one."""
-    shape, kind = list(array.shape), rng.integers(0, 6)
-    axis = int(rng.integers(0, max(len(shape), 1)))
-    if kind == 0 or not shape:
-        shape.insert(axis, int(rng.choice(LENGTHS)))
-    elif kind == 1:
-        del shape[axis]
-    elif kind == 2:
-        shape[axis] = max(shape[axis] + int(rng.choice([-1, 1])), 0)
-    elif kind == 3:
-        shape[axis] = int(rng.choice(LENGTHS))
-    elif kind == 4:
-        shape.reverse()
-    else:
-        shape[axis] = 0
-        shape[int(rng.integers(0, len(shape)))] = int(rng.choice([0, 2**20, 2**31, 2**32 + 4, 2**40, 2**61]))
-        if 0 not in shape:
-            shape.append(0)
-    if 0 in shape:
-        return np.empty(shape, array.dtype)
-    return np.resize(array, shape) if array.size else np.zeros(LENGTHS[-1], array.dtype)
-
-
-def other_layout(rng: Rng, array: np.ndarray) -> Any:
-    """Return the same values elsewhere in memory: strided, broadcast, read-only, unaligned, or as a capsule."""
-    kind = rng.integers(0, 8)
-    if kind == 0 and array.ndim:
-        return np.repeat(array, 2, axis=-1)[..., ::2]
-    if kind == 1 and array.ndim:
-        return array[::-1]
-    if kind == 2:
-        return np.asfortranarray(array)
-    if kind == 3:
-        return np.broadcast_to(array.ravel()[:1].reshape([1] * array.ndim) if array.size else array, array.shape)
-    if kind == 4:
-        array = array.copy()
-        array.setflags(write=False)
-        return array
-    if kind == 5:
-        memory = np.zeros(array.nbytes + 1, np.uint8)
-        return memory[1:].view(array.dtype).reshape(array.shape) if array.nbytes else array
-    if kind == 6 and array.dtype.kind in "fiu":
-        return array.__dlpack__()
-    return array.tolist()
-
-
-def other_values(rng: Rng, array: np.ndarray) -> np.ndarray:
-    """Return a copy with some numbers from the edges."""
+def read_only(array: np.ndarray) -> np.ndarray:
     array = array.copy()
-    if array.size == 0 or array.dtype.kind not in "fiu":
-        return array
-    share = float(rng.choice([0.0, 0.1, 1.0]))
-    chosen = rng.random(array.shape) < share
-    chosen.reshape(-1)[int(rng.integers(0, array.size))] = True
-    with np.errstate(all="ignore"):
-        if array.dtype.kind == "f":
-            value = np.float64(rng.choice(FLOATS))
-        elif rng.random() < 0.5:
-            value = np.array(array.max(), np.int64) + rng.integers(-1, 3)
-        else:
-            value = np.int64(rng.choice([-1, -2, 2**31 - 1, -(2**31), 2**62, 2**63 - 1, -(2**63), 2**24]))
-        array[chosen] = value.astype(array.dtype)
+    array.setflags(write=False)
     return array
 
 
-def changed_array(rng: Rng, array: np.ndarray) -> Any:
-    kind = rng.random()
-    try:
-        if kind < 0.3:
-            return other_shape(rng, array)
-        if kind < 0.45:
-            return other_layout(rng, array)
-        if kind < 0.55:
-            name = str(rng.choice(DTYPES))
-            same_size = array.itemsize == np.dtype(name).itemsize != 8
-            return array.view(name) if same_size else np.zeros(array.shape, name)
-        return other_values(rng, array)
-    except (MemoryError, BufferError, TypeError, ValueError):  # numpy refuses this itself
-        return array
+LAYOUTS: tuple[Callable[[np.ndarray], Any], ...] = (
+    lambda array: np.repeat(array, 2, axis=-1)[..., ::2],
+    lambda array: array[::-1],
+    np.asfortranarray,
+    lambda array: np.broadcast_to(array.ravel()[0], array.shape),
+    read_only,
+    lambda array: np.frombuffer(bytearray(b"x" + array.tobytes()), np.uint8)[1:].view(array.dtype).reshape(array.shape),
+    lambda array: array.__dlpack__(),
+    lambda array: array.tolist(),
+    lambda array: array.astype(">f4"),
+    lambda array: array.astype(object),
+)
+"""The same values elsewhere in memory: strided, broadcast, read-only, unaligned, as capsule, list or objects."""
 
 
-def changed(rng: Rng, value: Any) -> Any:
+def changed(dice: Random, value: Any) -> Any:
     """Return another value of about the same kind."""
     if isinstance(value, np.ndarray):
-        return changed_array(rng, value)
+        with contextlib.suppress(MemoryError, BufferError, TypeError, ValueError, IndexError):  # by numpy itself
+            return dice.choice(LAYOUTS)(value) if dice.random() < 0.15 else kinds.faulty_array(value, dice)[1]
+        return value
     if isinstance(value, list | tuple) and value:
-        items, index = list(value), int(rng.integers(0, len(value)))
-        kind = rng.integers(0, 4)
-        if kind == 0:
-            del items[index]
-        elif kind == 1:
-            items.append(items[index])
-        elif kind == 2:
-            items = items[:index]
-        else:
-            items[index] = items[int(rng.integers(0, len(items)))]
-        return like(value, items)
+        return like(value, kinds.faulty_list(value, dice))
     if isinstance(value, str):
-        return str(rng.choice(["", "avx2", "sse4", "x" * 1000, "a\0b", "\u00fc"]))
-    if isinstance(value, int | float):
-        return rng.choice(np.array(INTEGERS + FLOATS, object))
-    return None
+        return dice.choice(("", "avx2", "sse4", "x" * 1000, "a\0b", "\u00fc"))
+    return edge_number(dice) if isinstance(value, int | float) else None
 
 
 def is_whole(value: Any) -> bool:
     return isinstance(value, int) or (isinstance(value, np.ndarray) and value.dtype.kind in "iu")
 
 
-def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
+def of_a_stranger(native: Any, dice: Random, value: Any) -> Any:
+    """Return a value of the same type from the call of another function, or an object of it that was never made."""
+    stranger = arguments_of(dice.choice(STRANGERS), native, np.random.default_rng(dice.getrandbits(32)))
+    alike = [at(stranger, own) for own in places(stranger) if isinstance(at(stranger, own), type(value))]
+    if alike and dice.random() >= 0.1:
+        return dice.choice(alike)
+    own: Any = type(value) if type(value).__module__ == "_native" and not isinstance(value, tuple) else None
+    return own and own.__new__(own)
+
+
+def mutate(native: Any, dice: Random, arguments: list[Any]) -> list[Any]:
     """Change one to three arguments. Some get a value from elsewhere in this call or from another call."""
-    for _ in range(int(rng.integers(1, 4))):
+    for _ in range(dice.randint(1, 3)):
         paths = places(arguments)
-        if not paths or rng.random() < 0.03:
-            arguments = changed(rng, arguments) if arguments else [None]
+        if not paths or dice.random() < 0.03:
+            arguments = changed(dice, arguments) if arguments else [None]
             continue
-        if rng.random() < 0.4:  # prefer indices and counts
+        if dice.random() < 0.4:  # prefer indices and counts
             paths = [path for path in paths if is_whole(at(arguments, path))] or paths
-        path, kind = paths[int(rng.integers(0, len(paths)))], rng.random()
+        path, kind = dice.choice(paths), dice.random()
         if kind < 0.75:
-            new = changed(rng, at(arguments, path))
+            new = changed(dice, at(arguments, path))
         elif kind < 0.83:
-            new = at(arguments, paths[int(rng.integers(0, len(paths)))])
-        elif kind < 0.95:  # the same type, but from another call
-            value: Any = at(arguments, path)
-            stranger = arguments_of(str(rng.choice(STRANGERS)), native, rng)
-            alike = [own for own in places(stranger) if isinstance(at(stranger, own), type(value))]
-            new = at(stranger, alike[int(rng.integers(0, len(alike)))]) if alike else None
-            if not alike or rng.random() < 0.1:
-                own = type(value).__module__ == "_native" and not isinstance(value, tuple)
-                kind_of: Any = type(value)
-                new = kind_of.__new__(kind_of) if own else None
+            new = at(arguments, dice.choice(paths))
+        elif kind < 0.95:
+            new = of_a_stranger(native, dice, at(arguments, path))
         else:
-            new = rng.choice(np.array([None, object(), "x", b"x", 1, 0.5, {}, np.float32(1)], object))
+            new = dice.choice((None, object(), "x", b"x", 1, 0.5, {}, np.float32(1)))
         arguments = put(arguments, path, new)
     return arguments
 
@@ -234,11 +161,11 @@ def mutate(native: Any, rng: Rng, arguments: list[Any]) -> list[Any]:
 def run_call(native: Any, seed: int, number: int) -> tuple[str, str]:
     """Make one call, and return the function's name and the outcome."""
     names = sorted(MAKERS)
-    name, rng = names[number % len(names)], np.random.default_rng((seed, number))
-    arguments = arguments_of(name, native, rng)
-    valid = rng.random() < 0.05
+    name, dice = names[number % len(names)], Random(f"{seed} {number}")
+    arguments = arguments_of(name, native, np.random.default_rng((seed, number)))
+    valid = dice.random() < 0.05
     if not valid:
-        arguments = mutate(native, rng, arguments)
+        arguments = mutate(native, dice, arguments)
     try:
         getattr(native, name)(*arguments)
     except REFUSALS as error:
@@ -296,7 +223,7 @@ def main() -> int:
         return 0
     here = [sys.executable, "-m", "fuzzing.native_calls", str(options.build), "--seed", str(options.seed)]
     next_call, end = (0, options.calls) if options.call is None else (options.call, options.call + 1)
-    findings, results = 0, collections.Counter[tuple[str, str]]()
+    findings, results = 0, collections.Counter[tuple[str, ...]]()
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
         while next_call < end and findings < MOST_FINDINGS:
@@ -309,18 +236,12 @@ def main() -> int:
             log.write_text("".join(f"{line}\n" for line in lines))
             print(f"FINDING (exit {done.returncode}); again: {' '.join(here)} --call {next_call - 1}", flush=True)
         for line in log.read_text().splitlines():
-            _, name, result = line.split()
-            results[name, result] += 1
-    report(results)
-    print(f"{sum(results.values())} native calls with seed {options.seed}: {findings} findings")
-    return int(findings > 0)
-
-
-def report(results: collections.Counter[tuple[str, str]]) -> None:
-    """Print the number of calls of each function, and of those that it accepted."""
+            results[tuple(line.split()[1:])] += 1
     for name in sorted({name for name, _ in results}):
         own = {result: count for (of, result), count in results.items() if of == name}
         print(f"{name:28} {sum(own.values()):6} calls  {own.get('accepted', 0):6} accepted")
+    print(f"{sum(results.values())} native calls with seed {options.seed}: {findings} findings")
+    return int(findings > 0)
 
 
 if __name__ == "__main__":

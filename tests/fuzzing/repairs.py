@@ -1,13 +1,14 @@
 """Correct checksums and hashes after a fault, as an attacker would.
 
 This module uses none of mien's functions, since a change of theirs would silently change what is fuzzed. A test repairs
-one harmless edit of each format and reads it.
+one harmless edit of each format and reads it. Files that are too faulty to be repaired stay as they are.
 """
 
 import contextlib
 import hashlib
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,6 @@ import cv2
 import numpy as np
 import safetensors.numpy
 
-_UNSOUND = (Exception,)
-"""Errors of files that are too faulty to be repaired. Such files stay as they are."""
 _GEOMETRY = (
     "template", "faces", "identity_basis", "expression_basis", "joint_template", "joint_identity_basis",
     "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis",
@@ -25,7 +24,6 @@ _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation"
 
 
 def split(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return header and body of a whole safetensors file."""
     size = int.from_bytes(data[:8], "little")
     return json.loads(data[8 : 8 + size]), data[8 + size :]
 
@@ -37,37 +35,33 @@ def joined(header: Any, body: bytes) -> bytes:
     return len(text).to_bytes(8, "little") + text + body
 
 
-def json_checksum(content: dict[str, Any]) -> str:
-    """Return the checksum that `mien.files.write_json` would write."""
-    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()[:32]
+def _canonical(content: Any) -> bytes:
+    return json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
 
 
 def with_checksum(content: Any) -> Any:
     """Return a json value with a correct checksum, if it can have one."""
-    if not isinstance(content, dict):
-        return content
-    content = {name: value for name, value in content.items() if name != "checksum"}
-    with contextlib.suppress(*_UNSOUND):
-        return {**content, "checksum": json_checksum(content)}
+    if isinstance(content, dict):
+        content = {name: value for name, value in content.items() if name != "checksum"}
+        with contextlib.suppress(Exception):
+            return {**content, "checksum": hashlib.sha256(_canonical(content)).hexdigest()[:32]}
     return content
 
 
 def repair_tensors(data: bytes) -> bytes:
     """Return a safetensors file with a correct checksum of header and body, if it has one."""
-    with contextlib.suppress(*_UNSOUND):
+    with contextlib.suppress(Exception):
         header, body = split(data)
         metadata = header.pop("__metadata__")
         if "checksum" in metadata:
-            text = json.dumps(header, sort_keys=True, separators=(",", ":"))
-            metadata["checksum"] = hashlib.sha256(text.encode() + body).hexdigest()
+            metadata["checksum"] = hashlib.sha256(_canonical(header) + body).hexdigest()
             return joined({"__metadata__": metadata, **header}, body)
     return data
 
 
 def repair_portable(data: bytes, content: Any = None) -> bytes:
     """Return a .mien file with a correct hash over content and arrays, and with other content if some is given."""
-    with contextlib.suppress(*_UNSOUND):
+    with contextlib.suppress(Exception):
         header, body = split(data)
         entry = json.loads(header["__metadata__"]["mien"])
         entry["content"] = entry["content"] if content is None else content
@@ -79,7 +73,7 @@ def repair_portable(data: bytes, content: Any = None) -> bytes:
 
 def repair_glb(data: bytes) -> bytes:
     """Return a .glb file with a correct hash over the avatar's content and arrays, if it has one."""
-    with contextlib.suppress(*_UNSOUND):
+    with contextlib.suppress(Exception):
         length = int.from_bytes(data[12:16], "little")
         content, buffer = json.loads(data[20 : 20 + length]), data[28 + length :]
         extension = content["extensions"]["MIEN_gaussian_avatar"]
@@ -111,12 +105,16 @@ def edit_json(path: Path, **values: Any) -> None:
 def repair_around(file: Path) -> None:
     """Correct what the files beside `file` say about it. Files that are too faulty stay as they are."""
     for repair in _AROUND.get(file.name, ()):
-        with contextlib.suppress(*_UNSOUND):
+        with contextlib.suppress(Exception):
             repair(file.parent)
 
 
-def _tracking(folder: Path) -> None:
-    edit_json(folder / "tracking.json", tensors_sha256=_sha256(folder / "tracking.safetensors"))
+def _digest_beside(name: str) -> Callable[[Path], None]:
+    """Return what writes the digest of the tensors into the json file of the same name."""
+    return lambda folder: edit_json(
+        folder / f"{name}.json",
+        tensors_sha256=hashlib.sha256((folder / f"{name}.safetensors").read_bytes()).hexdigest(),
+    )
 
 
 def _run_of_tracking(folder: Path) -> None:
@@ -131,10 +129,6 @@ def _run_of_tracking(folder: Path) -> None:
         data = json.loads(config.read_text())["data"]
         data[0]["tracking"] = digest.hexdigest()[:16]
         edit_json(config, data=data)
-
-
-def _avatar(folder: Path) -> None:
-    edit_json(folder / "avatar.json", tensors_sha256=_sha256(folder / "avatar.safetensors"))
 
 
 def _face_model(folder: Path) -> None:
@@ -159,10 +153,9 @@ def _capture(folder: Path) -> None:
     digest = hashlib.sha256(repr(picked).encode())
     for name, array in sorted(arrays.items()):
         digest.update(f"{name} {array.shape};".encode() + np.ascontiguousarray(array).tobytes())
-    edit_json(folder / "capture.json", capture_hash=digest.hexdigest())
-    stamp = folder / "cache" / "stamp.json"
-    if stamp.is_file():
-        edit_json(stamp, capture_hash=digest.hexdigest())
+    for file in (folder / "capture.json", folder / "cache" / "stamp.json"):
+        if file.is_file():
+            edit_json(file, capture_hash=digest.hexdigest())
 
 
 def _scoring(folder: Path) -> None:
@@ -176,16 +169,9 @@ def _scoring(folder: Path) -> None:
     edit_json(folder / "scoring.json", sha256=digest.hexdigest())
 
 
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-_AROUND = {
-    "tracking.safetensors": (_tracking, _run_of_tracking),
-    "avatar.safetensors": (_avatar,),
-    "face_model.safetensors": (_face_model,),
-    "face_model.json": (_face_model,),
-    "capture.json": (_capture,),
-    "landmarks.safetensors": (_capture,),
-    "crops.safetensors": (_scoring,),
-}
+_AROUND: dict[str, tuple[Callable[[Path], None], ...]] = {
+    "tracking.safetensors": (_digest_beside("tracking"), _run_of_tracking),
+    "avatar.safetensors": (_digest_beside("avatar"),),
+    "face_model.safetensors": (_face_model,), "face_model.json": (_face_model,),
+    "capture.json": (_capture,), "landmarks.safetensors": (_capture,), "crops.safetensors": (_scoring,),
+}  # fmt: skip

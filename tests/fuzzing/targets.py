@@ -8,9 +8,8 @@ from random import Random
 from typing import Any
 
 from fuzzing import faults, lines, uses
-from fuzzing.content import expect_finite
 from fuzzing.faults import Place
-from fuzzing.material import ANALYSIS, PIECES, RUN, SEQUENCE
+from fuzzing.material import ANALYSIS, PIECES, RUN, SEQUENCE, go_on
 from mien.avatar import load_avatar
 from mien.capture import read_capture
 from mien.capture.calibration import read_calibration
@@ -90,7 +89,7 @@ _TARGETS = (
     Target("capture.json", f"{_CAPTURE}/capture.json", _READ_CAPTURE, uses.use_capture, 2, True),
     Target("landmarks.safetensors", f"{_CAPTURE}/landmarks.safetensors", _READ_CAPTURE, uses.use_capture, 2, True),
     Target("frames", f"{_CAPTURE}/*/*/*.png", _READ_CAPTURE, uses.use_capture, 1, True),
-    Target("cache", f"{_CAPTURE}/cache/*", _READ_CAPTURE, uses.use_capture, fault=faults.faulty_without_damage),
+    Target("cache", f"{_CAPTURE}/cache/*", _READ_CAPTURE, uses.use_capture, fault=faults.any_fault),
     Target("tracking.json", f"{_TRACKING}/tracking.json", _READ_TRACKING, uses.use_run, 2, True),
     Target("tracking.safetensors", f"{_TRACKING}/tracking.safetensors", _READ_TRACKING, uses.use_run, 3, True),
     Target("scoring.json", f"{_SCORING}/scoring.json", _READ_SCORING, uses.use_run, 1.5, True),
@@ -108,9 +107,9 @@ _TARGETS = (
            uses.use_comparison, 2, True),
     Target("analysis.json", f"{ANALYSIS}/analysis.json", uses.read_analysis, weight=2, exact=True),
     Target("charts", f"{ANALYSIS}/*.png", uses.read_analysis, weight=0.3),
-    Target("partial scores", f"{RUN}/.*.partial", lambda root, file: PartialScores(file, "0").read(), uses.use_partial,
-           fault=faults.faulty_without_damage),
-    Target("pieces", f"{PIECES}/*.safetensors", uses.go_on_tracking, weight=0.3, named=False),
+    Target("partial scores", f"{RUN}/.*.partial", lambda root, file: PartialScores(file, "0").read(),
+           uses.use_evaluation, fault=faults.any_fault),
+    Target("pieces", f"{PIECES}/*.safetensors", lambda root, file: go_on(root / PIECES), weight=0.3, named=False),
     Target("avatar.json", f"{RUN}/avatar/avatar.json", _READ_AVATAR, uses.use_avatar, 2, True),
     Target("avatar.safetensors", f"{RUN}/avatar/avatar.safetensors", _READ_AVATAR, uses.use_avatar, 2, True),
     Target("face_model.json", f"{RUN}/avatar/face_model.json", _READ_AVATAR, uses.use_avatar, 1.5, True),
@@ -123,31 +122,24 @@ _TARGETS = (
     Target("miens", "miens/*", _of(read_portable), uses.use_portable, 3),
     Target("head.ply", "head.ply", _of(read_ply), uses.use_gaussians, 2),
     Target("pictures", "pictures/*", uses.read_pictures, weight=5),
-    Target("mattes", "given/mattes/*", uses.read_mattes, expect_finite),
+    Target("mattes", "given/mattes/*", uses.read_mattes, uses.expect_finite),
     Target("points", "given/points.*", lambda root, file: read_landmarks(file, 3), uses.expect_rows, 2),
-    Target("crops.json", "given/crops.json", _of(read_crops), expect_finite),
+    Target("crops.json", "given/crops.json", _of(read_crops), uses.expect_finite),
     Target("cameras.json", "given/cameras.json", _of(read_cameras), uses.use_cameras, 1.5, parts=("head.ply",)),
     Target("rig.json", "rig/rig.json", _of(read_calibration), uses.use_rig, 2),
     Target("take.csv", "given/take.csv", uses.read_motion, uses.expect_motion, 2),
     Target("take.json", "given/*take.json", uses.read_motion, uses.expect_motion, 2),
     Target("takes", "takes/*", uses.read_motion, uses.expect_motion, 4),
     Target("sounds", "sounds/*", _of(read_speech), uses.expect_motion, 3),
-    Target("tiny.npz", "flame/tiny.npz", _of(read_flame), uses.use_flame, 2),
-    Target("tiny.pkl", "flame/tiny.pkl", _of(read_flame), uses.use_flame, 2),
+    Target("tiny.npz", "flame/tiny.npz", _of(read_flame), uses.use_face_model, 2),
+    Target("tiny.pkl", "flame/tiny.pkl", _of(read_flame), uses.use_face_model, 2),
     Target("point_cloud.ply", "gaussian_avatars/point_cloud.ply", **_FOLDER, weight=2),
     Target("flame_param.npz", "gaussian_avatars/flame_param.npz", **_FOLDER, weight=2),
     Target("folder's face model", "gaussian_avatars/face_model.*", **_FOLDER, exact=True),
     Target("folder on FLAME", "flame_avatars/*", _on_flame, uses.use_gaussian_avatars, parts=("flame",)),
-    Target("imports", "gaussian_avatars/*", lambda root, file: None, lines.run_an_import, 0.5, fault=faults.any_fault,
-           parts=("cache",), named=False),
     Target("videos", "videos/*", uses.read_video, weight=3),
-    Target("playlists", "videos/clip.mp4", uses.read_no_playlist, fault=faults.write_playlist),
-    Target("names", "[gpv]*/*.*", uses.read_by_ending, fault=faults.rename, parts=("given", "pictures", "videos"),
-           named=False),
     Target("places", "W/**/*", uses.read_workspace, uses.use_run, 4, fault=faults.faulty_place),
-    Target("commands", "W/**/*", lambda root, file: None, lines.run_a_line, 1, fault=faults.any_fault, named=False,
-           parts=("cache",)),
-    Target("lines", "W/**/*", lambda root, file: None, lines.run_an_odd_line, 2, fault=lines.faulty_or_not, named=False,
+    Target("lines", "W/**/*", lambda root, file: None, lines.run_an_odd_line, 3, fault=lines.faulty_or_not, named=False,
            parts=lines.PARTS),
     Target("scene of a .glb", "exports/head.glb", uses.read_scene, weight=2),
     Target("avatar of a .glb", "exports/head.glb", _of(read_glb_avatar), uses.use_portable, 2),

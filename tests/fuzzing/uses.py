@@ -7,17 +7,17 @@ import json
 import os
 import subprocess
 import tempfile
-from contextlib import suppress
-from dataclasses import fields, replace
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
-from fuzzing.content import expect_finite
-from fuzzing.material import ANALYSIS, CONFIG, GROWTH, PIECES, QUICK, RUN, SEQUENCE, SETTINGS, go_on
+from fuzzing.material import ANALYSIS, CONFIG, GROWTH, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
 from mien.avatar import METHODS, load_avatar
 from mien.avatar.baking import make_portable
@@ -34,11 +34,7 @@ from mien.datasets import TrainedAvatar, datasets, recognised, write_sequence
 from mien.driving import Motion, drive, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
 from mien.evaluation import evaluate, read_metrics
-from mien.evaluation.compare import compare_runs
-from mien.evaluation.compare_report import comparison_html
 from mien.evaluation.image_source import open_pictures, read_picture
-from mien.evaluation.partial import PartialScores
-from mien.evaluation.text import comparison_text
 from mien.export import in_world, read_glb, read_ply, write_gaussian_avatars_folder, write_ply
 from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
 from mien.face.flame import flame_face_model
@@ -76,9 +72,16 @@ def known(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_track(root: Path, file: Path) -> FaceParams:
-    try:
+    with told_of(file, TypeError):  # as `mien.evaluation.load` does
         return FaceParams(**read_tensors(file))
-    except TypeError as error:  # as `mien.evaluation.load` does
+
+
+@contextlib.contextmanager
+def told_of(file: Path, kind: type[Exception]) -> Iterator[None]:
+    """Make errors of a kind complaints about a file, as callers of the reader do."""
+    try:
+        yield
+    except kind as error:
         raise UserError(f"{file}: {error}") from None
 
 
@@ -87,10 +90,6 @@ def resume_run(root: Path, file: Path) -> Any:
     state = start([sequence], face_model, CONFIG, replace(SETTINGS, split="tail"))
     resume(root / RUN / "checkpoints", state, SETTINGS.record_every)
     return state.avatar
-
-
-def go_on_tracking(root: Path, file: Path) -> None:
-    go_on(root / PIECES)
 
 
 def read_added(root: Path, file: Path) -> FaceModel:
@@ -113,7 +112,7 @@ def read_mattes(root: Path, file: Path) -> list[np.ndarray]:
 
 
 def read_motion(root: Path, file: Path) -> Motion:
-    return read_live_link_face(file) if file.suffix == ".csv" else read_blendshape_json(file)
+    return {".csv": read_live_link_face}.get(file.suffix, read_blendshape_json)(file)
 
 
 def read_video(root: Path, file: Path) -> None:
@@ -124,23 +123,6 @@ def read_video(root: Path, file: Path) -> None:
         assert (frame.dtype, frame.ndim) == (np.uint8, 3), (frame.dtype, frame.shape)
 
 
-def read_no_playlist(root: Path, file: Path) -> None:
-    assert not list(itertools.islice(read_video_frames(file, 512), SEEN)), "a list made mien read other files"
-
-
-def read_by_ending(root: Path, file: Path) -> None:
-    """Read a file by its ending from its own folder, as people do."""
-    with contextlib.chdir(file.parent):
-        name = Path(file.name)
-        if name.suffix in (".csv", ".json"):
-            read_motion(root, name)
-        elif name.suffix in (".png", ".jpg", ".webp", ".tif", ".bmp"):
-            read_pictures(root, name)
-        elif name.suffix != ".safetensors":
-            read_video(root, name)
-            open_source(name, FrameSelection(), 25.0)
-
-
 def read_workspace(root: Path, file: Path) -> Any:
     workspace = open_workspace(root / "W")
     read_sequence(workspace.sequence_dir(workspace.pick_sequence(None)))
@@ -149,8 +131,8 @@ def read_workspace(root: Path, file: Path) -> Any:
 
 def read_analysis(root: Path, file: Path) -> Any:
     """Return what an analysis keeps: the parts, without what depends on the command."""
-    options = AnalysisOptions()
-    return run_analysis(GROWTH, GROWTH.parts, root / RUN, [root / SEQUENCE], root / ANALYSIS, options)["parts"]
+    given = root / RUN, [root / SEQUENCE], root / ANALYSIS, AnalysisOptions()
+    return run_analysis(GROWTH, GROWTH.parts, *given)["parts"]
 
 
 def read_dataset(root: Path, file: Path) -> Any:
@@ -166,10 +148,8 @@ def read_scene(root: Path, file: Path) -> None:
     glb = read_glb(file)
     accessors = glb.content.get("accessors")
     for index in range(min(len(accessors), 50) if isinstance(accessors, list) else 0):
-        try:
+        with told_of(file, ValueError):
             glb.array(index).sum()
-        except ValueError as error:
-            raise UserError(f"{file}: {error}") from None
 
 
 def read_in_node(root: Path, file: Path) -> None:
@@ -186,7 +166,6 @@ def read_in_node(root: Path, file: Path) -> None:
 
 
 def tally(root: Path, file: Path) -> str:
-    """Count the answers of a study."""
     key = read_key(root / "study/study.key.json")
     return tally_text(tally_content(key, read_all_answers([root / "study/answers.json"], key)))
 
@@ -195,7 +174,30 @@ def tally(root: Path, file: Path) -> str:
 
 
 def nothing(root: Path, found: Any, dice: Random) -> None:
-    """Do nothing else."""
+    pass
+
+
+_MAY_BE_NAN = frozenset({"landmarks", "residuals", "pixel_residuals", "sharpness", "brightness", "clipped", "quality",
+                         "timestamps", "source", "settings"})  # fmt: skip
+"""Names of values that may be NaN, because a face was not found or the value is only shown."""
+
+
+def expect_finite(root: Path, found: Any, dice: Random, name: str = "") -> None:
+    """Check that all numbers in a value are finite, except for those where NaN means that something is unknown."""
+    if isinstance(found, nn.Module):
+        found = dict(found.state_dict())
+    if isinstance(found, Tensor):
+        found = found.detach().numpy()
+    if is_dataclass(found) and not isinstance(found, type):
+        found = {field.name: getattr(found, field.name) for field in fields(found)}
+    if name not in _MAY_BE_NAN:
+        if isinstance(found, (float, np.ndarray)):
+            assert not isinstance(found, np.ndarray) or found.dtype.kind in "fiub", found.dtype
+            assert np.isfinite(found).all(), f"{name} holds numbers that are not finite"
+        named = found.items() if isinstance(found, dict) else ()
+        listed = found if isinstance(found, (tuple, list)) else ()
+        for key, item in (*named, *((name, item) for item in listed)):
+            expect_finite(root, item, dice, str(key))
 
 
 def expect_rows(root: Path, found: np.ndarray, dice: Random) -> None:
@@ -230,7 +232,7 @@ def use_evaluation(root: Path, found: Any, dice: Random) -> None:
 def use_training(root: Path, found: Any, dice: Random) -> None:
     run = root / (RUN if dice.random() < 0.7 else "W/runs/new")
     if dice.random() < 0.7:
-        with suppress(IsADirectoryError):
+        with contextlib.suppress(IsADirectoryError):
             (run / "training.json").unlink(missing_ok=True)
     settings = replace(SETTINGS, split="tail")
     settings = settings if run.name == "toy" else replace(settings, steps=2)
@@ -251,19 +253,9 @@ def _draw(gaussians: Any, camera: Any = None) -> None:
     assert image.isfinite().all(), "a picture that is not finite"
 
 
-def use_partial(root: Path, found: Any, dice: Random) -> None:
-    """Evaluate with the faulty lines after the correct first one."""
-    for file in (root / RUN).glob(".*.partial"):
-        PartialScores(file, "0").read()
-    use_evaluation(root, found, dice)
-
-
 def use_comparison(root: Path, found: Any, dice: Random) -> None:
-    run_line("evaluate {W} --compare", root)
-    comparison = compare_runs({"a": root / RUN})
-    comparison_text(comparison, bold=False)
-    comparison.content()
-    comparison_html(comparison, [[]] * len(comparison.tables))
+    for more in ("", " --json"):
+        run_line(f"evaluate {{W}} --compare{more}", root)
 
 
 def use_avatar(root: Path, found: Any, dice: Random) -> None:
@@ -276,8 +268,10 @@ def use_avatar(root: Path, found: Any, dice: Random) -> None:
             write_portable(root / "out.mien", make_portable(found, toy_camera(32), str(root)))
 
 
-def use_face_model(root: Path, found: FaceModel, dice: Random) -> None:
+def use_face_model(root: Path, found: Any, dice: Random) -> None:
+    """Use a model, or one in FLAME's schema."""
     expect_finite(root, found, dice)
+    found = found if isinstance(found, FaceModel) else flame_face_model(found, "tiny")
     vertices = found.vertices_reference(found.neutral(1))
     assert all(found.landmark_positions(vertices, name).isfinite().all() for name in found.landmarks)
 
@@ -305,15 +299,9 @@ def use_cameras(root: Path, found: Any, dice: Random) -> None:
         _draw(gaussians, replace(camera, width=min(camera.width, 64), height=min(camera.height, 64)))
 
 
-def use_flame(root: Path, found: Any, dice: Random) -> None:
-    expect_finite(root, found, dice)
-    use_face_model(root, flame_face_model(found, "tiny"), dice)
-
-
 def use_gaussian_avatars(root: Path, found: Any, dice: Random) -> None:
     """Pose and draw what a folder holds, and write it as the run and the folder that a user would make of it."""
-    expect_finite(root, found.avatar, dice)
-    expect_finite(root, found.face, dice)
+    expect_finite(root, (found.avatar, found.face), dice)
     camera, timestep = front_camera(found.avatar).fitted(32, 32), dice.randrange(len(found.face))
     _draw(found.avatar.pose(found.face[timestep]).gaussians.timestep(0), camera)
     if found.avatar.face_model.shareable and dice.random() < 0.3:  # the others need the user's own copy of the model
@@ -346,9 +334,8 @@ def use_config(root: Path, found: ConfigFile, dice: Random) -> None:
     """Make the options of `mien train` of the file, as its command line does, and check them."""
     from mien.commands.train import Command
 
-    arguments = ["--config", str(found.path)]
-    arguments += ["--method", dice.choice(list(METHODS))] if found.method is None else []
-    command = with_settings(Command, arguments)
+    method = ["--method", dice.choice(list(METHODS))] if found.method is None else []
+    command = with_settings(Command, ["--config", str(found.path), *method])
     options = next(field for field in fields(command) if field.name == "options").default_factory()  # type: ignore[misc]
     assert isinstance(options, TrainOptions)
     options.check()

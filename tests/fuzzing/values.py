@@ -37,44 +37,34 @@ Row = tuple[str, Any]
 Change = Callable[[np.ndarray], np.ndarray]
 
 
+# Changes of an array. `new` puts zeros of a shape in the place of one, which need not exist.
+
+
 def fill(value: float) -> Change:
-    """Return a change that puts a number everywhere."""
     return lambda array: np.full_like(array, value)
 
 
 def last(value: float) -> Change:
-    """Return a change of the last number."""
-
-    def change(array: np.ndarray) -> np.ndarray:
-        array = array.copy()
-        array.flat[-1:] = value
-        return array
-
-    return change
+    return lambda array: np.concatenate([array.ravel()[:-1], [value]]).astype(array.dtype).reshape(array.shape)
 
 
 def plus(value: float) -> Change:
-    """Return a change that adds a number everywhere."""
     return lambda array: array + np.array(value).astype(array.dtype)
 
 
 def times(value: float) -> Change:
-    """Return a change that multiplies every number."""
     return lambda array: array * np.array(value).astype(array.dtype)
 
 
 def typed(kind: Any) -> Change:
-    """Return a change of the type."""
     return lambda array: array.astype(kind)
 
 
 def first(count: int) -> Change:
-    """Return a change that keeps only the first rows."""
     return lambda array: array[:count]
 
 
 def new(*shape: int, kind: Any = np.float32) -> Change:
-    """Return a change that puts zeros of a shape in the place of an array, which need not exist."""
     return lambda array: np.zeros(shape, kind)
 
 
@@ -98,18 +88,18 @@ VALUES: dict[str, tuple[Row, ...]] = {
         ("timesteps", 10**9), ("timesteps", HUGE), ("timesteps", "5"), ("width", 10**9), ("width", HUGE),
         ("width+height", 30_000), ("fps", HUGE), ("fps", 1e-300), ("camera_ids", ["front", "front"]),
         ("camera_ids", ["../../../home"]), ("camera_ids", ["/etc"]), ("camera_ids", [NOT_ONE_LINE]),
-        ("camera_ids", [3]),
-        ("camera_ids", [None]), ("name", NOT_ONE_LINE), ("source", []), ("source", {"a": nested(900)}),
+        ("camera_ids", [3]), ("camera_ids", [None]), ("name", NOT_ONE_LINE), ("source", []),
+        ("source", {"a": nested(900)}),
     ),
     "landmarks.safetensors": (
         ("landmarks", last(np.nan)), ("landmarks", last(np.inf)), ("landmarks", last(3e38)),
-        ("timestamps", last(np.nan)),
-        ("timestamps", last(1e300)), ("principal_point", last(np.inf)), ("+dtype landmarks", "F8_E5M2"),
+        ("timestamps", last(np.nan)), ("timestamps", last(1e300)), ("principal_point", last(np.inf)),
+        ("+dtype landmarks", "F8_E5M2"),
     ),
     "tracking.safetensors": (
         ("camera_K", fill(3e38)), ("camera_K", times(-1)), ("camera_viewmats", times(2)),
-        ("head_translation", fill(3e38)),
-        ("expression", typed(np.float16)), ("neck_lines", typed(np.int64)), ("+dtype joints", "F8_E4M3"),
+        ("head_translation", fill(3e38)), ("expression", typed(np.float16)), ("neck_lines", typed(np.int64)),
+        ("+dtype joints", "F8_E4M3"),
     ),
     "tracking.json": (
         ("cameras.0.width", 10**9), ("cameras.0.width", HUGE), ("cameras", {}), ("face_model", ["anny"]),
@@ -125,10 +115,9 @@ VALUES: dict[str, tuple[Row, ...]] = {
     ),
     "config.json": (
         ("data.0.camera.width", 10**9), ("data.0.camera.K", [[3e38] * 3] * 3), ("data.0.camera.K", "wide"),
-        ("data", []),
-        ("settings", [{"split": 1}]), ("method", {"kind": 3}), ("command_line", [1]), ("method", GONE),
-        ("settings", GONE),
-        ("data", GONE), *(("data.0.sequence", name) for name in ("../../../home", "/etc", NOT_ONE_LINE, 3, None)),
+        ("data", []), ("settings", [{"split": 1}]), ("method", {"kind": 3}), ("command_line", [1]), ("method", GONE),
+        ("settings", GONE), ("data", GONE),
+        *(("data.0.sequence", name) for name in ("../../../home", "/etc", NOT_ONE_LINE, 3, None)),
     ),
     "training.json": (("steps", "many"), ("seconds", HUGE)),
     "curves.safetensors": (
@@ -152,9 +141,8 @@ VALUES: dict[str, tuple[Row, ...]] = {
         (f"{_STORE}.face_index", fill(10**6)), (f"{_STORE}.trained.means", fill(np.nan)),
         ("store.means:first", fill(np.inf)), ("store.means:first", new(3)), ("store.means:first", typed(np.int8)),
         ("+store.none:first+store.none:second", new(3)), ("step", fill(-1)), ("step", new(3)),
-        ("gaussians", fill(10**12)),
-        ("+density.seen", new(3)), ("density.pull", GONE), ("track.expression", new(9)), ("curves.loss", new()),
-        ("curves.loss", GONE),
+        ("gaussians", fill(10**12)), ("+density.seen", new(3)), ("density.pull", GONE), ("track.expression", new(9)),
+        ("curves.loss", new()), ("curves.loss", GONE),
     ),
     "avatars": (
         (f"{_STORE}.face_index", fill(10**6)), (f"{_STORE}.face_index", fill(-1)),
@@ -195,13 +183,12 @@ VALUES: dict[str, tuple[Row, ...]] = {
         ("baked.rig.joint_parents", ["-1", "0", "0"]), ("baked.rig.joint_parents", [-1, 2, 1]),
         ("baked.rig.joint_parents", [-1, 0, HUGE]), ("baked.rig.joint_parents", [-1]),
         ("baked.rig.joint_free", [True] * 3), ("baked.scale_gain", 1e300), ("baked.network.outputs", ["sh", "sh"]),
-        ("baked.network.outputs", ["means"]), ("+baked.network.weights+biases", []),
-        ("about.name", "a\x1b[2Jb"), ("about.name", nested(400)), ("about.name", "x" * 1001),
-        ("baked.attributes.log_scales", {"tensor": "baked.means"}),
-        ("@camera.K", fill(3e38)), ("@camera.viewmat", fill(0)), ("@baked.faces", fill(2**31 - 1)),
-        ("@baked.face_index", fill(-1)), ("@baked.attributes.log_scales", fill(1000)),
-        ("@baked.attributes.sh", lambda array: array[:, [0, 0]]), ("@baked.means", typed(np.float64)),
-        ("@baked.means", first(3)), ("@*", last),
+        ("baked.network.outputs", ["means"]), ("+baked.network.weights+biases", []), ("about.name", "a\x1b[2Jb"),
+        ("about.name", nested(400)), ("about.name", "x" * 1001),
+        ("baked.attributes.log_scales", {"tensor": "baked.means"}), ("@camera.K", fill(3e38)),
+        ("@camera.viewmat", fill(0)), ("@baked.faces", fill(2**31 - 1)), ("@baked.face_index", fill(-1)),
+        ("@baked.attributes.log_scales", fill(1000)), ("@baked.attributes.sh", lambda array: array[:, [0, 0]]),
+        ("@baked.means", typed(np.float64)), ("@baked.means", first(3)), ("@*", last),
     ),
     "crops.json": tuple(("crops.0\\.png", box) for box in (
         [0, 0, HUGE, 4], [-HUGE, 0, 4, 4], [True, 0, 4, 4], [0, 0, 4.0, 4], [0, 0, 4, 10**7])),
@@ -219,8 +206,6 @@ VALUES: dict[str, tuple[Row, ...]] = {
         ("landmarks", fill(np.inf)), ("landmarks", fill(3e38)), ("landmarks", typed(bool)),
     ),
 }  # fmt: skip
-
-
 SANE: dict[str, Row] = {
     "capture.json": ("fps", 24.5), "landmarks.safetensors": ("landmarks", plus(1e-4)), "config.json": ("mien", "0.0"),
     "tracking.json": ("settings", {"edited": 1}), "tracking.safetensors": ("expression", plus(1e-4)),
@@ -248,17 +233,15 @@ def concrete(row: Row, file: Path) -> list[Row]:
 
 def edit(file: Path, where: str, value: Any) -> bytes | None:
     """Return a file with a value at a place, or None if it has no such place. Its own checksum is correct."""
-    if file.suffix not in (".json", ".safetensors", ".mien"):
-        return None
     data, portable = file.read_bytes(), file.suffix == ".mien"
     of_arrays = callable(value) or where.startswith(("@", "+dtype"))
     try:
         if file.suffix == ".safetensors" or (portable and of_arrays):
             data = _edit_arrays(data, where.removeprefix("@"), value)
             return repair_portable(data) if portable else repair_tensors(data)
-        content = json.loads(split(data)[0]["__metadata__"]["mien"])["content"] if portable else json.loads(data)
-        if of_arrays:
+        if of_arrays or file.suffix not in (".json", ".mien"):
             return None
+        content = json.loads(split(data)[0]["__metadata__"]["mien"])["content"] if portable else json.loads(data)
         _edit_value(content, where, value)
         if portable:
             return repair_portable(data, content)
