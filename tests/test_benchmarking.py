@@ -20,9 +20,7 @@ from mien.face import load_face_model
 from mien.lab.benchmarking import device as device_benchmark
 from mien.lab.benchmarking import headgas_step, mono_step, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
-from mien.lab.benchmarking.scenes import head_scene
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, time_function
-from mien.render import rasterize
 from mien.training.trainer import step
 
 pytestmark = pytest.mark.unchecked
@@ -43,6 +41,14 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
     assert len(runs) == 7  # two of which warm up
     assert 0 < timing.min_ms <= timing.median_ms
     assert timing.cpu_ms > 0
+    # Times of a step are those of one frame.
+    state, _ = mono_step.mono_case(load_face_model(), 3000, (64, 48), frames=4)
+    assert state.avatar.extras.frames_per_step() == 4
+    assert mono_step.per_frame(Timing(8.0, 12.0, 16.0), 4) == Timing(2.0, 3.0, 4.0)
+    # Waiting for a picture is measured with the worker and without.
+    rows = list(train_step.waiting_rows(load_face_model(), 500, (64, 48), 0.01))
+    assert [row.name for row in rows] == ["wait_for_target", "make_target"]
+    assert all(0 < row.min_ms <= row.median_ms and row.cpu_ms > 0 for row in rows)
 
 
 def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -57,9 +63,7 @@ def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.Monkey
     assert {((row.width, row.height), row.gaussians, row.threads) for row in rows} == set(wanted)
     assert all(0 < row.min_ms <= row.median_ms for row in rows)
     assert all(f"{size}, 1 thread " in chart.read_text() for size in ("40x30", "32x32"))
-
-
-def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Instruction sets are compared, and restored.
     monkeypatch.setattr(render_benchmark, "COUNTS", ())
     monkeypatch.setattr(render_benchmark, "benchmark_render", lambda *_: [_native.rasterize_isa()])
     best = _native.rasterize_isa()
@@ -128,31 +132,6 @@ def test_a_case_trains(made: Any, count: int, name: str, shape: tuple[int, ...])
         step(state, data, train_step.SETTINGS)
     assert (state.step - begun, before.shape) == (count, shape)
     assert not torch.equal(before, state.avatar.gaussian_store()[name])
-
-
-def test_times_of_a_step_are_those_of_one_frame() -> None:
-    state, _ = mono_step.mono_case(load_face_model(), 3000, (64, 48), frames=4)
-    assert state.avatar.extras.frames_per_step() == 4
-    assert mono_step.per_frame(Timing(8.0, 12.0, 16.0), 4) == Timing(2.0, 3.0, 4.0)
-
-
-def test_waiting_for_a_picture_is_measured_with_and_without_the_worker() -> None:
-    rows = list(train_step.waiting_rows(load_face_model(), 500, (64, 48), 0.01))
-    assert [row.name for row in rows] == ["wait_for_target", "make_target"]
-    assert all(0 < row.min_ms <= row.median_ms and row.cpu_ms > 0 for row in rows)
-
-
-def test_the_torch_tile_loop_draws_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(PEERS))
-    from torch_tiles import render_tiles  # pyright: ignore[reportMissingImports]
-
-    scene = head_scene(500, 50, 40)
-    found = render_tiles(scene.gaussians, scene.camera, scene.background)
-    expected = rasterize(scene.gaussians, scene.camera, scene.background).image
-    assert (found - expected).abs().mean() < 1e-3
-    ours, theirs = (torch.autograd.grad(picture, scene.parameters, scene.gradient) for picture in (expected, found))
-    for one, other in zip(ours, theirs, strict=True):
-        assert (one - other).norm() < 0.05 * other.norm()
 
 
 @pytest.mark.slow

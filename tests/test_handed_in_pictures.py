@@ -62,25 +62,21 @@ def test_a_huge_picture_is_refused_with_its_size(tmp_path: Path, name: str) -> N
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp", ".webp", ".tif", ".tiff"])
-@pytest.mark.parametrize("shape", [(7, 13, 3), (13, 7), (1, 1, 3)])
-def test_what_is_announced_is_what_is_decoded(tmp_path: Path, ending: str, shape: tuple[int, ...]) -> None:
+def test_what_is_announced_is_what_is_decoded(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"a{ending}"
-    assert cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8))
-    assert announced_size(path.read_bytes()) == (shape[1], shape[0])
-    assert read_image(path).shape == (*shape[:2], 3)
-    for length in range(0, 40, 3):
-        assert announced_size(path.read_bytes()[:length]) in (None, (shape[1], shape[0]))
+    for shape in ((7, 13, 3), (13, 7), (1, 1, 3)):
+        assert cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8))
+        assert announced_size(path.read_bytes()) == (shape[1], shape[0])
+        assert read_image(path).shape == (*shape[:2], 3)
+        for length in range(0, 40, 3):
+            assert announced_size(path.read_bytes()[:length]) in (None, (shape[1], shape[0]))
 
 
 def test_lossless_and_lossy_webp_are_read(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (21, 34, 4), dtype=np.uint8)
-    kinds = set()
-    for channels, quality in ((3, 50), (3, 101), (4, 50)):
-        done, data = cv2.imencode(".webp", picture[..., :channels], [cv2.IMWRITE_WEBP_QUALITY, quality])
-        assert done
-        assert announced_size(data.tobytes()) == (34, 21)
-        kinds.add(data.tobytes()[12:16])
-    assert kinds == {b"VP8 ", b"VP8L", b"VP8X"}
+    for channels, quality, kind in ((3, 50, b"VP8 "), (3, 101, b"VP8L"), (4, 50, b"VP8X")):
+        data = cv2.imencode(".webp", picture[..., :channels], [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
+        assert (announced_size(data), data[12:16]) == ((34, 21), kind)
 
 
 def test_other_kinds_of_pictures_are_not_decoded(tmp_path: Path) -> None:
@@ -91,20 +87,13 @@ def test_other_kinds_of_pictures_are_not_decoded(tmp_path: Path) -> None:
     assert decode_picture(path, cv2.IMREAD_COLOR) is None
     with pytest.raises(UserError, match="cannot be read as an image"):
         read_image(path)
-
-
-def test_a_picture_of_thousands_of_scans_is_not_decoded(tmp_path: Path) -> None:
-    done, data = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
-    assert done
-    path = tmp_path / "a.jpg"
-    path.write_bytes(data.tobytes())
+    # Nor is a picture of thousands of scans.
+    data = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    path.write_bytes(data)
     assert decode_picture(path, cv2.IMREAD_COLOR) is not None
-    path.write_bytes(data.tobytes()[:-2] + b"\xff\xda\x00\x08\x01\x01\x00\x01\x3f\x00" * 5000 + b"\xff\xd9")
+    path.write_bytes(data[:-2] + b"\xff\xda\x00\x08\x01\x01\x00\x01\x3f\x00" * 5000 + b"\xff\xd9")
     assert decode_picture(path, cv2.IMREAD_COLOR) is None
-
-
-def test_the_largest_picture_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
+    # The largest picture is read.
     path.write_bytes(png(MAX_PICTURE_PIXELS // 256, 256, 256))
     assert decode_picture(path, cv2.IMREAD_GRAYSCALE) is not None
     path.write_bytes(png(MAX_PICTURE_PIXELS // 256 + 1, 256, 256))

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from mien.capture.source import read_image
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import scoring
@@ -17,48 +18,32 @@ from mien.perceptual import distance, load_perceptual, lpips, weights
 from mien.storage import read_json
 
 
-@pytest.fixture
-def pair() -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    target = torch.rand(24, 31, 3, generator=generator)
-    return (target + 0.1 * torch.randn(24, 31, 3, generator=generator)).clamp(0, 1), target
-
-
-def test_psnr_and_l1_of_a_constant_difference() -> None:
-    """A constant difference has the PSNR and L1 of the formulas."""
+def test_psnr_and_l1() -> None:
     target = torch.full((8, 9, 3), 0.25)
     assert psnr(target + 0.1, target) == pytest.approx(20.0, abs=1e-4)
     assert l1(target - 0.1, target) == pytest.approx(0.1, abs=1e-6)
-
-
-def test_identical_images_have_finite_figures(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
-    image = pair[1]
-    assert psnr(image, image) == MAX_PSNR
-    assert l1(image, image) == 0
-    assert ssim(image, image) == pytest.approx(1, abs=1e-6)
-
-
-def test_box_leaves_the_rest_out() -> None:
+    assert (psnr(target, target), l1(target, target)) == (MAX_PSNR, 0)
+    # A box leaves the rest out, and is cut at the border.
     target = torch.zeros(10, 12, 3)
     image = target.clone()
     image[2:5, 3:7] = 0.5
     assert psnr(image, target, (3, 2, 4, 3)) == pytest.approx(-10 * np.log10(0.25), abs=1e-4)
     assert psnr(image, target) == pytest.approx(-10 * np.log10(0.25 * 12 / 120), abs=1e-4)
-
-
-def test_box_is_cut_at_the_border() -> None:
     image = torch.arange(20.0).reshape(4, 5)
     assert crop_to(image, (-2, -1, 4, 3)).tolist() == [[0, 1], [5, 6]]
     assert crop_to(image, (3, 2, 9, 9)).shape == (2, 2)
 
 
-def test_ssim_equals_a_direct_evaluation_of_its_definition(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
-    image, target = (t.double().numpy() for t in pair)
+def test_ssim_equals_a_direct_evaluation_of_its_definition() -> None:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(24, 31, 3, generator=generator)
+    image = (target + 0.1 * torch.randn(24, 31, 3, generator=generator)).clamp(0, 1)
+    assert ssim(image, image) == pytest.approx(1, abs=1e-6)
     offsets = np.arange(11) - 5
     window = np.exp(-(offsets**2) / (2 * 1.5**2))
     window = np.outer(window, window) / window.sum() ** 2
-    got = ssim_map(*pair)
-    padded = [np.pad(t, ((5, 5), (5, 5), (0, 0))) for t in (image, target)]
+    got = ssim_map(image, target)
+    padded = [np.pad(t.double().numpy(), ((5, 5), (5, 5), (0, 0))) for t in (image, target)]
     for row, column, channel in ((0, 0, 0), (12, 15, 1), (23, 30, 2), (3, 29, 0)):
         x, y = (p[row : row + 11, column : column + 11, channel] for p in padded)
         mean_x, mean_y = (window * x).sum(), (window * y).sum()
@@ -67,28 +52,21 @@ def test_ssim_equals_a_direct_evaluation_of_its_definition(pair: tuple[torch.Ten
         expected = (2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)
         expected /= (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
         assert float(got[row, column, channel]) == pytest.approx(expected, abs=2e-5)
-
-
-def _read(path: str) -> torch.Tensor:
-    picture = cv2.imread(path)
-    assert picture is not None
-    return torch.from_numpy(picture[:, :, ::-1].copy()).float() / 255
+    windows = Windows.of(target)  # to the same bits, also when the windows were used before
+    assert torch.equal(ssim_map(image, windows), got)
+    assert torch.equal(ssim_map(image, windows), got)
 
 
 def test_st_lpips_gives_the_published_figure(test_data) -> None:
     metric = load_perceptual()
-    example, reference = (_read(str(test_data / "golden" / f"ex_{name}.png")) for name in ("p0", "ref"))
+    example, reference = (
+        torch.from_numpy(read_image(test_data / "golden" / f"ex_{name}.png")).float() / 255 for name in ("p0", "ref")
+    )
     assert metric(example, reference) == pytest.approx(0.7777554988861084, abs=1e-5)
     assert metric(reference, reference) == 0
     assert metric(reference, example) == pytest.approx(metric(example, reference), abs=1e-6)
-
-
-def test_st_lpips_orders_small_shift_below_blur(test_data) -> None:
-    metric = load_perceptual()
-    picture = _read(str(test_data / "golden" / "ex_ref.png"))
-    blurred = torch.from_numpy(cv2.GaussianBlur(picture.numpy(), (0, 0), 3))
-    shifted = torch.roll(picture, 1, dims=1)
-    assert metric(shifted, picture) < 0.5 * metric(blurred, picture)
+    blurred = torch.from_numpy(cv2.GaussianBlur(reference.numpy(), (0, 0), 3))
+    assert metric(torch.roll(reference, 1, dims=1), reference) < 0.5 * metric(blurred, reference), "a shift is small"
 
 
 @pytest.mark.parametrize("size", [(40, 47), (47, 40), (33, 33), (64, 64)])
@@ -106,23 +84,16 @@ def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path
         load_perceptual()
     path = tmp_path / "alex.pth"
     monkeypatch.setattr(weights, "weights_path", lambda backbone: path)
-    with pytest.raises(UserError, match="missing"):
-        load_perceptual()
-    torch.save({"scaling_layer.shift": torch.zeros(1)}, path)
-    with pytest.raises(UserError, match="damaged"):
-        load_perceptual()
-    path.write_bytes(b"no weights")
-    with pytest.raises(UserError, match="damaged"):
-        load_perceptual()
+    for content, words in (
+        (None, "missing"), (b"no weights", "damaged"), ({"scaling_layer.shift": torch.zeros(1)}, "damaged"),
+    ):  # fmt: skip
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        elif content is not None:
+            torch.save(content, path)
+        with pytest.raises(UserError, match=words):
+            load_perceptual()
     load_perceptual.cache_clear()
-
-
-def test_ssim_with_shared_windows_is_that_of_the_target_itself() -> None:
-    """To the same bits, also when the windows were used before."""
-    first, second, target = torch.rand(3, 40, 33, 3)
-    windows = Windows.of(target)
-    for image in (first, second, first):
-        assert torch.equal(ssim_map(image, windows), ssim_map(image, target))
 
 
 CHANNELS = {"lpips-alex": (64, 192, 384, 256, 256), "lpips-vgg": (64, 128, 256, 512, 512)}
@@ -132,44 +103,35 @@ and relu5_3."""
 TRUNKS = {trunk.backbone: trunk for trunk in lpips.TRUNKS}
 
 
+LAYERS = {
+    "lpips-alex": ((64, 11, 4, 2), None, (192, 5, 1, 2), None, (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
+    "lpips-vgg": tuple(
+        layer for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+        for layer in (*depth * [(width, 3, 1, 1)], None)
+    ),
+}  # fmt: skip
+"""Width, kernel, stride and padding of each convolution of AlexNet and VGG16 in torchvision's order; None: pooling."""
+
+
 def _trunk(backbone: str) -> nn.Sequential:
-    """Return the convolutions of AlexNet or VGG16 in torchvision's order, with random weights."""
     torch.manual_seed(3)
-    if backbone == "lpips-vgg":
-        return _vgg16()
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(),
-        nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, 1, 1), nn.ReLU(), nn.Conv2d(384, 256, 3, 1, 1), nn.ReLU(),
-        nn.Conv2d(256, 256, 3, 1, 1), nn.ReLU(),
-    )  # fmt: skip
-
-
-def _vgg16() -> nn.Sequential:
-    """Return VGG16's layers: convolutions 3x3 in five groups, each followed by a pooling that halves."""
-    layers: list[nn.Module] = []
-    channels = 3
-    for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        for _ in range(depth):
-            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
-            channels = width
-        layers.append(nn.MaxPool2d(2))
+    layers, channels = [], 3
+    for layer in LAYERS[backbone]:
+        if layer is None:
+            layers.append(nn.MaxPool2d(3 if backbone == "lpips-alex" else 2, 2))
+        else:
+            layers += [nn.Conv2d(channels, *layer), nn.ReLU()]
+            channels = layer[0]
     return nn.Sequential(*layers)
 
 
 def _write(folder: Path, backbone: str) -> tuple[Path, Path]:
-    """Write files of a trunk and of factors, as they are published."""
     weights = {f"features.{name}": value for name, value in _trunk(backbone).state_dict().items()}
     torch.save(weights, folder / "trunk.pth")
     torch.manual_seed(4)
     heads = {f"lin{k}.model.1.weight": torch.rand(1, c, 1, 1) for k, c in enumerate(CHANNELS[backbone])}
     torch.save(heads, folder / "heads.pth")
     return folder / "trunk.pth", folder / "heads.pth"
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Return files of AlexNet, whose second convolution has padding 2."""
-    return _write(tmp_path_factory.mktemp("lpips"), "lpips-alex")
 
 
 def _by_formula(backbone: str, first: Tensor, second: Tensor, heads: dict[str, Tensor]) -> float:
@@ -200,7 +162,8 @@ def test_it_is_the_published_formula(backbone: str, tmp_path: Path) -> None:
     assert metric.between(metric.features(first), metric.features(first)) == 0
 
 
-def test_other_files_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    files = _write(tmp_path, "lpips-alex")
     with pytest.raises(UserError, match="is not the file that torchvision published; give alexnet"):
         lpips.load_lpips(files[0])
     with pytest.raises(UserError, match="no such file"):
@@ -212,17 +175,9 @@ def test_other_files_are_refused(files: tuple[Path, Path], tmp_path: Path) -> No
         lpips.build_lpips(lpips.TRUNKS[0], tmp_path / "bad.pth", files[1])
 
 
-@pytest.fixture
-def exact(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Take the random trunk for the published one."""
-    metric = lpips.build_lpips(lpips.TRUNKS[0], *files)
-    monkeypatch.setattr(scoring, "load_lpips", lambda path: metric)
-    return files[0]
-
-
-def test_the_command_shows_it_beside_the_others(
-    exact: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_shows_it_beside_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    metric = lpips.build_lpips(lpips.TRUNKS[0], *_write(tmp_path, "lpips-alex"))
+    monkeypatch.setattr(scoring, "load_lpips", lambda path: metric)  # the random trunk for the published one
     random = np.random.default_rng(2)
     for folder in ("truth", "images"):
         (tmp_path / folder).mkdir()
@@ -231,7 +186,7 @@ def test_the_command_shows_it_beside_the_others(
     shutil.copy(tmp_path / "truth/0.png", tmp_path / "images/1.png")
     command = ["evaluate", "--images", str(tmp_path / "images"), "--truth", str(tmp_path / "truth")]
     out = tmp_path / "scores.json"
-    assert main([*command, "--lpips-weights", str(exact), "--no-perceptual", "--out", str(out)]) == 0
+    assert main([*command, "--lpips-weights", str(tmp_path / "trunk.pth"), "--no-perceptual", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     assert ", LPIPS 0." in shown
     assert "ST-LPIPS" not in shown
