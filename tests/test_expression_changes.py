@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from known import known
 from mien import runtime
@@ -30,15 +29,10 @@ from mien.gaussians import Gaussians
 from mien.runtime.checks import baked_fault
 from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
-from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
+from toy_scene import random, runtime_face, toy_camera, toy_face, toy_face_model
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
 PARTS = ("means", "quats", "scales", "opacities", "sh")
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal numbers."""
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def new_avatar(rank: int = 2, filled: bool = True, **settings: object) -> GaussianAvatars:
@@ -218,7 +212,6 @@ def test_starts_as_without_features() -> None:
 
 
 def test_color_and_opacity_change_by_the_network() -> None:
-    """By the plain formula from the activations and the features, in float64."""
     avatar, face = with_features(), toy_face(5)[2]
     store, (activations,) = avatar.store, avatar.activations(face)
     exact = Layers(*(tensor.double() for tensor in known(avatar.appearance).layers()))
@@ -261,7 +254,6 @@ def test_a_gaussian_without_features_never_changes_and_changes_have_a_penalty() 
 
 
 def test_features_have_their_own_number_of_activations() -> None:
-    """Bases take the first activations."""
     avatar = with_features()
     assert avatar.store["feature_bases"].shape[1] == DIRECTIONS
     assert avatar.store["offset_basis"].shape[-1] == RANK

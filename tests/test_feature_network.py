@@ -16,17 +16,13 @@ from mien.training.adam import (
     factored_update,
     update_all,
 )
+from toy_scene import random
 
 Sizes = tuple[int, int, int, int, int, int]
 """Gaussians, inputs, features, own numbers, hidden values, outputs."""
 SIZES: list[Sizes] = [
     (100, 20, 32, 27, 64, 49), (1, 1, 1, 0, 1, 1), (0, 3, 4, 5, 6, 7), (2000, 5, 17, 3, 70, 5), (97, 3, 8, 27, 33, 4),
 ]  # fmt: skip
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal numbers."""
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def arguments(sizes: Sizes, dtype: torch.dtype = torch.float32) -> list[Tensor]:

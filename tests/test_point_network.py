@@ -5,6 +5,7 @@ from torch import Tensor
 
 from known import known
 from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
+from toy_scene import random
 
 Sizes = tuple[int, int, tuple[tuple[int, Activation, int | None], ...]]
 """Points, inputs, and outputs, activation and extra values of each layer."""
@@ -15,11 +16,6 @@ NETWORKS: list[Sizes] = [
     (2000, 39, ((64, "softplus", None), (70, "relu", None), (17, "softplus", 1), (33, "none", 2))),
     (97, 3, ((16, "relu", None), (16, "softplus", 0), (5, "none", 0))),
 ]
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal numbers."""
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def arguments(sizes: Sizes, dtype: torch.dtype = torch.float32) -> list[Tensor]:

@@ -42,13 +42,9 @@ from mien.training.adam import (
 )
 from mien.training.density_control.gradient import observe_reference
 from mien.training.losses import alpha_loss, alpha_loss_reference
+from toy_scene import random
 
 Tensors = list[Tensor]
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    """Return standard normal numbers."""
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def some_radii(count: int) -> Tensor:
@@ -343,7 +339,6 @@ def test_another_epsilon_is_that_of_the_formula() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
 def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
-    """The box of nonzero values is the smallest one."""
     values = torch.zeros(size)
     assert _native.box_of_nonzero(values) == (0, 0, 0, 0)
     for pixel in ((size[0] - 1, size[1] // 2), (size[0] // 3, size[1] - 1), (size[0] // 2, size[1] // 3)):

@@ -16,6 +16,11 @@ from mien.tracking import Tracking
 from mien.training import Sequence
 
 
+def random(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
 def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
     """Return an ellipsoid head with two expressions (dropped lower half, swollen front), a neck and a derived jaw."""
     template, faces = sphere(rings, around)
@@ -61,7 +66,6 @@ def toy_face(timesteps: int) -> FaceParams:
 
 
 def runtime_face(face: FaceParams) -> Face:
-    """One timestep as the runtime takes it."""
     fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
     return Face(*(tensor[0].detach().numpy() for tensor in fields))
 
@@ -111,14 +115,12 @@ def toy_capture(face_model: FaceModel, timesteps: int = 10, size: int = 64) -> t
 
 
 def toy_sequence(timesteps: int = 10, size: int = 48) -> tuple[FaceModel, Sequence]:
-    """Return the toy face model and its capture, tracked exactly."""
     face_model = toy_face_model()
     capture, alpha = toy_capture(face_model, timesteps, size)
     return face_model, Sequence("toy", capture, toy_tracking(face_model, timesteps, size), alpha)
 
 
 def surface_of(avatar: Avatar) -> GaussianSurface:
-    """Return the surface of an avatar of GaussianAvatars."""
     surface = avatar.surface()
     assert isinstance(surface, GaussianSurface)
     return surface
