@@ -17,26 +17,15 @@ TIMESTEPS = 24
 POSITIONS = np.linspace(-0.4, 1.2, 13)
 
 
-@pytest.fixture(scope="module")
-def case() -> BlinkCase:
-    return BlinkCase()
+case = pytest.fixture(scope="module")(lambda: BlinkCase())
+STILL = np.full((TIMESTEPS, 2), 0.1)
+BLINKS = STILL.copy()
+"""Both eyes blink for three frames, and the left one alone for one frame."""
+BLINKS[7:10] = np.array([0.6, 1.0, 0.7])[:, None]
+BLINKS[16, 1] = 1.0
 
 
-def still() -> np.ndarray:
-    return np.full((TIMESTEPS, 2), 0.1)
-
-
-def blinks() -> np.ndarray:
-    """Return lids that blink: both eyes for three frames, and the left one alone for one frame."""
-    lids = still()
-    lids[7:10] = np.array([0.6, 1.0, 0.7])[:, None]
-    lids[16, 1] = 1.0
-    return lids
-
-
-@pytest.fixture(scope="module")
-def blinking(case) -> Shot:
-    return case.shot(blinks())
+blinking = pytest.fixture(scope="module")(lambda case: case.shot(BLINKS))
 
 
 def place(case: BlinkCase, shot: Shot, tracked: np.ndarray) -> np.ndarray:
@@ -49,60 +38,53 @@ def place(case: BlinkCase, shot: Shot, tracked: np.ndarray) -> np.ndarray:
     return case.lids_of(after)
 
 
-def test_blinks_that_landmarks_missed_are_found_in_pictures(case, blinking):
-    true = blinks()
-    found = place(case, blinking, 0.1 + 0.4 * (true - 0.1))
-    np.testing.assert_allclose(found[true > 0.5], true[true > 0.5], atol=0.15)
+def test_blinks_that_landmarks_missed_are_found_in_pictures(case, blinking, monkeypatch):
+    monkeypatch.setenv("MIEN_THREADS", "1")
+    found = place(case, blinking, 0.1 + 0.4 * (BLINKS - 0.1))
+    np.testing.assert_allclose(found[BLINKS > 0.5], BLINKS[BLINKS > 0.5], atol=0.15)
     # A wink closes only one eye, and open eyes stay open.
-    np.testing.assert_allclose(found[true < 0.5], 0.1, atol=0.05)
+    np.testing.assert_allclose(found[BLINKS < 0.5], 0.1, atol=0.05)
+    monkeypatch.setenv("MIEN_THREADS", "3")
+    np.testing.assert_array_equal(place(case, blinking, 0.1 + 0.4 * (BLINKS - 0.1)), found)
 
 
 @pytest.mark.unchecked
 def test_blinks_that_never_were_are_opened_and_nobody_blinks_where_nobody_does(case):
-    shot, false = case.shot(still()), still()
+    shot, false = case.shot(STILL), STILL.copy()
     false[11] = 0.7
     np.testing.assert_allclose(place(case, shot, false), 0.1, atol=0.1)
-    tracked = still() + 0.03 * np.random.default_rng(0).standard_normal((TIMESTEPS, 2))
+    tracked = STILL + 0.03 * np.random.default_rng(0).standard_normal((TIMESTEPS, 2))
     assert np.abs(place(case, shot, tracked) - 0.1).max() < np.abs(tracked - 0.1).max() + 0.01
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize("what", ["no weight", "too small", "eyes like skin"])
-def test_what_pictures_do_not_show_stays_as_tracked(case, blinking, what):
-    size = 40 if what == "too small" else 192
-    shot = blinking if what == "no weight" else case.shot(blinks(), size, white=WHITE if what == "too small" else SKIN)
-    found = place_lids(case.reduced, [shot], case.fit(still(), size), 0.0 if what == "no weight" else 1.0)
-    np.testing.assert_allclose(case.lids_of(found), still(), atol=0.05 if what == "eyes like skin" else 0)
+@pytest.mark.parametrize(("size", "white", "weight", "most"), [
+    pytest.param(192, WHITE, 0.0, 0, id="no weight"),
+    pytest.param(40, WHITE, 1.0, 0, id="too small"),
+    pytest.param(192, SKIN, 1.0, 0.05, id="eyes like skin"),
+])  # fmt: skip
+def test_what_pictures_do_not_show_stays_as_tracked(case, size, white, weight, most):
+    found = place_lids(case.reduced, [case.shot(BLINKS, size, white=white)], case.fit(STILL, size), weight)
+    np.testing.assert_allclose(case.lids_of(found), STILL, atol=most)
 
 
 @pytest.mark.unchecked
 def test_of_several_cameras_the_one_that_an_eye_faces_tells(case, blinking):
-    true, front, tracked = blinks(), blinking, case.fit(still())
+    tracked, one = case.fit(STILL), blinking.capture
     cameras = tracked.sequences[0].cameras
     side = cameras.viewmat[0].clone()
     side[:3, 3] += torch.tensor([0.5, 0.0, 0.0])  # sees the head from 35 degrees to the side
     cameras = CameraBatch(cameras.K.repeat(2, 1, 1), torch.stack([cameras.viewmat[0], side]))
-    one = front.capture
+    both = {name: np.repeat(getattr(one, name), 2, axis=1) for name in ("mattes", "landmarks", "valid")}
     capture = replace(
-        one, camera_ids=("front", "side"), images=np.concatenate([one.images, np.full_like(one.images, 128)], axis=1),
-        mattes=np.repeat(one.mattes, 2, axis=1), landmarks=np.repeat(one.landmarks, 2, axis=1),
-        valid=np.repeat(one.valid, 2, axis=1), principal_point=np.repeat(one.principal_point, 2, axis=0),
+        one, **both, camera_ids=("front", "side"), principal_point=np.repeat(one.principal_point, 2, axis=0),
+        images=np.concatenate([one.images, np.full_like(one.images, 128)], axis=1),
     )  # fmt: skip
-    picture = torch.arange(2 * TIMESTEPS)
-    detected = front.views.detected.repeat_interleave(2, 0)
+    picture, detected = torch.arange(2 * TIMESTEPS), blinking.views.detected.repeat_interleave(2, 0)
     views = Views(detected, picture // 2, picture % 2, torch.ones(len(picture), dtype=torch.float64))
-    shot, own = replace(front, views=views, capture=capture), replace(tracked.sequences[0], cameras=cameras)
+    shot, own = replace(blinking, views=views, capture=capture), replace(tracked.sequences[0], cameras=cameras)
     found = place_lids(case.reduced, [shot], replace(tracked, sequences=(own,)), 1.0)
-    np.testing.assert_allclose(case.lids_of(found), true, atol=0.2)
-
-
-@pytest.mark.unchecked
-def test_is_the_same_with_any_number_of_threads(case, blinking, monkeypatch):
-    found = []
-    for threads in ("1", "3"):
-        monkeypatch.setenv("MIEN_THREADS", threads)
-        found.append(place_lids(case.reduced, [blinking], case.fit(still()), 1.0).sequences[0].state)
-    assert torch.equal(*found)
+    np.testing.assert_allclose(case.lids_of(found), BLINKS, atol=0.2)
 
 
 def test_eyes_have_their_own_closing_coefficient(case):
@@ -111,14 +93,9 @@ def test_eyes_have_their_own_closing_coefficient(case):
     assert [layout.names[eye.column] for eye in eyes] == ["eyeBlinkRight", "eyeBlinkLeft"]
     assert all(eye.closed == pytest.approx(1.0, abs=0.05) for eye in eyes)
     assert all(eye.forward[2] > 0.9 for eye in eyes)
-
-
-def test_models_that_cannot_close_an_eye_have_none(case):
-    small = make_small_face_model()
-    assert eyes_of(small, layout_of(small)) == []
-    blind = replace(case.model, region_names=tuple(name.replace("eyes", "x") for name in case.model.region_names))
-    blind = replace(blind, region_names=tuple(name.replace("irises", "y") for name in blind.region_names))
-    assert eyes_of(blind, layout_of(blind)) == []
+    names = [name.replace("eyes", "x").replace("irises", "y") for name in case.model.region_names]
+    for blind in (make_small_face_model(), replace(case.model, region_names=tuple(names))):
+        assert eyes_of(blind, layout_of(blind)) == []
 
 
 def at(places: dict[int, float], otherwise: float = 0.1) -> np.ndarray:
@@ -130,22 +107,16 @@ def at(places: dict[int, float], otherwise: float = 0.1) -> np.ndarray:
 
 TREMBLING = 0.1 + 0.02 * np.random.default_rng(0).standard_normal(50)
 ANYWHERE = np.random.default_rng(0).uniform(0.0, 1.0, 50)
-SHUT, OPENER = {30: 1.0}, {10: -2.0}
 BLINK = {20: 0.5, 21: 1.0, 22: 0.5}
 
 
-@pytest.mark.parametrize(
-    ("tracked", "seen", "expected", "tolerance"),
-    [
-        pytest.param(TREMBLING, TREMBLING, TREMBLING, 0.02, id="colours that agree change little"),
-        pytest.param(at({}), at(BLINK), at(BLINK), 0.05, id="a few frames that disagree follow the colours"),
-        pytest.param(at({}), ANYWHERE, at({}), 0.05, id="colours that contradict every frame count for nothing"),
-        pytest.param(
-            at({30: 0.5}, 0.2), at(SHUT), at({30: 0.97}, 0.2), 0.02, id="too open throughout, but where lids meet"
-        ),
-        pytest.param(at({}), at(OPENER), at({}), 0.01, id="opener than any is left alone"),
-    ],
-)
+@pytest.mark.parametrize(("tracked", "seen", "expected", "tolerance"), [
+    pytest.param(TREMBLING, TREMBLING, TREMBLING, 0.02, id="colours that agree change little"),
+    pytest.param(at({}), at(BLINK), at(BLINK), 0.05, id="a few frames that disagree follow the colours"),
+    pytest.param(at({}), ANYWHERE, at({}), 0.05, id="colours that contradict every frame count for nothing"),
+    pytest.param(at({30: 0.5}, 0.2), at({30: 1.0}), at({30: 0.97}, 0.2), 0.02, id="too open but where lids meet"),
+    pytest.param(at({}), at({10: -2.0}), at({}), 0.01, id="opener than any is left alone"),
+])  # fmt: skip
 def test_positions_are_weighed(tracked: np.ndarray, seen: np.ndarray, expected: np.ndarray, tolerance: float):
     bowls = 400.0 * (POSITIONS - seen[:, None]) ** 2
     np.testing.assert_allclose(weigh_positions(bowls, tracked, 1.0), expected, atol=tolerance)

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 import torch
 
 from mien.adam import Moments
-from mien.tracking import Tracking, TrackingSettings, track, track_subject
+from mien.tracking import TrackingSettings, track, track_subject
 from mien.tracking.constants import TRACKING
 from mien.tracking.descent import epochs, frames
 from mien.tracking.descent.adam import apply_adam
@@ -29,33 +29,38 @@ PAPER = replace(LANDMARKS, schedule="paper", paper=QUICK)
 ALONE = replace(PAPER, paper=replace(QUICK, start="landmarks"))
 
 
-@pytest.fixture(scope="module")
-def case() -> PhotometricCase:
-    return make_photometric_case(timesteps=8)
+case = pytest.fixture(scope="module")(lambda: make_photometric_case(timesteps=8))
 
 
-@pytest.fixture(scope="module")
-def by_landmarks(case: PhotometricCase) -> Tracking:
-    return track(case.capture, case.model, LANDMARKS)
+def scene_of(case: PhotometricCase, settings: TrackingSettings, **response: torch.Tensor):
+    """Return the scene at the true pose, with the fit, the shot and the model that it is of."""
+    shot, layout = shot_of(case.capture, settings), layout_of(case.model)
+    model = reduce_face_model(case.model, layout)
+    model = reduce_face_model(case.model, layout, replace(model.response, **response))
+    state = torch.cat([case.face.head_rotation, case.face.head_translation], dim=1).double()
+    fit = Fit(unknown_subject(model), (SequenceFit(shot.cameras, widen(state, layout)),))
+    return paper_scene(model, [shot], lenses_of([case.capture], settings), fit, settings), fit, shot, model
 
 
-@pytest.fixture(scope="module")
-def by_descent(case: PhotometricCase) -> Tracking:
-    return track(case.capture, case.model, PAPER)
+def _descent(case: PhotometricCase, settings: TrackingSettings) -> Descent:
+    """The state before any step."""
+    scene, fit, *_ = scene_of(case, settings)
+    descent = Descent(scene, first_state(scene, fit, [None]))
+    descent.state.visibility += 1
+    return descent
 
 
 @pytest.mark.unchecked
-def test_pixels_calm_what_landmarks_leave(case, by_landmarks, by_descent):
-    assert wobble(case, by_descent) < 0.25 * wobble(case, by_landmarks)
+def test_pixels_calm_what_landmarks_leave(case):
+    by_landmarks, by_descent, alone = (track(case.capture, case.model, each) for each in (LANDMARKS, PAPER, ALONE))
+    for found in (by_descent, alone):
+        assert wobble(case, found) < 0.25 * wobble(case, by_landmarks)
     assert turn_error(case, by_descent) < 0.3
-
-
-@pytest.mark.unchecked
-def test_all_of_it_from_landmarks(case, by_landmarks):
-    """The schedule is also better than landmarks if it starts from them alone."""
-    alone = track(case.capture, case.model, ALONE)
-    assert wobble(case, alone) < 0.25 * wobble(case, by_landmarks)
     assert turn_error(case, alone) < 0.9 * turn_error(case, by_landmarks)
+    assert by_descent.settings["schedule"] == "paper"
+    offsets = by_descent.face.vertex_offsets
+    assert offsets is not None
+    assert offsets.norm(dim=1).max() < 0.005
 
 
 def test_the_first_frame_has_turns_until_it_no_longer_gets_better(case, monkeypatch):
@@ -82,7 +87,9 @@ def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
     descent, used = _descent(case, ALONE), []
     (target,) = descent.targets(0, 0)
     behind, camera = replace(target, camera=1), descent.scene.camera(0, 0, descent.state.log_focals)
-    away = replace(camera, viewmat=_turned_away(camera.viewmat))
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    around[2, 3] = -1.2  # on the other side of the head, which is 0.6 m away
+    away = replace(camera, viewmat=camera.viewmat @ around)
     monkeypatch.setattr(type(descent.scene), "camera", lambda _, __, index, focals: camera if index == 0 else away)
     monkeypatch.setattr(frames, "guess_texture", lambda _, one, *__: used.append(one.camera))
     monkeypatch.setattr(frames, "turn_of_first", lambda *_, **__: 1.0)
@@ -91,13 +98,12 @@ def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
 
 
 def test_every_camera_of_a_timestep_counts_in_every_step(case):
-    """Colours are the mean over the pictures, so that a step of two cameras weighs as one of a single camera."""
     descent = _descent(case, PAPER)
     (target,) = descent.targets(0, 3)
     dark = replace(target, image=0 * target.image)
     moving, weights = descent.moving(target, ())[0], descent.scene.used
-    one, other, both = (float(descent.frame_cost(some, moving, weights, None)) for some in
-                        ([target], [dark], [target, dark]))  # fmt: skip
+    given = ([target], [dark], [target, dark])
+    one, other, both = (float(descent.frame_cost(some, moving, weights, None)) for some in given)
     assert other > one
     assert both == pytest.approx((one + other) / 2, rel=1e-5)
 
@@ -139,7 +145,6 @@ def test_the_frame_pass_can_be_smooth_in_both_directions(case):
 
 
 def test_smoothness_in_the_frame_pass_is_a_setting(case):
-    """A frame with its share of the temporal term ends nearer to the motion around it."""
     ends = {}
     for smoothness in (0.0, 1.0):
         descent = _descent(case, replace(PAPER, paper=replace(QUICK, pass_smoothness=smoothness)))
@@ -160,47 +165,8 @@ def test_defaults_are_the_supplements():
 
 def test_the_neck_has_no_column_of_its_own(case):
     """The head has a pose of its own, so a neck above the shoulders would turn nothing that the fit can see."""
-    columns = layout_of(case.model).names
     assert any("neck" in name for name in case.model.joint_names)
-    assert not any("neck" in name for name in columns)
-
-
-@pytest.mark.unchecked
-def test_textures_may_be_as_large_as_those_of_published_trackers(case):
-    size = 2048
-    settings = replace(PAPER, paper=replace(QUICK, texture_size=size))
-    settings.check()
-    descent = _descent(case, settings)
-    assert descent.state.texture.shape[:2] == (size, size)
-    (target,) = descent.targets(0, 3)
-    frames.guess_texture(descent.scene, target, descent.moving(target, ())[0], descent.state.texture)
-    assert torch.isfinite(descent.state.texture).all()
-
-
-def _turned_away(viewmat: torch.Tensor) -> torch.Tensor:
-    """A camera on the other side of the world's origin, which the head is between, at the same height."""
-    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
-    around[2, 3] = -1.2  # the head is 0.6 m away
-    return viewmat @ around
-
-
-def _descent(case: PhotometricCase, settings: TrackingSettings) -> Descent:
-    """The state before any step, at the true pose."""
-    shot, layout = shot_of(case.capture, settings), layout_of(case.model)
-    model = reduce_face_model(case.model, layout)
-    state = torch.cat([case.face.head_rotation, case.face.head_translation], dim=1).double()
-    fit = Fit(unknown_subject(model), (SequenceFit(shot.cameras, widen(state, layout)),))
-    scene = paper_scene(model, [shot], lenses_of([case.capture], settings), fit, settings)
-    descent = Descent(scene, first_state(scene, fit, [None]))
-    descent.state.visibility += 1
-    return descent
-
-
-@pytest.mark.unchecked
-def test_it_says_how_it_was_made(by_descent):
-    assert by_descent.settings["schedule"] == "paper"
-    assert by_descent.face.vertex_offsets is not None
-    assert by_descent.face.vertex_offsets.norm(dim=1).max() < 0.005
+    assert not any("neck" in name for name in layout_of(case.model).names)
 
 
 @pytest.mark.unchecked
@@ -215,28 +181,18 @@ def test_the_same_with_any_number_of_threads(monkeypatch):
 
 
 def test_landmarks_cost_what_they_cost_other_schedules(case):
-    """Landmarks cost what they cost in other schedules.
-
-    The detector's whole response counts, with turns and expressions.
-    """
+    """The detector's whole response counts, with turns and expressions."""
     settings = replace(PAPER, paper=replace(QUICK, gap_weight=0.0))
-    shot, layout = shot_of(case.capture, settings), layout_of(case.model)
-    model = reduce_face_model(case.model, layout)
-    random = torch.Generator().manual_seed(0)
-    response = model.response
-    by_turn = 0.01 * torch.randn(response.by_turn.shape, generator=random, dtype=torch.float64)
-    by_expression = 0.01 * torch.randn(response.by_expression.shape, generator=random, dtype=torch.float64)
-    model = reduce_face_model(case.model, layout, replace(response, by_turn=by_turn, by_expression=by_expression))
-    state = torch.cat([case.face.head_rotation, case.face.head_translation], dim=1).double()
-    own = SequenceFit(shot.cameras, widen(state, layout))
-    fit = Fit(unknown_subject(model), (own,))
-    scene = paper_scene(model, [shot], lenses_of([case.capture], settings), fit, settings)
-    descent = Descent(scene, first_state(scene, fit, [None]))
+    random, plain = torch.Generator().manual_seed(0), scene_of(case, settings)[3].response
+    scene, fit, shot, model = scene_of(case, settings, **{
+        name: 0.01 * torch.randn(getattr(plain, name).shape, generator=random, dtype=torch.float64)
+        for name in ("by_turn", "by_expression")
+    })  # fmt: skip
+    descent, (own,) = Descent(scene, first_state(scene, fit, [None])), fit.sequences
     target = read_target(scene, 0, 3, 0)
     term = quiet_landmarks(all_landmarks(model, shot.views, own, settings), settings.paper.landmark_share)
     expected = term.cost(own.state, fit.subject, own.cameras)[3]
-    row = descent.state.frames[0][3]
-    found = landmark_terms(scene, target, descent.moving(target, ())[0]) + prior_term(scene, row)
+    found = landmark_terms(scene, target, descent.moving(target, ())[0]) + prior_term(scene, descent.state.frames[0][3])
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=0)
 
 
@@ -255,10 +211,7 @@ def test_adam_is_that_of_torch():
 
 @pytest.mark.unchecked
 @pytest.mark.parametrize(("start", "stops"), [("landmarks", (3, 4)), ("fast", (2,))])
-def test_an_interrupted_fit_goes_on(
-    tmp_path, monkeypatch, start: Literal["fast", "landmarks"], stops: tuple[int, ...]
-) -> None:
-    """It ends with the same numbers, whether it stopped in the frames, in the epochs or in both."""
+def test_an_interrupted_fit_goes_on(tmp_path, monkeypatch, start, stops: tuple[int, ...]) -> None:
     case, keep = make_photometric_case(timesteps=5), tmp_path / "kept"
     settings = replace(PAPER, paper=replace(QUICK, start=start, first_steps=10, steps=3, epochs=3))
     expected = track_subject([case.capture], case.model, settings)[0]

@@ -13,7 +13,7 @@ from mien.tracking.pixels.outline import OutlineTerm, edge_distances, outline_te
 from mien.tracking.pixels.shared import move_like_keyframes
 from mien.tracking.pixels.surface import surface_model
 from mien.tracking.settings import PhotometricSettings
-from photometric_case import FOCAL, SIZE, PhotometricCase, make_photometric_case, make_textured_model
+from photometric_case import FOCAL, SIZE, PhotometricCase, assert_alike, make_photometric_case, make_textured_model
 from tracking_case import make_tracking_case
 
 LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
@@ -23,19 +23,8 @@ FAST = replace(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def case() -> PhotometricCase:
-    return make_photometric_case()
-
-
-@pytest.fixture(scope="module")
-def by_landmarks(case: PhotometricCase) -> Tracking:
-    return track(case.capture, case.model, LANDMARKS)
-
-
-@pytest.fixture(scope="module")
-def by_pixels(case: PhotometricCase) -> Tracking:
-    return track(case.capture, case.model, FAST)
+case = pytest.fixture(scope="module")(lambda: make_photometric_case())
+by_landmarks = pytest.fixture(scope="module")(lambda case: track(case.capture, case.model, LANDMARKS))
 
 
 def wobble(case: PhotometricCase, tracking: Tracking) -> float:
@@ -53,35 +42,27 @@ def turn_error(case: PhotometricCase, tracking: Tracking) -> float:
 
 
 @pytest.mark.unchecked
-def test_pixels_calm_what_landmarks_leave(case, by_landmarks, by_pixels):
+def test_pixels_calm_what_landmarks_leave(case, by_landmarks, monkeypatch):
+    runs = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("MIEN_THREADS", threads)
+        runs.append(track(case.capture, case.model, FAST))
+    assert_alike(*runs)
+    by_pixels = runs[0]
     assert wobble(case, by_pixels) < 0.5 * wobble(case, by_landmarks)
     assert turn_error(case, by_pixels) < 0.3
-
-
-@pytest.mark.unchecked
-def test_expressions_come_nearer_the_truth(case, by_landmarks, by_pixels):
-    def error(tracking: Tracking) -> float:
-        return float((tracking.face.expression - case.face.expression).abs().mean())
-
-    assert error(by_pixels) < error(by_landmarks)
-
-
-@pytest.mark.unchecked
-def test_is_the_same_each_time_and_with_any_number_of_threads(case, by_pixels, monkeypatch):
-    monkeypatch.setenv("MIEN_THREADS", "3")
-    again = track(case.capture, case.model, FAST)
-    for name, tensor in by_pixels.face.tensors().items():
-        assert torch.equal(tensor, again.face.tensors()[name]), name
+    errors = [float((one.face.expression - case.face.expression).abs().mean()) for one in (by_pixels, by_landmarks)]
+    assert errors[0] < errors[1]
+    assert by_landmarks.pixel_residuals is None
+    assert by_pixels.pixel_residuals.isfinite().all()
+    assert 0 < by_pixels.pixel_residuals.median() < 0.06
 
 
 @pytest.mark.unchecked
 def test_a_face_without_texture_stays_where_landmarks_put_it():
-    case = make_tracking_case(timesteps=6)
-    capture = replace(case.capture, images=np.full_like(case.capture.images, 128))
-    model = make_textured_model()
-    expected = track(capture, model, LANDMARKS)
-    found = track(capture, model, FAST)
-    marks = [model.landmark_positions(model(tracking.face), "mediapipe") for tracking in (expected, found)]
+    capture, model = make_tracking_case(timesteps=6).capture, make_textured_model()
+    found = [track(capture, model, settings) for settings in (LANDMARKS, FAST)]
+    marks = [model.landmark_positions(model(tracking.face), "mediapipe") for tracking in found]
     assert (marks[0] - marks[1]).norm(dim=-1).median() < 0.0008
 
 
@@ -119,40 +100,28 @@ def test_sequences_of_one_subject_share_texture_and_identity(case):
 
 
 @pytest.mark.unchecked
-def test_residuals_tell_how_well_colors_agree(by_pixels, by_landmarks):
-    assert by_landmarks.pixel_residuals is None
-    assert by_pixels.pixel_residuals.isfinite().all()
-    assert 0 < by_pixels.pixel_residuals.median() < 0.06
-
-
-@pytest.mark.unchecked
 def test_a_model_without_texture_coordinates_is_tracked_by_landmarks_and_says_so(capsys):
     case = make_tracking_case(timesteps=4)
-    tracking = track(case.capture, case.model.to(torch.zeros(())), FAST)
-    assert tracking.pixel_residuals is None
+    expected, found = (track(case.capture, case.model.to(torch.zeros(())), each) for each in (LANDMARKS, FAST))
+    assert found.pixel_residuals is None
     assert "the fit to landmarks is kept" in capsys.readouterr().err
-    expected = track(case.capture, case.model.to(torch.zeros(())), LANDMARKS)
-    assert torch.equal(tracking.face.head_rotation, expected.face.head_rotation)
+    assert torch.equal(found.face.head_rotation, expected.face.head_rotation)
 
 
 def test_derivatives_of_the_surface_are_those_of_the_face_model():
-    model = make_textured_model()
-    generator = torch.Generator().manual_seed(0)
-    pose_basis = 0.002 * torch.randn(27, *model.template.shape, generator=generator)
-    model = replace(model, pose_basis=pose_basis)
+    model, generator = make_textured_model(), torch.Generator().manual_seed(0)
+    model = replace(model, pose_basis=0.002 * torch.randn(27, *model.template.shape, generator=generator))
     layout = layout_of(model)
     state = 0.3 * torch.rand(layout.size, generator=generator, dtype=torch.float64)
     state[3:6] = torch.tensor([0.02, 0.03, -0.8])
     state = torch.minimum(torch.maximum(state, layout.lower), layout.upper)
     identity = torch.randn(len(model.identity_basis), generator=generator, dtype=torch.float64)
     exact = replace(model, joint_identity_basis=0 * model.joint_identity_basis).to(torch.zeros(()).double())
-    surface = surface_model(exact, layout)
 
     def vertices(both: torch.Tensor) -> torch.Tensor:
         return exact(layout.face_params(both[None, : layout.size], both[layout.size :]))[0]
 
-    both = torch.cat([state, identity])
-    posed = surface.pose(state, identity, derive_identity=True)
+    both, posed = torch.cat([state, identity]), surface_model(exact, layout).pose(state, identity, derive_identity=True)
     assert posed.jacobian is not None
     torch.testing.assert_close(posed.vertices.double(), vertices(both), atol=1e-6, rtol=0)
     assert posed.jacobian.shape[2] == len(both)
@@ -162,28 +131,10 @@ def test_derivatives_of_the_surface_are_those_of_the_face_model():
         assert difference < 2e-4 * expected.abs().max() + 1e-7, index
 
 
-# Outlines -------------------------------------------------------------------------------------------------------------
-
-
 def term_of(case: PhotometricCase) -> OutlineTerm:
     rows = torch.arange(len(case.face))
     views = Views(case.landmarks.double(), rows, torch.zeros_like(rows), torch.ones(len(rows), dtype=torch.float64))
     return outline_term(surface_model(case.model, layout_of(case.model)), case.capture, rows, views, 10.0)
-
-
-def true_state(case: PhotometricCase) -> torch.Tensor:
-    layout, face = layout_of(case.model), case.face
-    expression = face.expression[:, layout.expression_index]
-    joints = face.joints.flatten(1)[:, layout.joint_index]
-    return torch.cat([face.head_rotation, face.head_translation, expression, joints], dim=1).double()
-
-
-def step_of(case: PhotometricCase, state: torch.Tensor, columns: slice) -> torch.Tensor:
-    """Return the Gauss-Newton step of some parameters of each timestep."""
-    subject = Subject(case.face.identity.double(), torch.zeros(478, 3).double())
-    rows = torch.arange(len(state))
-    frames, _ = term_of(case).joint_equations(state, rows, subject, batch_of((case.camera,)))
-    return -torch.linalg.solve(frames.hessian[:, columns, columns], frames.gradient[:, columns])
 
 
 @pytest.fixture(scope="module")
@@ -191,39 +142,35 @@ def short_case() -> PhotometricCase:
     return make_photometric_case(timesteps=8)
 
 
+def equations_of(case: PhotometricCase, term: OutlineTerm, shift: tuple[float, float] = (0, 0)):
+    """Return the equations of the timesteps and of what they share, with the head shifted away from the truth."""
+    layout, face = layout_of(case.model), case.face
+    expression, joints = face.expression[:, layout.expression_index], face.joints.flatten(1)[:, layout.joint_index]
+    state = torch.cat([face.head_rotation, face.head_translation, expression, joints], dim=1).double()
+    state[:, 3:5] += torch.tensor(shift)
+    subject = Subject(face.identity.double(), torch.zeros(478, 3).double())
+    return term.joint_equations(state, torch.arange(len(state)), subject, batch_of((case.camera,)))
+
+
 def test_the_true_outline_lies_where_the_matte_ends(short_case):
-    vertices = short_case.model(short_case.face)
-    for timestep in range(len(short_case.face)):
-        outline = term_of(short_case).outline(vertices[timestep], short_case.camera)
+    for timestep, mesh in enumerate(short_case.model(short_case.face)):
+        outline = term_of(short_case).outline(mesh, short_case.camera)
         distances = edge_distances(short_case.capture.mattes[timestep, 0], outline, 8.0)
         assert len(distances) > 20
         assert float(distances.nanmedian().abs()) < 0.3
-
-
-def test_normals_point_outwards_with_length_1(short_case):
-    outline = term_of(short_case).outline(short_case.model(short_case.face)[0], short_case.camera)
-    middle = outline.points.mean(0)
-    assert torch.allclose(outline.normals.norm(dim=1), torch.ones(len(outline.points)), atol=1e-5)
-    assert (((outline.points - middle) * outline.normals).sum(1) > 0).float().mean() > 0.9
+        assert torch.allclose(outline.normals.norm(dim=1), torch.ones(len(outline.points)), atol=1e-5)
+        outwards = ((outline.points - outline.points.mean(0)) * outline.normals).sum(1) > 0
+        assert outwards.float().mean() > 0.9
+        assert edge_distances(np.full((SIZE, SIZE), 255, np.uint8), outline, 8.0).isnan().all(), "out of reach"
 
 
 def test_a_shifted_head_is_pulled_back(short_case):
-    truth = true_state(short_case)
-    shift = torch.tensor([0.003, -0.002], dtype=torch.float64)  # 1.2 and 0.8 pixels
-    state = truth.clone()
-    state[:, 3:5] += shift
-    left = state[:, 3:5] + step_of(short_case, state, slice(3, 5)) - truth[:, 3:5]
-    assert float(left.norm(dim=1).mean()) < 0.3 * float(shift.norm())
-
-
-def test_what_is_out_of_reach_does_not_count(short_case):
-    outline = term_of(short_case).outline(short_case.model(short_case.face)[0], short_case.camera)
-    hair = np.full((SIZE, SIZE), 255, np.uint8)
-    assert edge_distances(hair, outline, 8.0).isnan().all()
+    shift, term = (0.003, -0.002), term_of(short_case)  # 1.2 and 0.8 pixels
+    frames, _ = equations_of(short_case, term, shift)
+    step = -torch.linalg.solve(frames.hessian[:, 3:5, 3:5], frames.gradient[:, 3:5])
+    assert float((torch.tensor(shift) + step).norm(dim=1).mean()) < 0.3 * float(torch.tensor(shift).norm())
     capture = replace(short_case.capture, mattes=np.full_like(short_case.capture.mattes, 255))
-    subject = Subject(short_case.face.identity.double(), torch.zeros(478, 3).double())
-    term, camera = replace(term_of(short_case), capture=capture), batch_of((short_case.camera,))
-    frames, shared = term.joint_equations(true_state(short_case), torch.arange(3), subject, camera)
+    frames, shared = equations_of(short_case, replace(term, capture=capture))
     assert not frames.hessian.any()
     assert not shared.gradient.any()
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -50,10 +49,8 @@ def test_a_few_landmarks_will_do():
     assert counted.sum() == 51 + 10
     moved = case.capture.landmarks.copy()
     moved[:, :, ~counted.numpy()] += 5
-    few, same, again = (
-        track(capture, make_small_face_model(), settings)
-        for capture in (case.capture, replace(case.capture, landmarks=moved), case.capture)
-    )
+    captures = case.capture, replace(case.capture, landmarks=moved), case.capture
+    few, same, again = (track(capture, make_small_face_model(), settings) for capture in captures)
     for name, tensor in few.face.tensors().items():
         assert torch.equal(tensor, again.face.tensors()[name]), f"{name} is not the same each time"
     pixels = case.camera.project(case.model.landmark_positions(case.model(few.face.to(case.pixels)), "mediapipe"))[0]
@@ -61,47 +58,11 @@ def test_a_few_landmarks_will_do():
     assert (few.face.expression - same.face.expression).abs().median() < 0.01
 
 
-@pytest.mark.unchecked
-def test_says_what_it_is_and_interpolates_missing_frames(tracked):
-    case, tracking = tracked
-    assert tracking.face_model == "small"
-    assert tracking.face_model_hash == make_small_face_model().content_hash
-    assert len(tracking.face) == 60
-    assert tracking.neck_lines.shape == (60, 1, 3)
-    assert tracking.settings["focal"] == FOCAL
-    torch.testing.assert_close(tracking.cameras[0].K.double(), case.camera.K, atol=0.01, rtol=0)
-    # The median distance of points with 0.3 px of noise in each coordinate is 0.35 px.
-    assert 0.3 < tracking.residuals.nanmedian() < 0.45
-    assert tracking.valid.logical_not().nonzero()[:, 0].tolist() == [20, 21]
-    assert tracking.residuals[20:22].isnan().all()
-    for field in (tracking.face.head_translation, tracking.face.expression, tracking.face.head_rotation):
-        between = field[19] + (field[22] - field[19]) / 3
-        torch.testing.assert_close(field[20], between)
-
-
-def test_expression_stays_in_bounds():
-    case = make_tracking_case(timesteps=6)
-    model = make_small_face_model()
-    narrow = model.expression_bounds.clone()
-    narrow[:4, 1] = 0.2
-    tracking = track(case.capture, replace(model, expression_bounds=narrow), KNOWN_FOCAL)
-    assert (tracking.face.expression >= narrow[:, 0]).all()
-    assert (tracking.face.expression <= narrow[:, 1]).all()
-    assert (tracking.face.expression[:, -1] == 0).all()
-    assert (tracking.face.expression[:, 1] == 0.2).any()
-
-
 def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return true yaw, tracked yaw and tracked landmarks (metres) of a head that rests, then turns 0.4 rad in 0.3 s."""
     case = make_tracking_case(timesteps=50, noise=0)
-    face = case.face[0]
     yaw = 0.2 * torch.tanh((torch.arange(50, dtype=torch.float64) - 33) / 2.0)
-    rotation = torch.zeros(50, 3, dtype=torch.float64)
-    rotation[:, 1] = yaw
-    moving = replace(
-        face, expression=face.expression.expand(50, -1), joints=face.joints.expand(50, -1, -1),
-        head_rotation=rotation, head_translation=face.head_translation.expand(50, -1),
-    )  # fmt: skip
+    moving = replace(case.face[[0] * 50], head_rotation=yaw[:, None] * torch.tensor([0.0, 1.0, 0.0]))
     pixels = case.camera.project(case.model.landmark_positions(case.model(moving), "mediapipe"))[0]
     generator = torch.Generator().manual_seed(5)
     # As with detectors, neighbours err alike: the picture shifts in each frame, and each point errs a little more.
@@ -113,7 +74,45 @@ def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Te
 
 
 @pytest.mark.unchecked
+def test_says_what_it_is_and_interpolates_missing_frames(tracked):
+    case, tracking = tracked
+    small = make_small_face_model()
+    assert (tracking.face_model, tracking.face_model_hash) == ("small", small.content_hash)
+    assert (len(tracking.face), tracking.neck_lines.shape, tracking.settings["focal"]) == (60, (60, 1, 3), FOCAL)
+    torch.testing.assert_close(tracking.cameras[0].K.double(), case.camera.K, atol=0.01, rtol=0)
+    # The median distance of points with 0.3 px of noise in each coordinate is 0.35 px.
+    assert 0.3 < tracking.residuals.nanmedian() < 0.45
+    assert tracking.valid.logical_not().nonzero()[:, 0].tolist() == [20, 21]
+    assert tracking.residuals[20:22].isnan().all()
+    for field in (tracking.face.head_translation, tracking.face.expression, tracking.face.head_rotation):
+        torch.testing.assert_close(field[20], field[19] + (field[22] - field[19]) / 3)
+    report = residual_report(case.capture, tracking, small)
+    assert report["frames_without_face"] == [20, 21]
+    assert report["residual_px"]["median"] == pytest.approx(float(tracking.residuals.nanmedian()), abs=1e-6)
+    assert report["iris_distance"]["deviation_percent"] < 1.0
+    assert report["jitter"]["fitted_px"] < report["jitter"]["detected_px"]
+    assert report["flagged_frames"] == []
+    residuals = tracking.residuals.clone()
+    residuals[7] = 5.0
+    assert residual_report(case.capture, replace(tracking, residuals=residuals), small)["flagged_frames"] == [7]
+
+
+def test_expression_stays_in_bounds():
+    case, model = make_tracking_case(timesteps=6), make_small_face_model()
+    narrow = model.expression_bounds.clone()
+    narrow[:4, 1] = 0.2
+    found = track(case.capture, replace(model, expression_bounds=narrow), KNOWN_FOCAL).face.expression
+    assert torch.equal(found, found.clamp(narrow[:, 0], narrow[:, 1]))
+    assert (found[:, -1] == 0).all()
+    assert (found[:, 1] == 0.2).any()
+
+
+@pytest.mark.unchecked
 def test_fast_turns_neither_lag_nor_shrink():
+    still = _still_then_turn(noise=0.3)[2][2:26]
+    shake = (still[2:] - 2 * still[1:-1] + still[:-2])[..., :2].norm(dim=-1).median()
+    # The shake of the whole picture alone is 0.3 px * sqrt(6) * sqrt(pi / 2) in second differences, or 1.06 mm.
+    assert shake < 0.0006
     yaw, tracked_yaw, _ = _still_then_turn(noise=0.0)
     tracked_yaw = tracked_yaw.double()
     range_ratio = (tracked_yaw.max() - tracked_yaw.min()) / (yaw.max() - yaw.min())
@@ -124,15 +123,6 @@ def test_fast_turns_neither_lag_nor_shrink():
     exact = crossing - float(centered[crossing] / (centered[crossing] - centered[crossing - 1]))
     assert abs(exact - 33) < 0.5
     assert (tracked_yaw.diff().max() / yaw.diff().max()) > 0.85
-
-
-@pytest.mark.unchecked
-def test_smoothing_calms_a_still_head():
-    _, _, marks = _still_then_turn(noise=0.3)
-    still = marks[2:26]
-    shake = (still[2:] - 2 * still[1:-1] + still[:-2])[..., :2].norm(dim=-1).median()
-    # The shake of the whole picture alone is 0.3 px * sqrt(6) * sqrt(pi / 2) in second differences, or 1.06 mm.
-    assert shake < 0.0006
 
 
 def test_the_focal_length_follows_the_crop_and_a_square_counts_as_cut_out():
@@ -154,37 +144,18 @@ def test_what_cannot_be_tracked_is_refused():
             track(capture, tracked_with)
 
 
-@pytest.mark.unchecked
-def test_report(tracked):
-    case, tracking = tracked
-    report = residual_report(case.capture, tracking, make_small_face_model())
-    assert report["frames_without_face"] == [20, 21]
-    assert report["residual_px"]["median"] == pytest.approx(float(tracking.residuals.nanmedian()), abs=1e-6)
-    assert report["iris_distance"]["deviation_percent"] < 1.0
-    assert report["jitter"]["fitted_px"] < report["jitter"]["detected_px"]
-    assert report["flagged_frames"] == []
-    residuals = tracking.residuals.clone()
-    residuals[7] = 5.0
-    report = residual_report(case.capture, replace(tracking, residuals=residuals), make_small_face_model())
-    assert report["flagged_frames"] == [7]
-
-
 def test_anny_lips_and_lids_part():
     """The embedding tells the upper from the lower lip and lid. Otherwise no mouth would open in a tracking."""
     model = load_face_model("anny")
     face = model.neutral(3)
-    expression = face.expression.clone()
-    expression[1, model.expression_names.index("jawOpen")] = 0.6
-    for side in ("Left", "Right"):
-        expression[2, model.expression_names.index(f"eyeBlink{side}")] = 0.8
-    marks = model.landmark_positions(model(replace(face, expression=expression)), "mediapipe").numpy()
-    for upper, lower in ((13, 14), (82, 87), (312, 317)):
-        gap = np.linalg.norm(marks[:, upper] - marks[:, lower], axis=-1)
-        assert gap[0] < 0.004
-        assert gap[1] > 0.012
-    for upper, lower in ((159, 145), (386, 374)):
-        gap = np.linalg.norm(marks[:, upper] - marks[:, lower], axis=-1)
-        assert gap[2] < 0.6 * gap[0]
+    face.expression[1, model.expression_names.index("jawOpen")] = 0.6
+    face.expression[2, [model.expression_names.index(f"eyeBlink{side}") for side in ("Left", "Right")]] = 0.8
+    marks = model.landmark_positions(model(face), "mediapipe")
+    lips = (marks[:, [13, 82, 312]] - marks[:, [14, 87, 317]]).norm(dim=-1)
+    assert lips[0].max() < 0.004
+    assert lips[1].min() > 0.012
+    lids = (marks[:, [159, 386]] - marks[:, [145, 374]]).norm(dim=-1)
+    assert (lids[2] < 0.6 * lids[0]).all()
 
 
 def test_settings_that_a_schedule_does_not_use_do_not_count():

@@ -1,16 +1,23 @@
-"""Pictures of a tracking are right: renderings of the model, heat, overlay, contact sheet, and the report's page."""
+"""Pictures of a tracking are right: renderings, heat, overlay, contact sheet, and the report's page, also of a rig."""
 
+import math
 import threading
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from mien.camera import Camera, look_at
+from mien.capture import Capture
 from mien.capture.video import probe_video
+from mien.face import FaceModel
 from mien.parallel import stream_in_threads
 from mien.render.mesh import shade
-from mien.rotation import matrix_from_axis_angle
+from mien.rotation import invert_rigid, matrix_from_axis_angle
 from mien.tracking import (
     Appearance,
     Tracking,
@@ -22,19 +29,21 @@ from mien.tracking import (
 )
 from mien.tracking.pixels import SkinTexture, even_light, model_pictures, window_of
 from mien.tracking.pixels.outcome import appearance_in_world, turn_light
+from mien.tracking.report import overlay
 from mien.tracking.report.contact_sheet import sheet_frames, sheet_rows, worst_of_runs
 from mien.tracking.report.heat import heat_map
 from mien.tracking.report.overlay import OverlayPainter, overlay_stride
 from mien.tracking.report.page import findings, name_runs
+from mien.tracking.report.rig import seen_from_front, visible_landmarks
 from mien.tracking.settings import PaperSettings, PhotometricSettings
 from photometric_case import FOCAL, SIZE, PhotometricCase, make_photometric_case, smooth_noise
+from small_face_model import make_small_face_model
+from tracking_case import make_tracking_case, still_camera
 
 FAST = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_size=128, keyframes=8, shared_steps=1))
 
 
-@pytest.fixture(scope="module")
-def case() -> PhotometricCase:
-    return make_photometric_case(timesteps=6)
+case = pytest.fixture(scope="module")(lambda: make_photometric_case(timesteps=6))
 
 
 @pytest.fixture(scope="module")
@@ -53,46 +62,32 @@ def truth(case: PhotometricCase) -> Tracking:
 def test_the_true_model_looks_like_the_pictures(case, truth):
     pictures = model_pictures(case.capture, truth, case.model)
     assert pictures is not None
-    vertices = case.model(case.face)
-    compared = pictures.compare(2, 0, vertices[2])
+    vertices = case.model(case.face)[2]
+    compared = pictures.compare(2, 0, vertices)
     known = compared.difference.isfinite()
     assert known.float().mean() > 0.2
     assert compared.difference[known].median() < 0.03
     assert compared.rms < 0.04
     part = torch.from_numpy(case.capture.images[2, 0][compared.window.rows, compared.window.columns] / np.float32(255))
     assert (compared.image - part)[known].abs().median() < 0.03, "the model's picture is not of the same place"
-    elsewhere = pictures.compare(2, 0, vertices[2] + torch.tensor([0.01, 0.0, 0.0]))
+    elsewhere = pictures.compare(2, 0, vertices + torch.tensor([0.01, 0.0, 0.0]))
     assert elsewhere.rms > 2 * compared.rms, "a shift by four pixels is not seen"
-
-
-def test_a_face_outside_the_picture_is_compared_with_nothing(case, truth):
-    pictures = model_pictures(case.capture, truth, case.model)
-    assert pictures is not None
     for shift in ([5.0, 0.0, 0.0], [0.0, 0.0, 3.0]):
-        compared = pictures.compare(0, 0, case.model(case.face)[0] + torch.tensor(shift))
-        assert np.isnan(compared.rms)
-        assert compared.difference.isnan().all()
+        outside = pictures.compare(2, 0, vertices + torch.tensor(shift))
+        assert np.isnan(outside.rms)
+        assert outside.difference.isnan().all()
     assert window_of(case.camera, torch.full((3, 3), 9.0)).rows.stop <= SIZE
 
 
 def test_turned_light_falls_on_turned_normals_alike():
-    random = torch.Generator().manual_seed(0)
+    random, T_world_fit = torch.Generator().manual_seed(0), torch.eye(4).double()
     light, normals = torch.randn(9, 3, generator=random), torch.randn(20, 3, generator=random)
     normals = torch.nn.functional.normalize(normals, dim=1)
-    R_world_fit = matrix_from_axis_angle(torch.tensor([0.4, -1.0, 0.3]))
-    torch.testing.assert_close(
-        shade(normals @ R_world_fit.T, turn_light(light, R_world_fit)), shade(normals, light), atol=1e-5, rtol=0
-    )
-    T_world_fit = torch.eye(4).double()
-    T_world_fit[:3, :3] = R_world_fit
+    T_world_fit[:3, :3] = R_world_fit = matrix_from_axis_angle(torch.tensor([0.4, -1.0, 0.3]))
+    turned = turn_light(light, R_world_fit)
+    torch.testing.assert_close(shade(normals @ R_world_fit.T, turned), shade(normals, light), atol=1e-5, rtol=0)
     appearance = appearance_in_world(SkinTexture(torch.zeros(2, 2, 3), torch.ones(2, 2), 0.1), light, T_world_fit, 0.01)
-    torch.testing.assert_close(appearance.light, turn_light(light, R_world_fit), atol=1e-5, rtol=0)
-
-
-def test_heat_grows_with_the_difference():
-    heat = heat_map(np.array([[0.0, 0.03, 0.08, 0.15, 9.0, np.nan]], np.float32)).astype(int).sum(-1)[0]
-    assert heat[0] < heat[1] < heat[2] < heat[3] == heat[4]
-    assert heat[5] == heat[0]
+    torch.testing.assert_close(appearance.light, turned, atol=1e-5, rtol=0)
 
 
 def test_the_overlay_shows_where_colors_differ(case, truth, tmp_path):
@@ -100,21 +95,16 @@ def test_the_overlay_shows_where_colors_differ(case, truth, tmp_path):
     off[3] += torch.tensor([0.01, 0.0, 0.0])
     painter = OverlayPainter(case.capture, replace(truth, face=replace(truth.face, head_translation=off)), case.model)
     assert painter.picture(3).shape == (2 * SIZE, 2 * SIZE, 3)
-    good, bad = (painter.panels(timestep)[3].astype(int).sum(-1) for timestep in (2, 3))
-    rows, columns = painter.head_box(3)
-    assert bad[rows, columns].mean() > 1.3 * good[painter.head_box(2)].mean()
+    good, bad = (painter.panels(timestep)[3].astype(int).sum(-1)[painter.head_box(timestep)] for timestep in (2, 3))
+    assert bad.mean() > 1.3 * good.mean()
     write_overlay(tmp_path / "overlay.mp4", case.capture, truth, case.model, every=4)
     assert probe_video(tmp_path / "overlay.mp4").frames == 2
     assert probe_video(tmp_path / "overlay.mp4").fps == pytest.approx(case.capture.fps / 4)
-
-
-def test_without_looks_the_overlay_has_two_panels(case, truth):
-    painter = OverlayPainter(case.capture, replace(truth, appearance=None, pixel_residuals=None), case.model)
-    assert painter.picture(0).shape == (SIZE, 2 * SIZE, 3)
-
-
-def test_long_clips_are_shown_in_part():
+    plain = OverlayPainter(case.capture, replace(truth, appearance=None, pixel_residuals=None), case.model)
+    assert plain.picture(0).shape == (SIZE, 2 * SIZE, 3), "two panels without looks"
     assert [overlay_stride(timesteps) for timesteps in (1, 120, 121, 15000)] == [1, 1, 2, 125]
+    heat = heat_map(np.array([[0.0, 0.03, 0.08, 0.15, 9.0, np.nan]], np.float32)).astype(int).sum(-1)[0]
+    assert heat[5] == heat[0] < heat[1] < heat[2] < heat[3] == heat[4]
 
 
 def test_results_come_in_order_and_few_wait(monkeypatch):
@@ -138,14 +128,9 @@ def test_the_sheet_has_what_stands_out(case, truth):
     odd = replace(truth, pixel_residuals=residuals)
     frames = sheet_frames(odd, flagged=[3, 4], alone=[1])
     assert [frame.timestep for frame in frames] == sorted({frame.timestep for frame in frames})
-    assert {frame.timestep: frame.why for frame in frames if frame.why} == {4: "flagged", 1: "landmarks only"}
     rows = sheet_rows(case.capture, odd, case.model, frames)
-    assert [(row.name, row.odd) for row in rows if row.odd] == [
-        ("Frame 1, landmarks only", True),
-        ("Frame 4, flagged", True),
-    ]
-    assert {tile.shape for row in rows for tile in row.tiles} == {(240, 240, 3)}
-    assert {len(row.tiles) for row in rows} == {4}
+    assert [row.name for row in rows if row.odd] == ["Frame 1, landmarks only", "Frame 4, flagged"]
+    assert {tuple(tile.shape for tile in row.tiles) for row in rows} == {((240, 240, 3),) * 4}
     assert worst_of_runs([2, 3, 7], np.array([0, 0, 1, 5, 0, 0, 0, 3.0])) == [3, 7]
     assert name_runs([3, 7, 8, 9, 12]) == "3, 7-9, 12"
 
@@ -172,26 +157,23 @@ def test_the_page_says_aloud_what_decided(case, truth, tmp_path, schedule, appea
     assert page.count("data:image/") == panels * page.count('<figure class="card">') + 1, "all panels, and the poster"
     assert page.index("<video") < page.index("Findings")
     assert page.count("<svg") == (5 if appearance else 4)
-    assert 'class="dot second"' in page or not residual_report(case.capture, shown, case.model)["flagged_frames"]
-    odd = [text for kind, text in findings(shown, residual_report(case.capture, shown, case.model)) if kind == "odd"]
-    assert (said in odd) or said.split(" so ")[0] in " ".join(odd) or schedule == "landmarks" or alone == 0
+    found = findings(shown, residual_report(case.capture, shown, case.model))
+    odd = " ".join(text for kind, text in found if kind == "odd")
+    assert said.split(" so ")[0] in odd or schedule == "landmarks" or alone == 0
 
 
 @pytest.mark.parametrize("schedule", ["fast", "paper"])
 def test_tracked_faces_have_looks(case, schedule):
     short = PaperSettings(first_steps=60, steps=5, epochs=1, texture_size=128)
-    tracking = track(case.capture, case.model, replace(FAST, schedule=schedule, paper=short))
-    pictures = model_pictures(case.capture, tracking, case.model)
-    assert pictures is not None
+    tracking: Any = track(case.capture, case.model, replace(FAST, schedule=schedule, paper=short))
+    pictures: Any = model_pictures(case.capture, tracking, case.model)
     assert pictures.compare(3, 0, case.model(tracking.face[3])[0]).rms < 0.08
-    assert tracking.pixel_residuals is not None
     assert tracking.pixel_residuals.median() < 0.08
     assert residual_report(case.capture, tracking, case.model)["landmarks_only_frames"] == []
 
 
 @pytest.mark.unchecked
 def test_calibrated_cameras_in_another_world_are_compared_too(case, tmp_path):
-    """Calibrated cameras in another world are compared, too: light turns into the world, and cameras form a grid."""
     W_other = torch.eye(4)
     W_other[:3, :3] = matrix_from_axis_angle(torch.tensor([0.3, 1.2, -0.2]))
     W_other[:3, 3] = torch.tensor([1.0, 2.0, -0.5])
@@ -203,20 +185,111 @@ def test_calibrated_cameras_in_another_world_are_compared_too(case, tmp_path):
         case.capture, **both, images=np.repeat(images, 2, axis=1), camera_ids=("a", "b"), calibration=(camera, camera),
         principal_point=np.repeat(case.capture.principal_point, 2, axis=0),
     )  # fmt: skip
-    tracking = track(capture, case.model, FAST)
-    assert tracking.pixel_residuals is not None
-    pictures = model_pictures(capture, tracking, case.model)
-    assert pictures is not None
-    vertices = case.model(tracking.face[3])[0]
-    found = [pictures.compare(3, index, vertices).rms for index in (0, 1)]
+    tracking: Any = track(capture, case.model, FAST)
+    light = turn_light(tracking.appearance.light, W_other[:3, :3].T)
+    unturned, vertices = replace(tracking.appearance, light=light), case.model(tracking.face[3])[0]
+    looks = (tracking, replace(tracking, appearance=unturned))
+    both: Any = [model_pictures(capture, each, case.model) for each in looks]
+    found, wrong = ([pictures.compare(3, index, vertices).rms for index in (0, 1)] for pictures in both)
     assert found[0] == found[1]
     assert found[0] == pytest.approx(float(tracking.pixel_residuals[3, 0]), rel=0.3)
-    assert tracking.appearance is not None
-    unturned = replace(tracking.appearance, light=turn_light(tracking.appearance.light, W_other[:3, :3].T))
-    wrong = model_pictures(capture, replace(tracking, appearance=unturned), case.model)
-    assert wrong is not None
-    assert wrong.compare(3, 0, vertices).rms > 1.02 * found[0]
+    assert wrong[0] > 1.02 * found[0]
     write_overlay(tmp_path / "overlay.mp4", capture, tracking, case.model, every=3)
     assert probe_video(tmp_path / "overlay.mp4").frames == 2
     write_residual_report(tmp_path, capture, tracking, case.model)
     assert (tmp_path / "report.html").is_file()
+
+
+YAWS = (-80, -30, 0, 30, 80)
+LANDMARKS = TrackingSettings(schedule="landmarks")
+NAMES = tuple(f"at{yaw}" for yaw in YAWS)
+
+
+def camera_at(yaw: float) -> Camera:
+    head, angle = torch.tensor([0.0, 0.0, -0.9]), math.radians(yaw)
+    place = head + 0.9 * torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+    return replace(still_camera().to(torch.zeros(())), viewmat=look_at(place, head, torch.tensor([0.0, 1.0, 0.0])))
+
+
+model = pytest.fixture(scope="module")(lambda: make_small_face_model())
+
+
+@pytest.fixture(scope="module")
+def rig(model: FaceModel) -> Capture:
+    """Five cameras around a head. As a detector does, they misplace the landmarks that they do not see."""
+    case = make_tracking_case(timesteps=6, noise=0.2)
+    face = case.face.to(torch.zeros(()))
+    face = replace(face, head_rotation=0.3 * face.head_rotation)
+    vertices, random = model(face), np.random.default_rng(0)
+    marks = model.landmark_positions(vertices, "mediapipe")
+    seen = []
+    for camera in map(camera_at, YAWS):
+        pixels = camera.project(marks)[0].numpy() + random.normal(0, 0.3, (6, marks.shape[1], 2))
+        pixels[~visible_landmarks(model, vertices, camera).numpy()] += 25
+        seen.append(pixels)
+    many = {name: np.repeat(getattr(case.capture, name), 5, axis=1) for name in ("images", "mattes", "valid")}
+    return replace(
+        case.capture, **many, landmarks=np.stack(seen, 1).astype(np.float32), camera_ids=NAMES,
+        calibration=tuple(map(camera_at, YAWS)), principal_point=np.repeat(case.capture.principal_point, 5, axis=0),
+    )  # fmt: skip
+
+
+def told_of(rig: Capture, model: FaceModel, folder: Path, change: Callable[[Camera], Camera]) -> tuple[str, str]:
+    """Return what a tracking by changed cameras prints, and its page."""
+    assert rig.calibration is not None
+    capture = replace(rig, calibration=tuple(map(change, rig.calibration)))
+    told = write_residual_report(folder, capture, track(capture, model, LANDMARKS), model)
+    return told, (folder / "report.html").read_text()
+
+
+def test_cameras_at_the_side_are_no_failures(rig: Capture, model: FaceModel, tmp_path: Path, monkeypatch) -> None:
+    tracking = track(rig, model, LANDMARKS)
+    assert seen_from_front(tracking).tolist() == [[False, True, True, True, False]] * 6
+    report = residual_report(rig, tracking, model)
+    assert report["shared_misfit"] is None
+    assert report["cameras"]["at80"]["residual_px"]["median"] > 2 * report["residual_px"]["max"], "guesses look bad"
+    assert report["cameras"]["at80"]["from_front"] == 0
+    assert max(row["misplaced_px"] for row in report["cameras"].values()) < 6
+    assert "Warning" not in write_residual_report(tmp_path, rig, tracking, model)
+    painter = OverlayPainter(rig, tracking, model)
+    assert painter.caption(2, 4) == "at80 2: from the side"
+    assert painter.caption(2, 2).endswith(" px")
+    drawn: list[int] = []
+    monkeypatch.setattr(overlay, "draw_points", lambda _, points, __: drawn.append(len(points)))
+    for index in (2, 4):
+        painter.panels(2, index)
+    assert drawn[0] == drawn[1] > 1.2 * drawn[2] == 1.2 * drawn[3] > 0, "hidden landmarks are not drawn"
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("wrong", [1, 4])
+def test_a_camera_with_a_wrong_matrix_is_named(rig: Capture, model: FaceModel, tmp_path: Path, wrong: int) -> None:
+    cameras: Any = rig.calibration
+    up = 0.06 * torch.tensor([[0.0] * 4, [0, 0, 0, 1], [0.0] * 4, [0.0] * 4])
+
+    def moved(camera: Camera) -> Camera:
+        return replace(camera, viewmat=camera.viewmat + up) if camera is cameras[wrong] else camera
+
+    told, page = told_of(rig, model, tmp_path, moved)
+    assert told.count("Warning: camera") == 1
+    assert f"Warning: camera {NAMES[wrong]} shows the face" in told
+    assert "check its K, viewmat, id and offset" in page
+
+
+@pytest.mark.unchecked
+def test_cameras_that_misfit_together_are_warned_of(
+    rig: Capture, model: FaceModel, tmp_path: Path, monkeypatch
+) -> None:
+    """No camera and no frame stands out if all have a wrong focal length."""
+    monkeypatch.setattr("mien.capture.reading_fit.INSIDE_OUT", -math.inf)  # The small model has no nose.
+    longer = torch.tensor([[1.6, 1, 1], [1, 1.6, 1], [1, 1, 1]])
+    told, page = told_of(rig, model, tmp_path, lambda camera: replace(camera, K=camera.K * longer))
+    assert "Warning: all cameras together see landmarks" in told
+    assert "check that K is in pixels of the whole picture" in told
+    assert "No frame stands out." not in told
+    assert "the calibration as a whole does not fit" in page
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    world = invert_rigid(camera_at(YAWS[0]).viewmat) @ flip
+    told, _ = told_of(rig, model, tmp_path, lambda each: replace(each, viewmat=invert_rigid(each.viewmat @ world)))
+    assert "Warning: all cameras together see landmarks" in told
+    assert "the matrices go from camera to world, so write the inverse of each viewmat" in told
