@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from color_charts import to_light
 from mien.capture import Capture
 from mien.capture.tone import PQ, hlg_scene_light, pq_light
 from mien.capture.video import write_video
@@ -59,14 +60,11 @@ def scan_texture(test_data: Path) -> np.ndarray:
     return texture
 
 
-def write_gradient_video(
-    path: Path, frames: int = 5, width: int = 64, height: int = 48, fps: float = 25.0
-) -> np.ndarray:
+def write_gradient_video(path: Path, frames: int = 5, width: int = 64, height: int = 48, fps: float = 25.0):
     """Write a clip without any person, and return its frames."""
     y, x = np.mgrid[:height, :width]
-    pictures = np.stack(
-        [np.stack([x * 255 // width, y * 255 // height, (x * 0 + 8 * t) % 256], axis=-1) for t in range(frames)]
-    ).astype(np.uint8)
+    channels = [(x * 255 // width, y * 255 // height, (x * 0 + 8 * t) % 256) for t in range(frames)]
+    pictures = np.moveaxis(np.array(channels, np.uint8), 1, -1)
     write_video(path, iter(pictures), fps, crf=1)
     return pictures
 
@@ -100,19 +98,11 @@ def encode(
     ticks: Sequence[int] | None = None,
     prepare: Callable[[Any], object] = lambda stream: None,
 ) -> None:
-    """Encode a video with FFmpeg.
+    """Encode a video with FFmpeg, whose names of codecs and pixel formats are given.
 
-    Args:
-        path: Path of the video; its ending tells the container.
-        frames: Frames as RGB pictures [h, w, 3], as lists of planes of the pixel format, or as PyAV has them.
-        codec: FFmpeg's name of the codec.
-        pixels: FFmpeg's name of the pixel format, such as yuv444p10le.
-        rate: Frames a second, or units of `ticks`.
-        options: Options of the codec; without any, libx264 keeps nearly every level.
-        colors: Colours that the codec's header and the frames state.
-        tags: Colours that the container states; those of the header without it.
-        ticks: Times of the frames; by default the rate is even.
-        prepare: Changes the stream before anything is encoded.
+    Frames are RGB pictures [h, w, 3], lists of planes of the pixel format, or as PyAV has them. `ticks` are their times
+    in units of the rate. `colors` are stated by the codec's header and the frames, `tags` by the container. Without
+    options, libx264 keeps nearly every level. `prepare` changes the stream before anything is encoded.
     """
     given = [_frame_of(frame, pixels) for frame in frames]
     with av.open(str(path), "w") as container:
@@ -151,9 +141,7 @@ def _frame_of(given: np.ndarray | list[np.ndarray] | av.VideoFrame, pixels: str)
     return frame
 
 
-def write_planes(
-    path: Path, pictures: list[np.ndarray], pixels: str, colors: Codes = (1, 1, 1, 1), ticks: list[int] | None = None
-) -> None:
+def write_planes(path: Path, pictures: list[np.ndarray], pixels: str, colors: Codes = (1, 1, 1, 1), ticks=None) -> None:
     """Write a lossless .mkv (FFV1) of exactly these Y'CbCr planes [3, h, w], 4:4:4, at 25 frames a second or at ticks
     of milliseconds."""
     encode(path, list(map(list, pictures)), "ffv1", pixels, rate=1000 if ticks else 25, colors=colors, ticks=ticks)
@@ -182,8 +170,7 @@ def _inverse(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> n
 
 def light_of(srgb: np.ndarray) -> np.ndarray:
     """Return linear light, 0..1, of sRGB levels, 0..255."""
-    values = srgb / 255
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return to_light(srgb / 255)
 
 
 def hdr_signal(light: np.ndarray, transfer: int) -> np.ndarray:

@@ -36,10 +36,8 @@ def live_link_face(folder: Path, frames: Frames) -> Path:
 
 
 def plain(folder: Path, frames: Frames) -> Path:
-    return write_json(
-        folder / "plain.json",
-        [{"timestamp_ms": 33 * index, "blendshapes": scores} for index, scores in enumerate(frames)],
-    )
+    listed = [{"timestamp_ms": 33 * index, "blendshapes": scores} for index, scores in enumerate(frames)]
+    return write_json(folder / "plain.json", listed)
 
 
 def landmarker_in_javascript(folder: Path, frames: Frames) -> Path:
@@ -78,10 +76,8 @@ def audio2face(folder: Path, frames: Frames) -> Path:
     names = [name[0].upper() + name[1:] for name in ARKIT_NAMES]
     weights = [[scores.get(name, 0.0) for name in ARKIT_NAMES] for scores in frames]
     counts = {"numPoses": len(names), "numFrames": len(weights)}
-    return write_json(
-        folder / "audio.json",
-        {"exportFps": 30, **counts, "facsNames": names, "weightMat": weights, "trackPath": "a.wav"},
-    )
+    content = {"exportFps": 30, **counts, "facsNames": names, "weightMat": weights, "trackPath": "a.wav"}
+    return write_json(folder / "audio.json", content)
 
 
 LAYOUTS: dict[str, list[Callable[[Path, Frames], Path]]] = {

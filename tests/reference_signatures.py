@@ -35,9 +35,8 @@ mm; one such step is allowed."""
 def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     """Return the means and standard deviations of picture blocks, the means of matte blocks, landmarks and vertices.
 
-    The pictures are those of the first, middle and last timestep from the first and the last camera. Each part is a
-    flat list: means and spreads of colours and means of mattes in grey levels, landmarks in pixels, vertices in
-    millimetres.
+    The pictures are those of the first, middle and last timestep from the first and the last camera. The parts are flat
+    lists in grey levels, pixels and millimetres.
     """
     timesteps = sorted({0, scene.timesteps // 2, scene.timesteps - 1})
     cameras = sorted({0, len(scene.cameras) - 1})

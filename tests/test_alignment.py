@@ -128,7 +128,6 @@ def test_what_a_hand_covers_gets_the_corrections_of_its_neighbours() -> None:
 
 
 def test_corrections_of_the_pose_are_averaged_over_time() -> None:
-    """Slow changes stay, and trembling goes."""
     tracked = make_experiment(12).faces[0]
     tracked = replace(tracked, head_rotation=tracked.head_rotation[:1].repeat(12, 1))
     slow = torch.linspace(0, 0.01, 12)[:, None] * torch.tensor([1.0, -1.0, 0.5])

@@ -155,28 +155,25 @@ BACKWARDS = np.diag([-1.0, 1, -1, 1])
 """Turns a camera to the other side, as one with OpenGL's axes looks."""
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (first(id="other"), "no camera 'left', it has back, middle, other, right, top"),
-        (lambda e: [*e, {**e[0], "id": "extra"}], "there is no video of the camera extra"),
-        (lambda e: [e[0], *e], "two cameras have the id 'left'"),
-        (first(width=300), "calibration is for pictures of 300x300, its video has 400x300"),
-        (first(viewmat=np.zeros((4, 4)).tolist()), "viewmat is not a rotation and translation"),
-        (first(K=np.zeros((3, 3)).tolist()), "focal lengths 0 and 0, which must be above 0"),
-        (first(K=[1, 2]), "K must be 3x3"),
-        (lambda e: [{"K": e[0]["K"]}, *e[1:]], "camera 0: has no `id`"),
-        (lambda e: [{"id": "left"}, *e[1:]], r"camera 0 \(left\): has no K, viewmat, width, height"),
-        (first(offset=-1), "offset -1 is not a number of frames"),
-        (first(id="../x"), "cannot be an id"),
-        (first(offset=FRAMES), f"its offset of {FRAMES} leaves no frame of .*left"),
-        (lambda e: [e[0], viewed(e[1], lambda m: BACKWARDS @ m), *e[2:]],
-         "middle finds a face, but the other cameras see the head behind"),
-        (lambda e: [], "has no list `cameras`"),
-        (lambda e: [viewed(entry, lambda m: THOUSAND @ m @ np.linalg.inv(THOUSAND)) for entry in e],
-         "the face is .* m wide, but it should be about 0.15"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("change", "message"), [
+    (first(id="other"), "no camera 'left', it has back, middle, other, right, top"),
+    (lambda e: [*e, {**e[0], "id": "extra"}], "there is no video of the camera extra"),
+    (lambda e: [e[0], *e], "two cameras have the id 'left'"),
+    (first(width=300), "calibration is for pictures of 300x300, its video has 400x300"),
+    (first(viewmat=np.zeros((4, 4)).tolist()), "viewmat is not a rotation and translation"),
+    (first(K=np.zeros((3, 3)).tolist()), "focal lengths 0 and 0, which must be above 0"),
+    (first(K=[1, 2]), "K must be 3x3"),
+    (lambda e: [{"K": e[0]["K"]}, *e[1:]], "camera 0: has no `id`"),
+    (lambda e: [{"id": "left"}, *e[1:]], r"camera 0 \(left\): has no K, viewmat, width, height"),
+    (first(offset=-1), "offset -1 is not a number of frames"),
+    (first(id="../x"), "cannot be an id"),
+    (first(offset=FRAMES), f"its offset of {FRAMES} leaves no frame of .*left"),
+    (lambda e: [e[0], viewed(e[1], lambda m: BACKWARDS @ m), *e[2:]],
+     "middle finds a face, but the other cameras see the head behind"),
+    (lambda e: [], "has no list `cameras`"),
+    (lambda e: [viewed(entry, lambda m: THOUSAND @ m @ np.linalg.inv(THOUSAND)) for entry in e],
+     "the face is .* m wide, but it should be about 0.15"),
+])  # fmt: skip
 def test_calibration_that_does_not_fit_is_refused(rig, tmp_path, change, message):
     with pytest.raises(UserError, match=message) as found:
         capture_changed(rig, tmp_path, change, max_frames=1)

@@ -105,7 +105,6 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
 
 
 def test_folder_of_images_in_natural_order(test_data, tmp_path):
-    """Frames without a face are marked."""
     folder, face = tmp_path / "pictures", face_picture(test_data, 128)
     folder.mkdir()
     for number in (2, 10, 1):

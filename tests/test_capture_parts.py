@@ -9,7 +9,7 @@ from mien.capture import CaptureSettings, capture_video_parts
 from mien.capture.crop import choose_crop, whole_picture
 from mien.capture.faces import second_difference_jitter
 from mien.capture.given import read_landmarks
-from mien.capture.matte import guided_filter, refine_matte
+from mien.capture.matte import refine_matte
 from mien.capture.plate import plate_matte
 from mien.capture.video import write_video
 from mien.errors import UserError
@@ -62,19 +62,6 @@ def test_jitter_is_the_second_difference():
     steady[5] = np.nan
     assert second_difference_jitter(steady) == pytest.approx(1.0)
     assert np.isnan(second_difference_jitter(steady[:2]))
-
-
-def test_guided_filter_steps_where_the_picture_does():
-    guide = np.full((64, 80, 3), 0.2, np.float32)
-    guide[:, 40:] = (0.8, 0.6, 0.5)
-    soft = np.broadcast_to(np.clip((np.arange(80) - 35) / 10, 0, 1), (64, 80)).astype(np.float32)
-    filtered = guided_filter(guide, soft, radius=8, epsilon=1e-4)
-    steps = np.diff(filtered, axis=1)[8:-8]
-    assert (steps.argmax(axis=1) == 39).all()
-    assert steps.max(axis=1).min() > 0.4  # the input deviates by 0.1
-    # Values that follow the guide exactly pass unchanged.
-    linear = guide @ np.array([0.3, 0.2, 0.1], np.float32)
-    np.testing.assert_allclose(guided_filter(guide, linear, 8, 1e-4)[:, 44:], linear[:, 44:], atol=5e-3)
 
 
 def test_matte_has_its_border_on_the_edge_of_the_picture():

@@ -212,7 +212,6 @@ def seen_of(frames: list) -> list[float | None]:
 
 
 def test_the_largest_and_most_persistent_is_followed():
-    """Nobody takes the place of who is away."""
     passing, stranger = (0.5, 0.5, 0.45, 0.5), (*ANN[:3], 0.3)
     walking = [[(0.75 - 0.025 * step, *BOB[1:])] for step in range(18)]
     for frames, seen in (

@@ -1,20 +1,33 @@
-"""Captures on disk survive a round trip, keep a cache, and report damage."""
+"""Captures on disk survive a round trip, keep a cache, and report damage. The room that one takes is said before."""
 
 import contextlib
 import dataclasses
 import os
 import runpy
 import shutil
+from collections import namedtuple
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from capture_helpers import assert_same_capture, random_capture, tree_bytes
+from capture_helpers import assert_same_capture, random_capture, tree_bytes, write_face_clip
 from damage import edit_json
 from mien.camera import camera_from_fov
-from mien.capture import frame_files, read_capture, read_capture_hash, write_capture
+from mien.capture import (
+    CaptureSettings,
+    capture_video,
+    frame_files,
+    process,
+    read_capture,
+    read_capture_hash,
+    write_capture,
+)
+from mien.capture.frame_files import FrameLayout
+from mien.capture.room import capture_bytes, check_room
+from mien.cli import main
 from mien.errors import UserError
 
 
@@ -26,7 +39,6 @@ def stored(tmp_path):
 
 
 def test_round_trip_is_exact_and_maps_memory(tmp_path):
-    """The hash follows all of the content, calibrations as well."""
     capture = random_capture()
     cameras = tuple(camera_from_fov(0.5 + 0.1 * index, capture.width, capture.height) for index in range(2))
     hashes = {write_capture(tmp_path / "capture", each) for each in (capture, capture)}
@@ -78,9 +90,6 @@ def test_stale_cache_is_rebuilt(stored):
         damage()
         assert_same_capture(random_capture(), read_capture(stored))
         assert tree_bytes(stored) == before
-
-
-def test_cache_that_cannot_be_written_is_made_elsewhere(stored):
     shutil.rmtree(stored / "cache")
     (stored / "cache").touch()  # a file in the way, as a read-only disk would be for a user
     assert_same_capture(random_capture(), read_capture(stored))
@@ -163,3 +172,50 @@ def test_interrupted_writing_leaves_the_old_capture(stored, monkeypatch):
         write_capture(stored, random_capture(seed=1))
     monkeypatch.undo()
     assert_same_capture(random_capture(), read_capture(stored))
+
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def leave(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(1 << 40, 0, free))
+
+
+def test_the_estimate_is_above_what_noise_without_pngs_takes(tmp_path: Path, monkeypatch, capsys) -> None:
+    capture, out = random_capture(timesteps=3, height=60, width=80), tmp_path / "capture"
+    write_capture(out, capture)
+    raw = sum(path.stat().st_size for path in (out / "cache").glob("*.u8"))
+    assert raw < capture_bytes(FrameLayout(out, capture.camera_ids, 3, 60, 80)) < 2 * raw
+    layout = FrameLayout(tmp_path, tuple(f"{index:02}" for index in range(16)), 600, 802, 550)
+    leave(monkeypatch, 10**12)
+    check_room(layout, "talk", out)
+    told = capsys.readouterr().err.strip()
+    assert told.endswith("talk: 600 frames of 550x802 by 16 cameras take about 23.3 GB on disk")
+    leave(monkeypatch, 10**10)
+    with pytest.raises(UserError, match=r"take about 23\.3 GB on disk, and there are 10\.0 GB left; free disk space"):
+        check_room(layout, "talk", out)
+    # What an interrupted run has written counts as room, and a hole in a file does not.
+    layout = FrameLayout(tmp_path / "work", ("front",), 100, 200, 200)
+    cache = layout.folder / "cache"
+    cache.mkdir(parents=True)
+    leave(monkeypatch, capture_bytes(layout) - 10**6)
+    with (cache / "hole.u8").open("wb") as file:
+        file.truncate(10**8)
+    with pytest.raises(UserError, match="left"):
+        check_room(layout, "s", out)
+    (cache / "frames.u8").write_bytes(bytes(range(256)) * 8000)
+    check_room(layout, "s", out)
+
+
+def test_too_little_room_is_refused_before_a_picture_is_written(test_data, tmp_path, monkeypatch, capsys) -> None:
+    clip = tmp_path / "face.mp4"
+    write_face_clip(clip, test_data)
+    leave(monkeypatch, 10**6)
+    with monkeypatch.context() as patched:
+        patched.setattr(process, "FrameWriter", lambda *_: pytest.fail("pictures were written"))
+        assert main(["capture", str(clip), "--out", str(tmp_path / "w"), "--capture.size", "200"]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "12 frames of 200x200 take about 3 MB on disk, and there are 1 MB left; free disk space" in error
+    assert not (tmp_path / "w" / "sequences").exists()
+    leave(monkeypatch, 10**9)
+    assert capture_video(clip, tmp_path / "capture", CaptureSettings(size=200)).timesteps == 12

@@ -49,16 +49,13 @@ def test_equal_pictures_give_equal_files(tmp_path):
     assert len(files) == 1
 
 
-@pytest.mark.parametrize(
-    ("degrees", "mirrored", "turn"),
-    [
-        (90, False, lambda picture: np.rot90(picture, 1)),
-        (-90, False, lambda picture: np.rot90(picture, -1)),
-        (180, False, lambda picture: np.rot90(picture, 2)),
-        (0, True, lambda picture: picture[:, ::-1]),
-        (90, True, lambda picture: np.rot90(picture, 1)[:, ::-1]),
-    ],
-)
+@pytest.mark.parametrize(("degrees", "mirrored", "turn"), [
+    (90, False, lambda picture: np.rot90(picture, 1)),
+    (-90, False, lambda picture: np.rot90(picture, -1)),
+    (180, False, lambda picture: np.rot90(picture, 2)),
+    (0, True, lambda picture: picture[:, ::-1]),
+    (90, True, lambda picture: np.rot90(picture, 1)[:, ::-1]),
+])  # fmt: skip
 def test_rotation_and_mirror_flags_are_applied(tmp_path, degrees, mirrored, turn):
     picture = np.zeros((48, 64, 3), np.uint8)
     picture[:24, :20] = 255

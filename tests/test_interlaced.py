@@ -10,6 +10,7 @@ import pytest
 from av.filter import Graph
 
 from capture_helpers import encode
+from mien.capture.deinterlacing import Deinterlace
 from mien.capture.fields import FieldOrder, combs, deinterlace
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames
 
@@ -25,7 +26,7 @@ def pattern() -> np.ndarray:
     return np.clip((smooth - smooth.mean()) * 4 + 128, 16, 235)
 
 
-def read_twice(path: Path, mode: str = "never") -> list[list[LazyFrame]]:
+def read_twice(path: Path, mode: Deinterlace = "never") -> list[list[LazyFrame]]:
     """Return the frames as they are read by default, and in another mode."""
     return [list(read_lazily(path)), list(read_lazily(path, mode=mode))]
 
@@ -98,7 +99,6 @@ def green(frame: LazyFrame) -> np.ndarray:
     ("kind", "order"), [*((kind, "tff") for kind in CODECS), *((kind, "bff") for kind in ("h264.mp4", "raw.mov"))]
 )
 def test_each_interlaced_frame_becomes_one_picture_of_its_first_moment(kind, order, pattern, tmp_path):
-    """The container marks a clip where the codec's frames cannot."""
     path, natural = tmp_path / kind, bend_ratio(moment(pattern, 0))
     write(path, kind, flagged(woven(pattern, order), CODECS[kind][1], [order] * FRAMES), CONTAINER_ORDERS[order])
     frames, as_stored = read_twice(path)
@@ -156,13 +156,10 @@ def test_a_turned_interlaced_clip_is_upright(pattern, tmp_path):
     assert np.abs(green(frames[2]).astype(int) - upright).mean() < 7
 
 
-@pytest.mark.parametrize(
-    ("pixels", "size"),
-    [
-        *((pixels, (3, 9)) for pixels in ("nv12", "rgb24", "gray", "gray16le", "yuvj420p", "yuv411p", "uyvy422")),
-        *((pixels, (64, 48)) for pixels in ("nv12", "p010le")),
-    ],
-)
+@pytest.mark.parametrize(("pixels", "size"), [
+    *((pixels, (3, 9)) for pixels in ("nv12", "rgb24", "gray", "gray16le", "yuvj420p", "yuv411p", "uyvy422")),
+    *((pixels, (64, 48)) for pixels in ("nv12", "p010le")),
+])  # fmt: skip
 def test_any_format_and_size_passes(pixels, size):
     frames = flagged([np.full((size[1], size[0]), 180, np.uint8)] * 3, pixels, ["tff"] * 3)
     for count in (1, 2, 3):
@@ -176,7 +173,6 @@ def test_any_format_and_size_passes(pixels, size):
 
 
 def test_a_clip_that_changes_its_size_passes(pattern):
-    """Few frames are held."""
     frames = flagged(woven(pattern, "tff", 4), "yuv420p", ["tff"] * 4)
     smaller = flagged([picture[:64, :64] for picture in woven(pattern, "tff", 4)], "yuv420p", ["tff"] * 4)
     given, read, found = frames[:2] + smaller[:3] + frames[2:], [], []

@@ -1,63 +1,75 @@
-"""Motion of other programs, as Live Link Face's csv or as json of blend shapes, is read, refused and applied."""
+"""Recordings of other programs, as Live Link Face's csv or as json of blend shapes, are read, refused and applied."""
 
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from mien.camera import camera_from_fov, look_at
-from mien.driving import ARKIT_NAMES, drive, face_of_motion, read_blendshape_json, read_live_link_face
-from mien.driving.motion import Motion, gaze_of
+from mien.driving import (
+    ARKIT_NAMES,
+    Motion,
+    drive,
+    face_of_motion,
+    read_blendshape_json,
+    read_live_link_face,
+    read_recording,
+)
+from mien.driving.motion import gaze_of
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.named import LOOK_ANGLE
-from recordings import COLUMNS, row, write_csv, write_json
+from recordings import COLUMNS, LAYOUTS, STILL, Frames, row, write_csv, write_json
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model
 
 
-def jaw(motion) -> list[float]:
-    return motion.coefficients[:, ARKIT_NAMES.index("jawOpen")].tolist()
+def jaw(motion: Motion) -> list[float]:
+    return np.round(motion.coefficients[:, ARKIT_NAMES.index("jawOpen")], 6).tolist()
+
+
+def read_rows(folder: Path, *rows: list[str], fps: float | None = None) -> Motion:
+    return read_live_link_face(write_csv(folder / "a.csv", *rows), fps)
 
 
 def test_values_times_and_turns(tmp_path: Path) -> None:
+    """Head angles follow Unreal: yaw to the subject's right, pitch down, roll to the left shoulder."""
     assert (len(COLUMNS), COLUMNS[2], COLUMNS[53:55]) == (63, "EyeBlinkLeft", ["TongueOut", "HeadYaw"])
     first = row("11:59:59:58.5", JawOpen=0.25, HeadYaw=0.3, EyeLookOutLeft=1, EyeLookInRight=1, EyeLookDownLeft=0.5)
-    motion = read_live_link_face(write_csv(tmp_path / "a.csv", first, row("11:59:59:59.5", JawOpen=0.5),
-                                           row("12:00:00:00.5", JawOpen=1, HeadPitch=-0.2)))  # fmt: skip
+    rows = row("11:59:59:59.5", JawOpen=0.5), row("12:00:00:00.5", JawOpen=1, HeadPitch=-0.2)
+    motion = read_rows(tmp_path, first, *rows)
     assert motion.fps == pytest.approx(60)
     assert jaw(motion) == [0.25, 0.5, 1]
-    np.testing.assert_allclose(motion.head_rotation[0], [0, -0.3, 0], atol=1e-6)
-    np.testing.assert_allclose(motion.head_rotation[2], [-0.2, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(motion.head_rotation[[0, 2]], [[0, -0.3, 0], [-0.2, 0, 0]], atol=1e-6)
     # Both eyes to the subject's left, the left one down as well.
     np.testing.assert_allclose(motion.eyes[0], [[LOOK_ANGLE / 2, LOOK_ANGLE, 0], [0, LOOK_ANGLE, 0]], atol=1e-6)
     assert motion.lost == 0
+    by_angles = read_rows(tmp_path, row("0:0:0:0", LeftEyeYaw=0.2, RightEyePitch=0.1))
+    np.testing.assert_allclose(by_angles.eyes[0], [[0, -0.2, 0], [0.1, 0, 0]], atol=1e-6)
+    rotation = read_rows(tmp_path, row("0:0:0:0", HeadYaw=0.3, HeadPitch=0.2, HeadRoll=0.1)).head_rotation[0]
+    turned = matrix_from_axis_angle(torch.from_numpy(rotation)).numpy()
+    ahead_and_left = [turned[0, 2], turned[1, 2], turned[1, 0]]
+    expected = [math.sin(0.3) * math.cos(0.2), math.sin(0.2), math.sin(0.1) * math.cos(0.2)]
+    assert ahead_and_left == pytest.approx([-value for value in expected], abs=1e-6)
 
 
 def test_the_rate_is_the_lowest_that_has_the_frame_numbers(tmp_path: Path) -> None:
     """Frames of 30 a second have the numbers 0 to 29, so the number 30 means 48, the next rate."""
     for largest, rate in ((29, 30), (30, 48)):
         rows = [row(f"0:00:0{second}:{frame:02d}.0") for second in (0, 1) for frame in range(largest + 1)]
-        motion = read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
+        motion = read_rows(tmp_path, *rows)
         assert (len(motion) - 1) / motion.fps == pytest.approx(1 + largest / rate, abs=0.02)
-
-
-def test_dropped_rows_are_interpolated_and_lost_faces_held(tmp_path: Path) -> None:
-    lost = ["0:00:00:05.0", "0"]
+    # Dropped rows are interpolated and lost faces held.
     rows = [row(f"0:00:00:0{index}.0", JawOpen=index / 10) for index in (0, 1, 3, 4)]
-    motion = read_live_link_face(write_csv(tmp_path / "a.csv", *rows, lost, row("0:00:00:06.0", JawOpen=0)))
+    motion = read_rows(tmp_path, *rows, ["0:00:00:05.0", "0"], row("0:00:00:06.0", JawOpen=0))
     np.testing.assert_allclose(jaw(motion), [0, 0.1, 0.2, 0.3, 0.4, 0.4, 0], atol=1e-6)
     assert motion.lost == 1
-
-
-def test_eye_angles_count_where_coefficients_do_not(tmp_path: Path) -> None:
-    motion = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", LeftEyeYaw=0.2, RightEyePitch=0.1)))
-    np.testing.assert_allclose(motion.eyes[0], [[0, -0.2, 0], [0.1, 0, 0]], atol=1e-6)
 
 
 REAL_LOOKS = (
@@ -70,30 +82,22 @@ REAL_LOOKS = (
 
 
 def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
-    """Angles have the signs of real takes: yaw to the right and pitch down agree with the eyeLook coefficients."""
     columns = ("EyeLookDown", "EyeLookIn", "EyeLookOut", "EyeLookUp")
     for left, right, left_angles, right_angles in REAL_LOOKS:
         looks, angles = {}, {}
         for side, coefficients, turns in (("Left", left, left_angles), ("Right", right, right_angles)):
             looks |= {f"{name}{side}": value for name, value in zip(columns, coefficients, strict=True)}
             angles |= {f"{side}Eye{name}": value for name, value in zip(("Yaw", "Pitch", "Roll"), turns, strict=True)}
-        by_looks = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **looks))).eyes[0]
-        by_angles = read_live_link_face(write_csv(tmp_path / "b.csv", row("0:0:0:0", **angles))).eyes[0]
+        by_looks, by_angles = (read_rows(tmp_path, row("0:0:0:0", **given)).eyes[0] for given in (looks, angles))
         # The calibration decides where the eyes look straight ahead. On these takes it differs by up to 7 degrees.
         assert np.abs(by_looks - by_angles).max() < math.radians(9)
         # A gaze up and to the side has hardly any torsion, once its roll is taken the right way.
         assert np.abs(by_angles[:, 2]).max() < 0.12
 
 
-def test_head_angles_are_unreals(tmp_path: Path) -> None:
-    """Head angles follow Unreal: yaw to the subject's right, pitch down, roll to the left shoulder."""
-    turns = {"HeadYaw": 0.3, "HeadPitch": 0.2, "HeadRoll": 0.1}
-    rotation = read_live_link_face(write_csv(tmp_path / "a.csv", row("0:0:0:0", **turns))).head_rotation[0]
-    turned = matrix_from_axis_angle(torch.from_numpy(rotation)).numpy()
-    ahead, left = turned[:, 2], turned[:, 0]
-    assert ahead[0] == pytest.approx(-math.sin(0.3) * math.cos(0.2), abs=1e-6)
-    assert ahead[1] == pytest.approx(-math.sin(0.2), abs=1e-6)
-    assert left[1] == pytest.approx(-math.sin(0.1) * math.cos(0.2), abs=1e-6)
+def rows_of(*timecodes: str) -> list[list[str]]:
+    """Rows with these timecodes, whose jaw opens by a tenth from one to the next."""
+    return [row(timecode, JawOpen=index / 10) for index, timecode in enumerate(timecodes)]
 
 
 def test_bad_csv_files(tmp_path: Path) -> None:
@@ -105,7 +109,8 @@ def test_bad_csv_files(tmp_path: Path) -> None:
         ([row("0:00:00:02.0", JawOpen="")], COLUMNS, "line 2: JawOpen is ''"),
         ([row("0:00:00:02.0", JawOpen=45)], COLUMNS, "line 2: JawOpen is 45; coefficients go from 0 to 1"),
         ([row("0:00:00:02.0", HeadYaw=20)], COLUMNS, "convert it if it is in degrees"),
-        ([good, good], COLUMNS, "line 3: its Timecode does not come after"),
+        (rows_of("1:0:0:5", "1:0:0:9", "1:0:0:6"), COLUMNS, "line 4: its Timecode does not come after"),
+        (rows_of("1:0:0:5", "1:0:0:5", "1:0:0:5"), COLUMNS, "line 3: its Timecode does not come after"),
         ([row("soon")], COLUMNS, "line 2: Timecode 'soon'"),
         ([good[:30]], COLUMNS, "line 2: has 30 of 63 values"),
         ([[*good[:1], "0"]], COLUMNS, "no row has a face"),
@@ -113,19 +118,11 @@ def test_bad_csv_files(tmp_path: Path) -> None:
     ):
         with pytest.raises(UserError, match=part):
             read_live_link_face(write_csv(tmp_path / "a.csv", *rows, columns=columns))
+    with pytest.raises(UserError, match="--fps 24: its frame numbers go up to 29; give more"):
+        read_rows(tmp_path, *rows_of("1:0:0:28", "1:0:0:29", "1:0:1:0"), fps=24.0)
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x81" * 9)
     with pytest.raises(UserError, match="cannot be read as csv"):
         read_live_link_face(tmp_path / "b.csv")
-
-
-def test_plain_json(tmp_path: Path) -> None:
-    """Plain json of blend shapes is read, and a frame without a face repeats the one before."""
-    frames = [{"timestamp_ms": 40 * i, "blendshapes": {"jawOpen": i / 4, "_neutral": 0.9}} for i in range(4)]
-    frames[2]["blendshapes"] = None
-    motion = read_blendshape_json(write_json(tmp_path / "a.json", frames))
-    assert motion.fps == pytest.approx(25)
-    assert jaw(motion) == [0, 0.25, 0.25, 0.75]
-    assert motion.lost == 1
 
 
 def test_face_landmarker_results(tmp_path: Path) -> None:
@@ -143,26 +140,28 @@ def test_face_landmarker_results(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion.head_translation[0], [0.01, 0.02, -0.45], atol=1e-6)
     none = {"faceBlendshapes": [], "facialTransformationMatrixes": []}
     assert read_blendshape_json(write_json(tmp_path / "b.json", [none, result])).lost == 1
+    # In plain json a frame without a face repeats the one before.
+    shapes = [{"jawOpen": 0, "_neutral": 0.9}, {"jawOpen": 0.25}, None, {"jawOpen": 0.75}]
+    frames = [{"timestamp_ms": 40 * index, "blendshapes": one} for index, one in enumerate(shapes)]
+    motion = read_blendshape_json(write_json(tmp_path / "a.json", frames))
+    assert (motion.fps, motion.lost) == (pytest.approx(25), 1)
+    assert jaw(motion) == [0, 0.25, 0.25, 0.75]
 
 
 def test_bad_json_files(tmp_path: Path) -> None:
     good = {"timestamp_ms": 0, "blendshapes": {}}
     for content, part in (
         ([], "is not a list of frames"),
-        ("jawOpen", "is not a list of frames"),
         ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
         ([good, good], "frame 1: its timestamp_ms does not come after"),
         ([good, {"blendshapes": {}}], "frame 1: timestamp_ms is None"),
+        ([{**good, "timestamp_ms": 5}, good], "frame 1: its timestamp_ms does not come after"),
         ([{"blendshapes": {"jawopen": 1}}], "did you mean jawOpen"),
         ([{"blendshapes": {"jawOpen": float("nan")}}], "jawOpen is nan"),
-        ([{"blendshapes": {"jawOpen": "wide"}}], "jawOpen is 'wide'"),
         ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"),
         ([{"blendshapes": None}], "no frame has a face"),
         ([{"faceBlendshapes": [{"categories": [{}]}]}], "layout of a FaceLandmarker"),
-        (
-            [{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}],
-            "layout of a FaceLandmarker",
-        ),
+        ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}], "layout of a FaceLandmarker"),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
     ):
         with pytest.raises(UserError, match=part):
@@ -175,10 +174,9 @@ def test_bad_json_files(tmp_path: Path) -> None:
 def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     names = ("jawOpen", "mouthLeft", *(f"other{i}" for i in range(6)))
     model = replace(make_small_face_model(), expression_names=names)
-    rows = [
+    motion = read_rows(tmp_path, *(
         row(f"0:00:00:0{i}.0", JawOpen=i / 10, EyeLookUpLeft=1, EyeLookUpRight=1, HeadYaw=0.1 * i) for i in range(3)
-    ]
-    motion = read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
+    ))  # fmt: skip
     face, at_rest = face_of_motion(motion, model)
     rest = model.neutral()
     rest = replace(rest, expression=rest.expression + 0.05, head_translation=torch.tensor([[0.0, 0, -0.6]]))
@@ -214,3 +212,141 @@ def test_eyes_that_look_up_and_down_stay_open() -> None:
     assert ahead > 100
     for name in ("eyeLookUp", "eyeLookDown"):
         assert visible(name, 1.0) > 0.3 * ahead, name
+
+
+def test_a_take_goes_on_after_midnight(tmp_path: Path) -> None:
+    times = [(23, 59, 58), (23, 59, 59), (0, 0, 0), (0, 0, 1)]
+    codes = [f"{h:02d}:{m:02d}:{s:02d}:{f:02d}.451" for h, m, s in times for f in range(0, 60, 2)]
+    motion = read_rows(tmp_path, *map(row, codes))
+    assert (len(motion), motion.fps) == (120, pytest.approx(30))
+    assert motion.notes == ()
+
+
+def test_a_timecode_that_comes_twice_costs_one_row(tmp_path: Path) -> None:
+    path, codes = tmp_path / "a.csv", ("1:0:0:0", "1:0:0:1", "1:0:0:1", "1:0:0:0.5", "1:0:0:2", "1:0:0:4")
+    motion = read_rows(tmp_path, *rows_of(*codes))
+    np.testing.assert_allclose(jaw(motion), [0, 0.1, 0.4, 0.45, 0.5], atol=1e-6)
+    assert motion.notes == (f"{path}, line 4: has the time of a row before it and is left out; 2 in all",)
+    frames = [{"timestamp_ms": time, "blendshapes": {"jawOpen": 0.1}} for time in (0, 40, 40, 80)]
+    motion = read_blendshape_json(write_json(tmp_path / "a.json", frames))
+    assert len(motion) == 3
+    assert "frame 2: has the time of a row before it and is left out; 1 in all" in motion.notes[0]
+
+
+@pytest.mark.parametrize("separator", [";", "\t", ","])
+@pytest.mark.parametrize("hint", ["", "sep={}\n"])
+def test_a_csv_that_a_spreadsheet_saved(tmp_path: Path, separator: str, hint: str) -> None:
+    rows = [row(f"0:00:00:0{index}.5", JawOpen=index / 8, HeadYaw=0.25) for index in range(3)]
+    quote = '"' if separator == "," else ""
+    lines = [separator.join(f"{quote}{cell.replace('.', ',')}{quote}" for cell in cells) for cells in (COLUMNS, *rows)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([hint.format(separator) + lines[0], *lines[1:]]), encoding="utf-8-sig")
+    motion = read_live_link_face(path)
+    assert jaw(motion) == [0, 0.125, 0.25]
+    assert motion.head_rotation[0] == pytest.approx([0, -0.25, 0])
+
+
+def test_a_missing_tongue_is_said(tmp_path: Path, capsys) -> None:
+    rows = [[*cells[:53], *cells[54:]] for cells in (COLUMNS, *rows_of("0:0:0:1"))]
+    path = write_csv(tmp_path / "a.csv", *rows[1:], columns=rows[0])
+    motion = read_live_link_face(path)
+    assert motion.notes == (f"{path}: has no column TongueOut, so the tongue stays in",)
+    assert (motion.coefficients[:, ARKIT_NAMES.index("tongueOut")] == 0).all()
+    read_recording(path, replace(make_small_face_model(), expression_names=("jawOpen", *map(str, range(7)))))
+    assert "has no column TongueOut" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("write", [write for writers in LAYOUTS.values() for write in writers])
+def test_every_layout_gives_the_same_motion(write, tmp_path: Path) -> None:
+    frames: Frames = [{"jawOpen": index / 8, "eyeBlinkLeft": 0.5, "browInnerUp": 0.25} for index in range(5)]
+    path = write(tmp_path, frames)
+    motion = read_live_link_face(path) if path.suffix == ".csv" else read_blendshape_json(path)
+    assert jaw(motion) == [0, 0.125, 0.25, 0.375, 0.5]
+    assert motion.coefficients[:, ARKIT_NAMES.index("eyeBlinkLeft")].tolist() == [0.5] * 5
+    assert motion.coefficients.sum() == pytest.approx(1.25 + 5 * 0.75)
+    assert motion.fps == pytest.approx(30, rel=0.02)
+    assert motion.notes == ()
+    if "facial_transformation_matrixes" in path.read_text():
+        assert motion.head_translation[0] == pytest.approx([0, 0, -0.4])
+
+
+def test_units_of_times(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+
+    def read(key: str, step: float, count: int = 120) -> Motion:
+        return read_blendshape_json(write_json(path, [{key: step * i, "blendshapes": {}} for i in range(count)]))
+
+    assert len(read("time", 1 / 60)) / read("time", 1 / 60).fps == pytest.approx(2.0)
+    assert read("timestampMs", 1000 / 60).fps == pytest.approx(60)
+    assert read("time", 2.0).fps == pytest.approx(0.5)
+    for key, step, words in (
+        ("timestamp_ms", 1 / 30, 'goes up by 0.03333 a frame, so there would be 30,000 .*or call seconds "time"'),
+        ("timestamp_ms", 33333.0, "goes up by 3.333e[+]04 a frame, so a frame would last 33 s; give milliseconds"),
+        ("time", 33.3, 'goes up by 33.3 a frame, so a frame would last 33 s; .*or call milliseconds "timestamp_ms"'),
+        ("time", 1e-4, "10,000 frames in a second; give seconds"),
+    ):
+        with pytest.raises(UserError, match=words):
+            read(key, step)
+
+
+def test_missing_times_are_said(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "a.json", [{"blendshapes": {"jawOpen": 0.5}}] * 3)
+    motion = read_blendshape_json(path)
+    assert motion.fps == pytest.approx(30)
+    line = f'{path}: has no times ("timestamp_ms", or "time" in seconds), so 30 frames a second are assumed'
+    assert motion.notes == (line,)
+    weights = {"facsNames": ["jawOpen"], "weightMat": [[0.5]] * 3}
+    assert "so 30 frames a second are assumed" in read_blendshape_json(write_json(path, weights)).notes[0]
+    assert read_blendshape_json(write_json(path, {**weights, "exportFps": 60})).fps == pytest.approx(60)
+
+
+def test_names_that_are_not_arkits(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    weights = {"exportFps": 30, "facsNames": ["JawOpen", "mouthSmile_L", "tongueTipUp"], "weightMat": [[0.5, 0.25, 1]]}
+    motion = read_blendshape_json(write_json(path, weights))
+    assert jaw(motion) == [0.5]
+    assert motion.coefficients[0, ARKIT_NAMES.index("mouthSmileLeft")] == 0.25
+    assert motion.notes == (f"{path}: 1 of its 3 names are not ARKit's and are left out ('tongueTipUp')",)
+    good = {"names": ["jawOpen"], "frames": [{"weights": [0.5], "time": 0.0}]}
+    for content, words in (
+        ({**weights, "facsNames": ["jawDrop", "lipSuck", "jawOpen"]}, "names are not ARKit's, such as 'jawDrop'"),
+        ({**weights, "exportFps": 1e-320}, "exportFps is 1e-320; give frames per second, from 1 to 500"),
+        ({**weights, "weightMat": [[0.5]]}, "frame 0: has 1 weights for 3 names"),
+        ({**weights, "weightMat": [[0.5, "wide", 0]]}, "mouthSmile_L is 'wide'"),
+        ({**good, "frames": [1]}, '"frames" is not a list of frames'),
+        ({**good, "frames": [{"weights": 3}]}, "frame 0: has 3 weights for 1 names"),
+        ({**good, "frames": [{"weights": None}]}, "no frame has a face"),
+        ({"names": 3, "frames": [{}]}, "has no list of names"),
+        ({"weightMat": []}, '"weightMat" is not a list of frames'),
+    ):
+        with pytest.raises(UserError, match=words):
+            read_blendshape_json(write_json(path, content))
+    turned = {**good, "frames": [{"weights": [0.5], "time": 0.0, "rotation": [0.1, 0.2, 0.3]}]}
+    assert '"rotation" is not read' in read_blendshape_json(write_json(path, turned)).notes[0]
+
+
+def test_transposed_matrices_are_read_and_others_refused(tmp_path: Path) -> None:
+    """All matrices of a file decide whether they are transposed, because one without translation does not tell."""
+    turn = np.array([[0.8, -0.6, 0, 0], [0.6, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    moved = turn + np.array(STILL) * np.array([0, 0, 0, 1]) - np.diag([0, 0, 0, 1])
+    path = tmp_path / "a.json"
+
+    def read(*matrices: np.ndarray) -> Motion:
+        frames: list[dict[str, Any]] = [
+            {"time": index / 30, "face_blendshapes": [], "facial_transformation_matrixes": [one.tolist()]}
+            for index, one in enumerate(matrices)
+        ]
+        frames[0]["face_blendshapes"] = [[]]
+        return read_blendshape_json(write_json(path, frames))
+
+    plain, other = read(turn, moved, moved), read(turn.T, moved.T, moved.T)
+    np.testing.assert_allclose(plain.head_rotation[:, 2], np.arccos(0.8), atol=1e-6)
+    for name in ("head_rotation", "head_translation"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(other, name))
+    assert plain.notes == ()
+    assert other.notes == (f"{path}: its facial transformation matrices are transposed, and are read so",)
+    wrong = moved.copy()
+    wrong[3] = [0, 0, 0.5, 1]
+    for second in (wrong, moved.T):
+        with pytest.raises(UserError, match="frame 1: the last row of its facial .* not 0 0 0 1"):
+            read(moved, second)

@@ -15,7 +15,6 @@ from mien.capture.video import probe_video, read_video_frames
 COLOR = np.array([200, 120, 100])
 WEIGHTS = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
 """Weights of red and blue in luma, by the code of the matrix."""
-PRIMARIES = {1: 1, 2: 2, 5: 5, 6: 6, 9: 9}
 SILENT = Colors()
 LIMITED, FULL = 1, 2
 KINDS = {
@@ -49,14 +48,13 @@ def numbers_of(colors: Colors, bits: int) -> list[int]:
 def write_color(path: Path, kind: str, true: Colors, header: Colors, container: Colors, height: int = 96) -> None:
     """Write three frames of `COLOR` in the colours `true`, whose header and container state something else."""
     codec, pixels, options = KINDS[kind]
-    wide = pixels.endswith("10le")
-    numbers = numbers_of(true, 10 if wide else 8)
-    halves = (height // 2 if "420" in pixels else height, 48)
-    sizes = [(height, 96), halves, halves]
-    planes = [np.full(size, value, np.uint16 if wide else np.uint8) for size, value in zip(sizes, numbers, strict=True)]
-    stated = [
-        (colors.matrix, PRIMARIES[colors.matrix], colors.transfer, colors.range) for colors in (header, container)
+    bits, halves = 10 if pixels.endswith("10le") else 8, (height // 2 if "420" in pixels else height, 48)
+    planes = [
+        np.full(size, value, np.uint16 if bits == 10 else np.uint8)
+        for size, value in zip(((height, 96), halves, halves), numbers_of(true, bits), strict=True)
     ]
+    # The codes of primaries are those of the matrices.
+    stated = [(colors.matrix, colors.matrix, colors.transfer, colors.range) for colors in (header, container)]
     encode(path, [planes] * 3, codec, pixels, options=options, colors=stated[0], tags=stated[1])
 
 
@@ -66,58 +64,41 @@ def error_of(path: Path) -> float:
     return float(np.abs(picture.reshape(-1, 3).mean(axis=0) - COLOR).max())
 
 
-TAGS = {
-    "HLG": ((HLG, 9), 96), "PQ": ((PQ, 9), 96), "709 of 96 lines": ((1, 1), 96), "PAL of 720 lines": ((6, 5), 720),
-    "NTSC of 720 lines": ((6, 6), 720),
-}  # fmt: skip
+def check(path: Path, true: Colors, header: Colors, container: Colors, height: int = 96, hdr: str = "") -> None:
+    write_color(path, path.name, true, header, container, height)
+    assert probe_video(path).hdr == hdr
+    assert error_of(path) <= 4
 
 
-@pytest.mark.parametrize(
-    ("kind", "tags", "height"),
-    [
-        (kind, *TAGS[name])
-        for kind in KINDS
-        for name in (TAGS if kind in ("prores.mov", "hevc.mp4", "vp9.webm") else ("HLG", "PAL of 720 lines"))
-    ],
-)
-def test_tags_of_the_container_count_where_the_header_is_silent(kind, tags, height, tmp_path):
-    true = Colors(tags[0], tags[1], LIMITED)
-    write_color(tmp_path / kind, kind, true, SILENT, true, height)
-    assert probe_video(tmp_path / kind).hdr == {PQ: "PQ", HLG: "HLG"}.get(true.transfer, "")
-    assert error_of(tmp_path / kind) <= 4
+@pytest.mark.parametrize("kind", KINDS)
+def test_tags_of_the_container_count_where_the_header_is_silent(kind, tmp_path):
+    for transfer, matrix, height in ((HLG, 9, 96), (PQ, 9, 96), (1, 1, 96), (6, 5, 720), (6, 6, 720)):
+        if (transfer, matrix) in ((HLG, 9), (6, 5)) or kind in ("prores.mov", "hevc.mp4", "vp9.webm"):
+            true = Colors(transfer, matrix, LIMITED)
+            check(tmp_path / kind, true, SILENT, true, height=height, hdr={PQ: "PQ", HLG: "HLG"}.get(transfer, ""))
+    for matrix, height in ((6, 96), (1, 720)):
+        if height == 96 or kind in ("prores.mov", "vp9.webm"):
+            check(tmp_path / kind, Colors(1, matrix, LIMITED), SILENT, SILENT, height=height)
+        if kind.endswith((".mkv", ".webm")):  # HDR has the matrix of BT.2020
+            hlg = Colors(HLG, 9, LIMITED), SILENT, Colors(HLG, 2, LIMITED)
+            check(tmp_path / kind, *hlg, height=height, hdr="HLG")
 
 
 @pytest.mark.parametrize("kind", ["hevc.mp4", "hevc.mkv", "vp9.webm", "vp9.mp4", "h264.mp4", "ffv1.mkv", "prores.mkv"])
 def test_full_range_of_the_container_counts(kind, tmp_path):
-    true = Colors(1, 1, FULL)
-    write_color(tmp_path / kind, kind, true, SILENT, true)
-    assert error_of(tmp_path / kind) <= 4
+    check(tmp_path / kind, Colors(1, 1, FULL), SILENT, Colors(1, 1, FULL))
     if not kind.endswith(".mp4"):  # FFmpeg writes no colours into .mov and .mp4 unless the matrix is among them
-        write_color(tmp_path / kind, kind, Colors(1, 6, FULL), SILENT, Colors(2, 2, FULL))
-        assert error_of(tmp_path / kind) <= 4
+        check(tmp_path / kind, Colors(1, 6, FULL), SILENT, Colors(2, 2, FULL))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_header_counts_before_the_container(kind, tmp_path):
-    true = Colors(HLG, 9, LIMITED)
-    write_color(tmp_path / kind, kind, true, true, Colors(1, 1, LIMITED))
+    true, other = Colors(HLG, 9, LIMITED), Colors(1, 1, LIMITED)
     if KINDS[kind][0] in ("libx264", "libx265", "prores_ks"):
-        assert probe_video(tmp_path / kind).hdr == "HLG"
-        assert error_of(tmp_path / kind) <= 4
+        check(tmp_path / kind, true, true, other, hdr="HLG")
     else:  # FFV1 and VP9 have no transfer function in their header
+        write_color(tmp_path / kind, kind, true, true, other)
         assert probe_video(tmp_path / kind).hdr == ""
-
-
-@pytest.mark.parametrize(
-    ("kind", "height", "matrix"), [*((kind, 96, 6) for kind in KINDS), ("prores.mov", 720, 1), ("vp9.webm", 720, 1)]
-)
-def test_without_any_tags_the_height_decides(kind, height, matrix, tmp_path):
-    write_color(tmp_path / kind, kind, Colors(1, matrix, LIMITED), SILENT, SILENT, height)
-    assert probe_video(tmp_path / kind).hdr == ""
-    assert error_of(tmp_path / kind) <= 4
-    if Path(kind).suffix in (".mkv", ".webm"):
-        write_color(tmp_path / kind, kind, Colors(HLG, 9, LIMITED), SILENT, Colors(HLG, 2, LIMITED), height)
-        assert error_of(tmp_path / kind) <= 4, "HDR has the matrix of BT.2020"
 
 
 def test_zeros_in_the_header_of_prores_are_unknown(tmp_path):
