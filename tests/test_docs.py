@@ -36,12 +36,6 @@ def test_files_that_pages_name_exist() -> None:
     assert missing == []
 
 
-def test_the_architecture_gives_every_room_its_job() -> None:
-    page = PROSE[ROOT / "docs" / "architecture.md"]
-    rows = re.findall(r"^\| `(\w+)` \| \w", page.split("## Rooms")[1].split("## Layers")[0], re.MULTILINE)
-    assert sorted(rows) == sorted(path.parent.name for path in (ROOT / "src/mien").glob("*/__init__.py"))
-
-
 def test_pictures_are_small_and_described() -> None:
     found = [(page, *each) for page, text in PROSE.items() for each in re.findall(r"!\[([^\]]*)\]\(([^)\s]+)\)", text)]
     shown = {(page.parent / target).resolve(): text for page, text, target in found}

@@ -16,7 +16,7 @@ import torch
 from batch_stub import PROGRAM
 from forked import ForkServer
 from fuzzing import uses
-from mien.avatar import METHODS, has_method, method_named, method_names, method_of
+from mien.avatar import METHODS, has_method, method_named, method_names
 from mien.avatar.methods import Method
 from mien.batch import Batch
 from mien.capture import read_capture_hash
@@ -248,7 +248,20 @@ EXPORT, IMPORT, BATCH = (
     "import {here}/F --out {here}/O",
     "batch {table} --on none9",
 )
+METHOD = """
+from dataclasses import dataclass
+from mien.avatar import Method, MethodConfig
+
+@dataclass(frozen=True)
+class ToyConfig(MethodConfig): ...
+
+IT = Method("mien_none9:Toy", "mien_none9:{}Config")
+"""
+TRAIN = "train {run} --method none9 --run new --steps 2"
 WRONG = (
+    ("methods", "IT = 1", TRAIN, "and it is no Method; update or uninstall mien-none9"),
+    ("methods", METHOD.format("Typo"), TRAIN, "mien_none9:TypoConfig: cannot be imported"),
+    ("methods", METHOD.format("Toy"), TRAIN, "mien_none9:Toy: cannot be imported"),
     ("formats", "IT = 1", EXPORT, "and it is no Format; update or uninstall mien-none9"),
     (
         "formats",
@@ -311,55 +324,16 @@ def test_a_package_that_cannot_be_imported_is_named_and_everything_else_works(
         assert (refused.returncode, told[:39]) == (2, "mien: mien_none9:IT: mien-none9 adds it")
 
 
-METHOD = "from mien.avatar.methods import Method\nOWN = Method('nowhere:Toy', 'nowhere:ToyConfig')\nWRONG = 1\n"
-TYPO = """
-from dataclasses import dataclass
-from mien.avatar import Method, MethodConfig
-
-@dataclass(frozen=True)
-class ToyConfig(MethodConfig):
-    pass
-
-A, B = (Method(f'mien_toys_c:{name}', f'mien_toys_c:{name}Config') for name in ('Typo', 'Toy'))
-"""
-
-
 def test_methods_of_packages_are_found_by_name(fork_server: ForkServer, tmp_path: Path) -> None:
-    def assert_holds(function: str) -> None:
-        process = fork_server.call(f"test_plugins:{function}", path=[tmp_path])
-        assert process.wait() == 0, process.stderr
-
-    assert_holds("entry_points_are_read_late")
-    points = "[mien.methods]\ntoy_a = mien_toys_a:OWN\nheadgas = mien_toys_a:OWN\nwrong = mien_toys_a:WRONG\n"
-    install(tmp_path, "mien_toys_a", METHOD, points)
-    assert_holds("methods_are_found_by_name")
-    install(tmp_path, "mien_toys_b", METHOD, "[mien.methods]\ntoy_a = mien_toys_b:OWN\n")
-    install(tmp_path, "mien_toys_c", TYPO, "[mien.methods]\ntypo = mien_toys_c:A\ntoy = mien_toys_c:B\n")
-    assert_holds("faults_are_told_and_others_go_on_working")
+    code = "from mien.avatar.methods import Method\nOWN = Method('nowhere:Toy', 'nowhere:ToyConfig')\n"
+    points = "[mien.methods]\nheadgas = mien_toys_a:OWN\ntoy = mien_toys_a:OWN\ntwice = mien_toys_a:OWN\n"
+    install(tmp_path, "mien_toys_a", code, points)
+    install(tmp_path, "mien_toys_b", code, "[mien.methods]\ntwice = mien_toys_b:OWN\n")
+    process = fork_server.call("test_plugins:methods_are_found_by_name", path=[tmp_path])
+    assert process.wait() == 0, process.stderr
 
 
 def methods_are_found_by_name() -> None:
-    assert method_names() == [*METHODS, "toy_a", "wrong"]
-    assert (has_method("toy_a"), has_method("toy_b")) == (True, False)
-    assert method_named("toy_a") == Method("nowhere:Toy", "nowhere:ToyConfig")
-    assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
-    with pytest.raises(UserError, match="it is no Method; update or uninstall mien-toys-a"):
-        method_named("wrong")
-    with pytest.raises(UserError, match="no method 'toy_b'; give one of gaussian_avatars, .*, toy_a, wrong, or"):
-        method_named("toy_b")
-
-
-def faults_are_told_and_others_go_on_working() -> None:
-    with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'toy_a' to mien.methods; uninstall"):
-        method_named("toy_a")
-    assert {"toy_a", "wrong", "typo", "toy"} <= set(method_names())
-    assert method_of(method_named("toy").config()) == "toy"
-    for part in ("config", "avatar"):
-        with pytest.raises(UserError, match="^mien_toys_c:Typo(Config)?: cannot be imported .*; update or uninstall"):
-            getattr(method_named("typo"), part)
-
-
-def entry_points_are_read_late() -> None:
     asked = {"mien.methods": lambda: pytest.fail("read")}  # libraries read groups of their own
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("importlib.metadata.entry_points", lambda group: asked.get(group, tuple)())
@@ -367,3 +341,11 @@ def entry_points_are_read_late() -> None:
         assert main(["train", "gone", "--method", "headgas"]) == 2
         with pytest.raises(pytest.fail.Exception, match="read"):
             main(["train", "gone", "--method", "nerf"])
+    assert method_names() == [*METHODS, "toy", "twice"]
+    assert (has_method("toy"), has_method("nerf")) == (True, False)
+    assert method_named("toy") == Method("nowhere:Toy", "nowhere:ToyConfig")
+    assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
+    with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'twice' to mien.methods; uninstall"):
+        method_named("twice")
+    with pytest.raises(UserError, match="no method 'nerf'; give one of gaussian_avatars, .*, toy, twice, or"):
+        method_named("nerf")

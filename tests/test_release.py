@@ -88,16 +88,6 @@ def test_two_checkouts_give_the_same_small_source_distribution(tmp_path: Path, m
     assert not [name for name in names if name.startswith((*unneeded, f"{landmarker}.2")) or "/vision_" in name]
 
 
-def test_containers_need_a_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without one, wheels are those of this machine."""
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert not make.has_containers()
-    for code, answers in ((0, True), (1, False)):
-        (tmp_path / "docker").write_text(f"#!/bin/sh\nexit {code}\n")
-        (tmp_path / "docker").chmod(0o755)
-        assert make.has_containers() is answers
-
-
 def test_a_folder_with_files_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "old.whl").write_bytes(b"")
     assert make.main(["--out", str(tmp_path), "--parts", "sdist"]) == 2

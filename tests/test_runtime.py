@@ -11,9 +11,8 @@ import safetensors.numpy
 import torch
 
 from mien import runtime
-from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, bake_rig, make_portable
+from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, make_portable
 from mien.errors import UserError
-from mien.runtime.checks import baked_fault
 from mien.runtime.posing import run_network
 from plain_settings import plain_config
 from toy_scene import runtime_face, toy_camera, toy_sequence
@@ -69,38 +68,6 @@ def test_names_and_their_mistakes(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=part):
             portable.pose(**wrong)  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize("kind", ["static", "skinned"])
-def test_linear_bases_add_to_the_raw_values(kind: str) -> None:
-    """raw + sum of coefficient times basis, by hand, for records that no method writes yet."""
-    face_model = toy_sequence(5, SIZE)[0]
-    rig = bake_rig(face_model, face_model.neutral())
-    random, n, e = np.random.default_rng(0), len(rig.template), 2
-
-    def some(*shape: int) -> np.ndarray:
-        return random.standard_normal(shape).astype(np.float32)
-
-    attributes = runtime.Attributes(some(n, 4), some(n, 3), some(n), some(n, 4, 3))
-    bases = runtime.LinearBases(log_scales=some(e, n, 3), opacity_logits=some(e, n), sh=some(e, n, 4, 3))
-    if kind == "static":
-        bases = replace(bases, means=some(e, n, 3))
-        record = runtime.Static(some(n, 3), attributes, ("drop", "swell"), bases=bases)
-    else:
-        record = runtime.BlendSkinned(rig, attributes, bases=bases)
-    assert baked_fault(record) is None
-    face = runtime.Face(np.array([0.3, -0.7], np.float32), some(1, 3), some(3), some(3))
-    found = runtime.pose(record, face)
-
-    def expected(name: str, raw: object = attributes) -> np.ndarray:
-        return getattr(raw, name) + np.tensordot(face.expression, getattr(bases, name), 1)
-
-    np.testing.assert_allclose(found.scales, np.exp(expected("log_scales")), rtol=1e-5)
-    np.testing.assert_allclose(found.opacities, 1 / (1 + np.exp(-expected("opacity_logits"))), rtol=1e-5)
-    np.testing.assert_allclose(found.sh, expected("sh"), rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(found.quats, attributes.quats)
-    if kind == "static":
-        np.testing.assert_allclose(found.means, expected("means", record), rtol=1e-5, atol=1e-6)
 
 
 @torch.no_grad()
