@@ -1,12 +1,14 @@
-"""Colour transforms of cameras: they learn how cameras differ, change no background, and resume with the run."""
+"""Colours that training sees: transforms of cameras, and the person's own at soft edges of the matte."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+import train_toy
 from mien.avatar.schedules import Progress
 from mien.errors import UserError
 from mien.face import FaceModel
@@ -16,7 +18,10 @@ from mien.training import Sequence, TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
+from mien.training.footage.constants import FOOTAGE
+from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.frames import Frame, training_frames
+from mien.training.footage.sequence import Targets, composite
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import toy_sequence
@@ -30,8 +35,8 @@ def rig() -> tuple[FaceModel, Sequence]:
     """Return the toy sequence as three cameras in one place, whose pictures differ by gains."""
     face_model, one = toy_sequence(timesteps=4, size=32)
     capture = one.capture
-    images = np.concatenate(
-        [np.clip(capture.images * gain.numpy() + 0.5, 0, 255).astype(np.uint8) for gain in GAINS], 1
+    images = np.concatenate([np.clip(capture.images * gain + 0.5, 0, 255) for gain in GAINS.numpy()], 1).astype(
+        np.uint8
     )
     capture = replace(
         capture, camera_ids=("a", "b", "c"), images=images, mattes=capture.mattes.repeat(3, 1),
@@ -95,11 +100,13 @@ def test_one_camera_is_refused_before_anything_is_written(rig, tmp_path: Path):
     with pytest.raises(UserError, match=r"--training.camera-colors first: compares cameras, .* on a alone"):
         train([rig[1]], rig[0], plain_gaussian_avatars(), settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+    # Without the option nothing is stored.
+    parts = start([rig[1]], rig[0], plain_gaussian_avatars(), replace(SETTINGS, camera_colors="none")).parts
+    assert "colors" not in [part.name for part in parts]
 
 
 @pytest.mark.unchecked
 def test_a_stopped_run_resumes_with_its_colors(rig, tmp_path: Path):
-    """The same bytes result with and without a stop, and the colours have moved."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     for folder in (whole, stopped):
         train([rig[1]], rig[0], plain_gaussian_avatars(), SETTINGS, folder)
@@ -113,6 +120,112 @@ def test_a_stopped_run_resumes_with_its_colors(rig, tmp_path: Path):
     assert first["colors.changes"].abs().max() > 1e-3
 
 
-def test_without_the_option_nothing_is_stored(rig):
-    parts = start([rig[1]], rig[0], plain_gaussian_avatars(), replace(SETTINGS, camera_colors="none")).parts
-    assert "colors" not in [part.name for part in parts]
+WALL = np.array([210.0, 220.0, 235.0])
+
+
+def _filmed(side: int = 480, red: float = 150.0, band: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """A disc with a soft rim of 8 pixels and a darker lower half, before a light wall; and its matte."""
+    rows, columns = np.mgrid[:side, :side][:, band] - side / 2
+    alpha = np.clip((0.3 * side - np.hypot(rows, columns)) / 8 + 0.5, 0, 1)
+    matte = np.rint(alpha * 255).astype(np.uint8)
+    share = matte[..., None] / 255.0
+    return np.rint(share * _person(side, red)[band] + (1 - share) * WALL).astype(np.uint8), matte
+
+
+def _person(side: int, red: float = 150.0) -> np.ndarray:
+    return np.array([red, 90.0, 60.0]) - np.where(np.arange(side) > side / 2, 20.0, 0.0)[:, None, None]
+
+
+def test_soft_edges_have_the_color_of_the_person() -> None:
+    image, matte = _filmed()
+    found = foreground_colors(image, matte)
+    share, soft = matte[..., None] / 255.0, (matte > 0) & (matte < 252)
+    for background in (0.0, 255.0):
+        true = share * _person(480) + (1 - share) * background
+        filmed, cleaned = (share * colors + (1 - share) * background for colors in (image, found))
+        before, after = (np.abs(picture - true)[soft].mean() for picture in (filmed, cleaned))
+        assert before > 10
+        assert after < 0.15 * before
+
+
+def test_large_pictures_are_cleaned_as_well() -> None:
+    """A window of 273 pixels holds a sum of colours that 32 bits do not."""
+    image, matte = _filmed(3000, 250.0, slice(1300, 1700))
+    part = (slice(100, 300), slice(2300, 2500))
+    share, soft = matte[part][..., None] / 255.0, soft_pixels(matte[part])
+    error = np.abs(foreground_colors(image, matte)[part] - _person(3000, 250.0)[1400:1600]) * share
+    assert error[soft].mean() < 3
+
+
+def _everywhere(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """`foreground_colors` estimated at every pixel, and not at those between empty and opaque alone."""
+    windows = [max(3, 2 * round(share * max(image.shape[:2]) / 2) + 1) for share in FOOTAGE.foreground_windows]
+    share, person, background = (matte * np.float32(1 / 255))[..., None], image, image
+    for number, window in enumerate(windows):
+        near_person, near_background = _mean(person, matte, window), _mean(background, 255 - matte, window)
+        rest = image - near_background - share * (near_person - near_background)
+        person = np.rint(np.clip(near_person + share * rest, 0, 255)).astype(np.uint8)
+        if number == 0:
+            background = np.rint(np.clip(near_background + (1 - share) * rest, 0, 255)).astype(np.uint8)
+    return np.where((matte >= FOOTAGE.foreground_solid)[..., None], image, np.where(matte[..., None] > 0, person, 0))
+
+
+def _mean(colors: np.ndarray, weights: np.ndarray, window: int) -> np.ndarray:
+    how = {"normalize": False, "borderType": cv2.BORDER_REFLECT}
+    weights = weights.astype(np.float64)
+    colors, total = (cv2.boxFilter(p, -1, (window, window), **how) for p in (colors * weights[..., None], weights))
+    return colors.astype(np.float32) / np.maximum(total, 1).astype(np.float32)[..., None]
+
+
+@pytest.mark.parametrize("size", [(60, 44), (90, 300)])
+def test_estimates_at_soft_pixels_alone_are_those_of_whole_pictures(size: tuple[int, int]) -> None:
+    """Noise, with every kind of opacity beside every other, and with empty borders."""
+    random = np.random.default_rng(3)
+    image = random.integers(0, 256, (*size, 3)).astype(np.uint8)
+    matte = random.choice(np.array([0, 1, 60, 128, 251, 252, 254, 255], np.uint8), size)
+    matte[:7], matte[:, -5:], matte[20:40, 8:30] = 0, 255, 0
+    expected, (place, colors) = _everywhere(image, matte), soft_colors(image, matte)
+    assert np.array_equal(foreground_colors(image, matte), expected)
+    assert not foreground_colors(image, np.zeros_like(matte)).any()
+    assert np.array_equal(place, np.flatnonzero(soft_pixels(matte)))
+    assert np.array_equal(colors, expected.reshape(-1, 3)[place])
+
+
+def counted(monkeypatch) -> list[int]:
+    """Return a list that grows with each picture that training cleans."""
+    cleaned: list[int] = []
+    seam = "mien.training.footage.sequence.soft_colors"
+    monkeypatch.setattr(seam, lambda *pictures: cleaned.append(1) or soft_colors(*pictures))
+    return cleaned
+
+
+def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch) -> None:
+    """The cut at the neck is no edge of the person; the scored mask only says what is shown."""
+    _, sequence = toy_sequence(2, 32)
+    cut = np.array(sequence.scoring)
+    cut[:, :, 18:] //= 2
+    sequence = replace(sequence, scoring=cut)
+    background = np.array([10, 20, 30], np.uint8)
+    image, matte = (np.array(part[1, 0]) for part in (sequence.capture.images, sequence.capture.mattes))
+    assert soft_pixels(matte).any()
+    expected = composite(foreground_colors(image, matte), cut[1, 0], background)
+    cleaned = counted(monkeypatch)
+    for keep in (True, False):
+        targets = Targets(sequence, 0, cleaned=True)
+        cleaned.clear()
+        for _ in range(2):
+            assert np.array_equal(targets.target(1, 0, background, keep=keep).picture.numpy(), expected)
+        other = targets.target(1, 0, 255 - background, keep=keep).picture.numpy()
+        assert np.array_equal(other, composite(foreground_colors(image, matte), cut[1, 0], 255 - background))
+        assert len(cleaned) == (2 if keep else 1), "once for each kept picture, or once for all backgrounds"
+    plain = Targets(sequence, 0).target(1, 0, background, keep=False).picture.numpy()
+    assert np.array_equal(plain, composite(image, cut[1, 0], background))
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("edges", ["filmed", "cleaned"])
+def test_training_reads_the_setting(edges, tmp_path: Path, monkeypatch) -> None:
+    face_model, sequence = toy_sequence(6, 32)
+    asked = counted(monkeypatch)
+    train([sequence], face_model, train_toy.CONFIG, replace(train_toy.SETTINGS, edges=edges), tmp_path)
+    assert bool(asked) == (edges == "cleaned")

@@ -1,20 +1,27 @@
-"""The distortion of a lens in a calibration is taken out of pictures, mattes and landmarks, or refused."""
+"""The distortion of a lens and the colours of a camera are corrected as their formulas say, or refused."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+import color_charts
 from capture_helpers import write_rig
+from dataset_writers import FRONTAL, write_nersemble
 from mien.camera import Camera
 from mien.capture.calibration import read_calibration
+from mien.capture.color_correction import ColorCorrection
 from mien.capture.crop import whole_picture
 from mien.capture.given import read_given
-from mien.capture.lens import Lens
 from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, open_source
+from mien.cli import main
+from mien.commands.stages import import_footage
 from mien.errors import UserError
 from mien.render.camera_paths import read_cameras
 
@@ -59,13 +66,12 @@ def found_dots(picture: np.ndarray) -> np.ndarray:
     return np.array(centers)
 
 
-def lens_of(folder: Path, given: object) -> Lens | None:
+def lens_of(folder: Path, given: object) -> Any:
     return read_calibration(write_rig(folder / "rig.json", {**ENTRY, "distortion": given}))[0].lens
 
 
 def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -> None:
     lens = lens_of(tmp_path, BARREL)
-    assert lens is not None
     picture = dotted(filmed(DOTS))
     assert abs(found_dots(picture) - DOTS).max() > 4, "the lens does something"
     folder, mattes = tmp_path / "pictures", tmp_path / "mattes"
@@ -81,10 +87,7 @@ def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -
     source = type(source)(**{**vars(source), "lens": lens})
     assert abs(found_dots(next(source.frames()).picture()[..., 1]) - DOTS).max() < 0.05
     settings = CaptureSettings(clean_plate=tmp_path / "plate.png", mattes=mattes, landmarks=tmp_path / "marks.csv")
-    given = read_given(settings, source)
-    assert given.plate is not None
-    assert given.mattes is not None
-    assert given.landmarks is not None
+    given: Any = read_given(settings, source)
     assert abs(found_dots(given.plate[..., 2]) - DOTS).max() < 0.05
     assert abs(found_dots(given.mattes.matte(0, whole_picture(WIDTH, HEIGHT, WIDTH))) - DOTS).max() < 0.05
     assert abs(given.landmarks[0, : len(DOTS)] - DOTS).max() < 0.01
@@ -96,9 +99,7 @@ def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -
 def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> None:
     for count in (4, 5, 8, 12, 14):
         numbers = [-0.1, 0.01, 0.001, 0.001] + [0.0] * (count - 4)
-        lens = lens_of(tmp_path, [[number] for number in numbers])
-        assert lens is not None
-        assert lens.coefficients == tuple(numbers)
+        assert lens_of(tmp_path, [[number] for number in numbers]).coefficients == tuple(numbers)
     for harmless in (
         *({"distortion": nothing} for nothing in (None, [], [0, 0, 0, 0], [[0.0] * 5])), {"dist": [0, 0, 0, 0]},
         {"model": "Sony A7"}, {"distance": 3}, {"distortion_model": "plumb_bob"}, {"fisheye": False},
@@ -106,24 +107,21 @@ def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> No
         assert read_calibration(write_rig(tmp_path / "rig.json", {**ENTRY, **harmless}))[0].lens is None, harmless
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"distortion": [0.1, 0.2, 0.3]}, "distortion has 3 coefficients; give 4, 5, 8, 12 or 14 in OpenCV's order"),
-        ({"distortion": 0.1}, "distortion has 1 coefficients"),
-        ({"distortion": [0.1, float("nan"), 0, 0]}, "NaN"),
-        ({"distortion": {"k1": 0.1}}, "is not a list of numbers"),
-        ({"distortion": [-9.0, 0, 0, 0]}, "folds the picture over itself; check the order"),
-        ({"distortion": [1e200, 0, 0, 0, 0]}, "folds the picture"),
-        ({"distortion": BARREL, "K": [[300, 5, 150], [0, 310, 125], [0, 0, 1]]}, "OpenCV's model has no skew"),
-        ({"distCoeffs": BARREL}, "distCoeffs describes a lens in a way that mien does not read; .* as a list `dist"),
-        ({"radial_distortion": BARREL}, "radial_distortion describes a lens"),
-        ({"D": BARREL}, "D describes a lens"),
-        ({"k1": -0.2}, "k1 describes a lens"),
-        ({"distortion": BARREL, "fisheye": True}, "fisheye describes a lens"),
-        ({"distortion": [0.1, 0, 0, 0], "model": "OPENCV_FISHEYE"}, "model describes a lens"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"distortion": [0.1, 0.2, 0.3]}, "distortion has 3 coefficients; give 4, 5, 8, 12 or 14 in OpenCV's order"),
+    ({"distortion": 0.1}, "distortion has 1 coefficients"),
+    ({"distortion": [0.1, float("nan"), 0, 0]}, "NaN"),
+    ({"distortion": {"k1": 0.1}}, "is not a list of numbers"),
+    ({"distortion": [-9.0, 0, 0, 0]}, "folds the picture over itself; check the order"),
+    ({"distortion": [1e200, 0, 0, 0, 0]}, "folds the picture"),
+    ({"distortion": BARREL, "K": [[300, 5, 150], [0, 310, 125], [0, 0, 1]]}, "OpenCV's model has no skew"),
+    ({"distCoeffs": BARREL}, "distCoeffs describes a lens in a way that mien does not read; .* as a list `dist"),
+    ({"radial_distortion": BARREL}, "radial_distortion describes a lens"),
+    ({"D": BARREL}, "D describes a lens"),
+    ({"k1": -0.2}, "k1 describes a lens"),
+    ({"distortion": BARREL, "fisheye": True}, "fisheye describes a lens"),
+    ({"distortion": [0.1, 0, 0, 0], "model": "OPENCV_FISHEYE"}, "model describes a lens"),
+])  # fmt: skip
 def test_other_descriptions_are_refused(tmp_path: Path, change: dict, message: str) -> None:
     with pytest.raises(UserError, match=message) as error:
         read_calibration(write_rig(tmp_path / "rig.json", {**ENTRY, **change}))
@@ -135,3 +133,96 @@ def test_distortion_of_all_cameras_and_of_camera_paths_is_refused(tmp_path: Path
         read_calibration(write_rig(tmp_path / "rig.json", ENTRY, distortion=BARREL))
     with pytest.raises(UserError, match="camera 0: has distortion, but pictures are drawn as by an ideal lens"):
         read_cameras(write_rig(tmp_path / "path.json", {**ENTRY, "distortion": BARREL}))
+
+
+SMALL = {"id": "a", "K": [[300, 0, 40], [0, 300, 30], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 80,
+         "height": 60}  # fmt: skip
+SERIALS = ("222200036", FRONTAL)
+
+
+def speckled(seed: int, height: int = 60, width: int = 80) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+def expected(picture: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    light = color_charts.to_light(picture.reshape(-1, 3) / 255)
+    return 255 * color_charts.to_srgb(color_charts.polynomial(light, matrix)).reshape(picture.shape)
+
+
+@pytest.mark.parametrize("terms", sorted(color_charts.ORDERS))
+def test_colors_follow_the_formula(terms: int) -> None:
+    """To rounding, in every number of terms. Each exchange of two terms would be seen."""
+    picture, matrix = speckled(terms), color_charts.correction(terms, terms)
+    found = ColorCorrection(matrix).apply(picture).astype(float)
+    assert np.abs(found - expected(picture, matrix)).max() < 0.6
+    for one in range(terms - 1):
+        exchanged = matrix.copy()
+        exchanged[:, [one, one + 1]] = matrix[:, [one + 1, one]]
+        assert np.abs(found - expected(picture, exchanged)).max() > 2, f"terms {one} and {one + 1}"
+    greys = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    assert (ColorCorrection(np.eye(3)).apply(greys) == greys).all()
+    assert ColorCorrection(-np.eye(3)).apply(greys).max() == 0
+    assert (ColorCorrection(1e6 * np.eye(3)).apply(greys)[0, 1:] == 255).all()
+
+
+def test_pictures_and_plates_are_corrected_and_mattes_are_not(tmp_path: Path) -> None:
+    matrix = color_charts.correction(5)
+    entry = {**SMALL, "color_correction": matrix.tolist()}
+    rig = write_rig(tmp_path / "rig.json", entry)
+    (camera,) = read_calibration(rig)
+    assert camera.colors is not None
+    for name, seed in (("pictures/0.png", 1), ("plate.png", 2), ("mattes/0.png", 3)):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), speckled(seed)[..., ::-1])
+    source = replace(open_source(tmp_path / "pictures", FrameSelection(), 25.0), colors=camera.colors)
+    assert np.abs(next(source.frames()).picture() - expected(speckled(1), matrix)).max() < 0.6
+    given: Any = read_given(CaptureSettings(clean_plate=tmp_path / "plate.png", mattes=tmp_path / "mattes"), source)
+    assert np.abs(given.plate - expected(speckled(2), matrix)).max() < 0.6
+    assert (given.mattes.matte(0, whole_picture(80, 60, 80)) == speckled(3)[..., 1]).all()
+
+
+@pytest.mark.parametrize(("given", "told"), [
+    ([[1, 0, 0], [0, 1, 0], [0, 0]], "is not three rows of numbers"),
+    ([[1, 0, 0], [0, 1, 0], [0, 0, 1e30]], "is not three rows of numbers"),
+    ([[], [], []], "has 0 terms for each channel"),
+    ("red", "is not three rows of numbers"),
+    (np.zeros((3, 6)).tolist(), "has 6 terms for each channel; polynomials of Cheung 2004 have 3, 4, 5, 7, 8, 10,"),
+])  # fmt: skip
+def test_other_matrices_are_refused(tmp_path: Path, given: object, told: str) -> None:
+    rig = write_rig(tmp_path / "rig.json", {**SMALL, "color_correction": given})
+    with pytest.raises(UserError, match=rf"camera 0 \(a\): color_correction.* {told}"):
+        read_calibration(rig)
+
+
+def test_the_option_leaves_colors_as_filmed(tmp_path: Path, monkeypatch, capsys) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def capture(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
+        asked.append({each.camera_id: each.colors for each in read_calibration(calibration)})
+        out.mkdir(parents=True)
+
+    def told(person: Path, out: str, *options: str, code: int = 0) -> str:
+        assert main(["import", str(person), "--out", str(tmp_path / out), *options]) == code
+        return capsys.readouterr().err
+
+    monkeypatch.setattr(import_footage, "capture_cameras", capture)
+    corrections = {serial: color_charts.correction(index) for index, serial in enumerate(SERIALS)}
+    person = write_nersemble(tmp_path / "017", SERIALS, colors=corrections)
+    by_file = "  colour correction: by calibration/color_calibration.json; --no-color-correction leaves it out"
+    assert by_file in told(person, "a")
+    for serial, found in asked[0].items():
+        np.testing.assert_array_equal(found.matrix, corrections[serial])
+    assert "  colour correction: left out (--no-color-correction)" in told(person, "b", "--no-color-correction")
+    file = person / "calibration/color_calibration.json"
+    for content, reason in (
+        ({FRONTAL: corrections[FRONTAL].tolist()}, "has no correction of the camera 222200036; copy the files"),
+        ({serial: np.zeros((3, 6)).tolist() for serial in SERIALS}, "'222200036': has 6 terms for each channel"),
+    ):
+        file.write_text(json.dumps(content))
+        assert f"mien: {file}: {reason}" in told(person, "c", code=2)
+        assert not list(tmp_path.glob("c/sequences/*/*"))
+    told(person, "c", "--no-color-correction")
+    without = told(write_nersemble(tmp_path / "018", SERIALS), "d")
+    assert "  missing or not used: colour correction (calibration/color_calibration.json): cameras differ" in without
+    assert "  colour correction:" not in without
+    assert asked[1:] == [dict.fromkeys(SERIALS)] * 3

@@ -3,14 +3,14 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.synthetic.detector_calibration import Sightings, fit_response
-from mien.tracking.fitting import CameraBatch, Fit, SequenceFit, Views, batch_of, layout_of
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking.fitting import Fit, SequenceFit, Views, batch_of, layout_of
 from mien.tracking.landmarks import DetectorResponse, all_landmarks, read_response, reduce_face_model, write_response
 from mien.tracking.landmarks.detector_response import unknown_response
 from mien.tracking.landmarks.shared_fit import fit_shared
@@ -43,48 +43,35 @@ def test_what_ships_is_plausible():
 
 def test_a_file_is_read_as_it_was_written(tmp_path, monkeypatch):
     model = make_small_face_model()
-    response = _some_response(len(model.expression_names))
-    path = tmp_path / "small_detector.npz"
-    write_response(path, model, response, 5)
-    monkeypatch.setattr("mien.tracking.landmarks.detector_response.response_path", lambda *which: path)
-    read = read_response(model, 0.003)
-    for name in ("mean", "by_turn", "by_expression", "by_person"):
-        torch.testing.assert_close(getattr(read, name), getattr(response, name), atol=3e-6, rtol=0)
-    assert read.rest_sigma == pytest.approx(response.rest_sigma)
-    other = replace(model, faces=model.faces.flip(0))
-    assert len(read_response(other, 0.002).by_person) == 0, "measured on another mesh"
-    assert read_response(other, 0.002).rest_sigma == 0.002
-
-
-def test_another_detector_has_what_people_differ_by_from_mediapipe(tmp_path, monkeypatch):
-    model = make_small_face_model()
     ours, theirs = (_some_response(len(model.expression_names), seed=seed) for seed in (0, 1))
     where = "mien.tracking.landmarks.detector_response.response_path"
     monkeypatch.setattr(where, lambda name, detector="mediapipe": tmp_path / f"{name}_{detector}.npz")
     write_response(tmp_path / f"{model.name}_litert.npz", model, theirs, 5, "litert")
     assert len(read_response(model, 0.003, "litert").by_person) == 0, "nothing is known without mediapipe's file"
     write_response(tmp_path / f"{model.name}_mediapipe.npz", model, ours, 5)
-    read = read_response(model, 0.003, "litert")
-    for name, expected in (("mean", theirs), ("by_turn", theirs), ("by_expression", ours), ("by_person", ours)):
-        torch.testing.assert_close(getattr(read, name), getattr(expected, name), atol=3e-6, rtol=0)
+    for read, of_all, of_people in (
+        (read_response(model, 0.003), ours, ours), (read_response(model, 0.003, "litert"), theirs, ours)
+    ):  # fmt: skip
+        for name in ("mean", "by_turn", "by_expression", "by_person"):
+            expected = getattr(of_all if name in ("mean", "by_turn") else of_people, name)
+            torch.testing.assert_close(getattr(read, name), expected, atol=3e-6, rtol=0)
+    assert read_response(model, 0.003).rest_sigma == pytest.approx(ours.rest_sigma)
+    other = read_response(replace(model, faces=model.faces.flip(0)), 0.002)
+    assert (len(other.by_person), other.rest_sigma) == (0, 0.002), "measured on another mesh"
 
 
 def _people(truth: DetectorResponse, count: int, pictures: int = 30) -> list[Sightings]:
-    random = torch.Generator().manual_seed(7)
-    people = []
+    random, people = torch.Generator().manual_seed(7), []
     for _ in range(count):
         turns = 0.4 * torch.randn(pictures, 3, generator=random)
-        R_seen = torch.matrix_exp(
-            torch.linalg.cross(turns[:, None].expand(-1, 3, 3), torch.eye(3).expand(pictures, 3, 3))
-        )
+        R_seen = matrix_from_axis_angle(turns)
         expression = torch.rand(pictures, len(truth.by_expression), generator=random)
         habits = torch.cat([turns[:, :2], expression], dim=1)
         person = torch.randn(len(truth.by_person), generator=random)
         offset = truth.mean.float() + torch.einsum("k,klc->lc", person, truth.by_person.float())
         rules = torch.cat([truth.by_turn, truth.by_expression]).float()
         at_rest = offset + torch.einsum("nh,hlc->nlc", habits, rules)
-        across = torch.einsum("nxc,nlc->nlx", R_seen[:, :2], at_rest)
-        people.append(Sightings(R_seen[:, :2], across, habits))
+        people.append(Sightings(R_seen[:, :2], torch.einsum("nxc,nlc->nlx", R_seen[:, :2], at_rest), habits))
     return people
 
 
@@ -97,9 +84,6 @@ def test_the_response_is_found_from_sightings():
     left = found.by_person.flatten(1).T - basis @ (basis.T @ found.by_person.flatten(1).T)
     assert left.norm() < 0.2 * found.by_person.norm(), "the same components, in some mixture"
     assert found.rest_sigma < 0.0004
-
-
-def test_too_few_people_are_an_error():
     with pytest.raises(UserError, match="draw more"):
         fit_response(_people(_some_response(2), 4))
 
@@ -125,21 +109,16 @@ def test_derivatives_by_the_person_match_finite_differences():
 def _fitted_identity(detects: DetectorResponse, expects: DetectorResponse) -> float:
     """Return the error of the identity that is fitted to a detector's landmarks of a person."""
     model = make_small_face_model()
-    layout = layout_of(model)
+    layout, rows, settings = layout_of(model), torch.arange(8), TrackingSettings(identity_weight=1.0)
     truth, reduced = reduce_face_model(model, layout, detects), reduce_face_model(model, layout, expects)
     state = torch.zeros(8, layout.size, dtype=torch.float64)
     state[:, :2] = 0.3 * torch.randn(8, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     state[:, 5] = -0.8
-    identity = torch.linspace(-1, 1, 6, dtype=torch.float64)
-    person = unknown_subject(truth)
+    identity, person = torch.linspace(-1, 1, 6, dtype=torch.float64), unknown_subject(truth)
     step = torch.cat([identity, torch.linspace(-1.5, 1.5, len(person.person), dtype=torch.float64)])
-    person = move_subject(person, step, detects)
-    cameras: CameraBatch = batch_of((still_camera(),))
-    detected = truth.project(
-        state, person.identity, person.bias, cameras[torch.zeros(8, dtype=torch.long)], torch.arange(8)
-    )
-    views = Views(detected, torch.arange(8), torch.zeros(8, dtype=torch.long), torch.ones(8, dtype=torch.float64))
-    settings = TrackingSettings(identity_weight=1.0)
+    person, cameras = move_subject(person, step, detects), batch_of((still_camera(),))
+    detected = truth.project(state, person.identity, person.bias, cameras[0 * rows], rows)
+    views = Views(detected, rows, 0 * rows, torch.ones(8, dtype=torch.float64))
     own = SequenceFit(cameras, state)
     term = all_landmarks(reduced, views, own, settings)
     fitted = fit_shared([term], Fit(unknown_subject(reduced), (own,)), [None], settings)
@@ -156,10 +135,8 @@ def test_who_expects_the_detectors_habits_finds_the_person():
 
 
 def test_several_cameras_expect_nothing_of_turns():
-    response = _some_response(2).without_turns()
-    turned = torch.tensor([[0.3, 0.2, 0.0]], dtype=torch.float64)
-    assert not response.of_turns(turned).any()
-    assert response.mean.any()
-    far = _some_response(2).of_turns(torch.full((1, 3), math.pi, dtype=torch.float64))
-    near = _some_response(2).of_turns(torch.full((1, 3), 0.6, dtype=torch.float64))
-    np.testing.assert_array_equal(far.numpy(), near.numpy())
+    response = _some_response(2)
+    assert not response.without_turns().of_turns(torch.tensor([[0.3, 0.2, 0.0]], dtype=torch.float64)).any()
+    assert response.without_turns().mean.any()
+    far, near = (response.of_turns(torch.full((1, 3), turn, dtype=torch.float64)) for turn in (math.pi, 0.6))
+    assert torch.equal(far, near)

@@ -1,16 +1,16 @@
 """The face track: tuned timesteps, corrections of those that were not seen, and what corrections may not follow."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
-from mien.avatar import FaceTuning, Moments, Progress, Rate
+from mien.avatar import FaceTuning, Progress, Rate
 from mien.face import FaceParams
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training.adam import Adam
 from mien.training.constants import TRAINING
-from mien.training.face_track import FaceTrack, mean_pose_correction, spread_corrections, turns_from_mean, without_turns
+from mien.training.face_track import FaceTrack, spread_corrections, turns_from_mean, without_turns
 from mien.training.trainer import tuning_for
 from toy_scene import toy_face, toy_sequence
 
@@ -39,9 +39,7 @@ def correct(track: FaceTrack, tracked: FaceParams, index: int, shift: torch.Tens
     face.head_translation[0] += tracked.T_world_head[index, :3, :3] @ shift
     face.head_rotation[0, 1] += yaw
     for group in groups:
-        assert group.moments is not None
-        moments = next(iter(group.moments.values()))
-        assert isinstance(moments, Moments)
+        moments: Any = next(iter((group.moments or {}).values()))
         moments.step += 1
 
 
@@ -132,15 +130,6 @@ def test_a_field_that_is_not_tuned_keeps_no_correction_from_the_others(still: st
     torch.testing.assert_close(getattr(steady.params(), moving), getattr(face, moving), atol=1e-8, rtol=0)
 
 
-def test_the_mean_correction_is_given_in_the_head_frame() -> None:
-    tracked = still_face(4, head_rotation=torch.randn(4, 3, generator=torch.Generator().manual_seed(0)))
-    turn, shift = matrix_from_axis_angle(torch.tensor([0.02, -0.01, 0.03])), torch.tensor([0.001, 0.002, -0.003])
-    rotation = tracked.T_world_head[:, :3, :3]
-    tuned = replace(tracked, head_rotation=axis_angle_from_matrix(rotation @ turn), head_translation=rotation @ shift)
-    for found, expected in zip(mean_pose_correction(tracked, tuned), (turn, shift), strict=True):
-        torch.testing.assert_close(found, expected)
-
-
 @pytest.mark.parametrize("keeps", [True, False])
 def test_a_shift_that_all_poses_share_is_taken_away(keeps: bool) -> None:
     """The heads look in four directions. The second half was never trained, and stays as it was tracked."""
@@ -177,7 +166,6 @@ def test_corrections_that_follow_the_turns_are_taken_away(keeps: bool, mean: boo
 
 
 def test_aligned_faces_are_corrected_more_slowly() -> None:
-    """Corrections may follow turns that several cameras see."""
     _, sequence = toy_sequence(2, 16)
     aligned = replace(sequence, tracking=replace(sequence.tracking, settings={"aligned": {"iterations": 2}}))
     both = replace(sequence, tracking=replace(sequence.tracking, cameras=tuple(sequence.tracking.cameras) * 2))

@@ -22,7 +22,7 @@ from mien.capture import Capture, read_capture
 from mien.capture.tone import HLG, srgb_signal
 from mien.capture.video import write_video
 from mien.cli import main
-from test_capture_quality import streak
+from test_capture_parts import streak
 from test_interlaced import flagged, write, write_single_fields
 
 pytestmark = pytest.mark.unchecked

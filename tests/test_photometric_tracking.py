@@ -1,19 +1,35 @@
-"""Faces fitted to pixels and outlines are better than landmarks alone. Unseen faces keep still."""
+"""Faces fitted to pixels and outlines are better than landmarks alone. The native alignment agrees with PyTorch."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from mien import _native
+from mien.camera import Camera
+from mien.render.mesh import Texture as MeshTexture
+from mien.render.mesh import interpolate, rasterize_mesh, render_mesh, sample_texture, shade, vertex_normals
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import Tracking, TrackingSettings, residual_report, track, track_subject
 from mien.tracking.fitting import Subject, Views, batch_of, layout_of
+from mien.tracking.pixels import SkinTexture, even_light, texture_space
 from mien.tracking.pixels.outline import OutlineTerm, edge_distances, outline_term
+from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.shared import move_like_keyframes
-from mien.tracking.pixels.surface import surface_model
+from mien.tracking.pixels.surface import PosedSurface, surface_model
+from mien.tracking.pixels.texture import Sighting, estimate_appearance, unknown_texture
 from mien.tracking.settings import PhotometricSettings
-from photometric_case import FOCAL, SIZE, PhotometricCase, assert_alike, make_photometric_case, make_textured_model
+from photometric_case import (
+    FOCAL,
+    SIZE,
+    PhotometricCase,
+    assert_alike,
+    make_photometric_case,
+    make_textured_model,
+    smooth_noise,
+)
 from tracking_case import make_tracking_case
 
 LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
@@ -196,3 +212,125 @@ def test_timesteps_between_keyframes_move_as_these_do():
     assert torch.equal(moved[:, 6:], state[:, 6:])
     wrong = (moved - state - step)[1::2, :6].norm(dim=1)
     assert float(wrong.mean()) < 0.2 * float((step - step.mean(0))[1::2, :6].norm(dim=1).mean())
+
+
+SIDE, SIGMA, OUTLIER, LEAST_COSINE = 72, 0.07, 2.0, 0.25
+MODEL = make_textured_model()
+SPACE = texture_space(MODEL, 128)
+K = torch.tensor([[110.0, 0, 36.5], [0, 108.0, 35.5], [0, 0, 1]])
+CAMERA = Camera(K, torch.diag(torch.tensor([1.0, -1, -1, 1])), SIDE, SIDE)
+
+
+def posed(shift=(0.004, 0.003, -0.6), yaw: float = 0.0, jacobian: Tensor | None = None) -> PosedSurface:
+    turn = matrix_from_axis_angle(torch.tensor([0.0, yaw, 0.0]))
+    vertices = (MODEL.template @ turn.T + torch.tensor(shift)).contiguous()
+    return PosedSurface(vertices, vertex_normals(vertices, MODEL.faces), jacobian)
+
+
+def drawn(surface: PosedSurface, skin: SkinTexture, light: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the picture of a surface, and where it covers whole pixels."""
+    texture = MeshTexture(skin.albedo, SPACE.corners)
+    image, alpha = render_mesh(surface.vertices, MODEL.faces, CAMERA, texture, light=light, supersample=3)
+    return image, (alpha > 0.99).float()
+
+
+def reference(seen: Sighting, skin: SkinTexture) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return cost, half gradient, half Hessian and residuals by PyTorch in float64, without a high-pass filter."""
+    vertices, normals = seen.posed.vertices, seen.posed.normals
+    fragments = rasterize_mesh(vertices, MODEL.faces, CAMERA)
+    points = interpolate(fragments, vertices, MODEL.faces)
+    directions = torch.nn.functional.normalize(interpolate(fragments, normals, MODEL.faces), dim=-1)
+    towards = torch.nn.functional.normalize(CAMERA.position - points, dim=-1)
+    uv = interpolate(fragments, SPACE.corners, MODEL.faces)
+    trust = sample_texture(skin.trust[..., None], uv)
+    albedo = sample_texture(skin.albedo * skin.trust[..., None], uv) / trust.clamp_min(1e-9)
+    prediction = albedo * shade(directions, seen.light)
+    weight = seen.picture.mask * trust[..., 0]
+    counts = (fragments.face_index >= 0) & ((directions * towards).sum(-1) >= LEAST_COSINE) & (weight > 0)
+    counts &= torch.cat([SPACE.used, torch.tensor([False])])[fragments.face_index.long()]
+    counts[[0, -1]], counts[:, [0, -1]] = False, False
+    residual = (seen.picture.image - prediction).double()
+    square = (residual**2).sum(-1) / SIGMA**2
+    fade = OUTLIER**2 / (OUTLIER**2 + square)
+    total = weight[counts].double().sum()
+    cost = (weight * square * fade)[counts].sum() / total
+    image = seen.picture.image.double()
+    by_x, by_y = torch.zeros_like(image), torch.zeros_like(image)
+    by_x[:, 1:-1], by_y[1:-1] = (image[:, 2:] - image[:, :-2]) / 2, (image[2:] - image[:-2]) / 2
+
+    assert seen.posed.jacobian is not None
+    apart = 1e-4 * seen.posed.jacobian.permute(2, 0, 1).double()
+    exact, ahead = CAMERA.to(apart), vertices.double()
+    columns = [(exact.project(ahead + d)[0] - exact.project(ahead - d)[0]).float() / 2e-4 for d in apart]
+    moved = torch.stack([interpolate(fragments, column.contiguous(), MODEL.faces) for column in columns], -1).double()
+    by_parameter = by_x[..., None] * moved[..., None, 0, :] + by_y[..., None] * moved[..., None, 1, :]
+    scale = (weight * fade**2 / SIGMA**2)[counts] / total
+    by_parameter, left = by_parameter[counts], residual[counts]
+    hessian = torch.einsum("n,nci,ncj->ij", scale, by_parameter, by_parameter)
+    gradient = torch.einsum("n,nci,nc->i", scale, by_parameter, left)
+    return cost, gradient, hessian, torch.where(counts[..., None], residual, torch.nan)
+
+
+LIGHT = even_light()
+LIGHT[1:4] = torch.tensor([[0.5, 0.4, 0.3], [0.6, 0.6, 0.7], [-0.4, -0.3, 0.2]])
+SKIN = SkinTexture(smooth_noise(128, 128, 3.0), (SPACE.fragments.face_index >= 0).float(), SIGMA)
+
+
+def test_cost_gradient_and_hessian_are_those_of_the_pixels():
+    mask = torch.rand(SIDE, SIDE, generator=torch.Generator().manual_seed(4)).clamp_min(0.2)
+    mask[:, :20] = 0
+    jacobian = torch.randn(len(MODEL.template), 3, 5, generator=torch.Generator().manual_seed(2))
+    seen = Sighting(posed(jacobian=jacobian), Picture(CAMERA, smooth_noise(SIDE, SIDE, 2.0, 5), mask), LIGHT)
+    gradient, hessian, residual = torch.empty(5), torch.empty(5, 5), torch.empty(SIDE, SIDE, 3)
+    surface = _native.AlignSurface(
+        SPACE.faces, SPACE.corners, SPACE.used.to(torch.uint8), SKIN.albedo, SKIN.trust, SIGMA, OUTLIER, LEAST_COSINE
+    )
+    derivatives = _native.AlignDerivatives(jacobian, hessian, gradient)
+    cost, weight = _native.align_mesh(surface, seen.arrays(), 0, derivatives, residual, None)
+    expected_cost, expected_gradient, expected_hessian, expected_residual = reference(seen, SKIN)
+    assert weight > 100
+    torch.testing.assert_close(residual.double(), expected_residual, atol=2e-5, rtol=0, equal_nan=True)
+    assert cost == pytest.approx(float(expected_cost), rel=1e-4)
+    for found, expected in ((gradient, expected_gradient), (hessian, expected_hessian)):
+        torch.testing.assert_close(found.double(), expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
+    arrays, few = seen.arrays(), torch.zeros(3, 3)
+    for wrong, how, kind in (
+        (arrays._replace(vertices=few, normals=few), None, IndexError),
+        (arrays._replace(mask=torch.zeros(5, 5)), None, ValueError),
+        (arrays, (jacobian, None, gradient), TypeError),
+    ):
+        with pytest.raises(kind):
+            _native.align_mesh(surface, wrong, 0, how, None, None)  # pyright: ignore[reportArgumentType]
+
+
+def test_high_pass_leaves_out_a_smooth_light_but_not_texture():
+    (image, mask), surface = drawn(posed(), SKIN, even_light()), SPACE.native(SKIN, 5.0)
+    ramp = torch.linspace(0.0, 0.3, SIDE)[None, :, None]
+    for picture, least, most in ((image + ramp, 0, 0.05), (image.roll(3, dims=1), 0.3, 9)):
+        seen = Sighting(posed(), Picture(CAMERA, picture.contiguous(), mask), even_light()).arrays()
+        plain, high_passed = (_native.align_mesh(surface, seen, r, None, None, None)[0] for r in (0, 6))
+        assert least * plain < high_passed < most * plain
+
+
+def _pictures_under_light(light: Tensor) -> list[Sighting]:
+    surfaces = [posed((0.0, 0.0, -0.5), yaw) for yaw in (0.0, 0.7, -0.7, 0.35, -0.35)]
+    pictures = [drawn(surface, SKIN, light) for surface in surfaces]
+    return [Sighting(surface, Picture(CAMERA, image.contiguous(), mask), even_light())
+            for surface, (image, mask) in zip(surfaces, pictures, strict=True)]  # fmt: skip
+
+
+def test_albedo_times_light_gives_the_pictures_back():
+    sightings = _pictures_under_light(LIGHT)
+    found, (light,) = estimate_appearance(SPACE, [sightings], unknown_texture(SPACE), 3.0, 0)
+    surface = SPACE.native(found, 5.0)
+    for seen in sightings:
+        residual = torch.empty(SIDE, SIDE, 3)
+        _native.align_mesh(surface, Sighting(seen.posed, seen.picture, light).arrays(), 0, None, residual, None)
+        known = residual[~residual.isnan().any(-1)]
+        assert len(known) > 300
+        assert known.abs().median() < 0.01
+    found, _ = estimate_appearance(SPACE, [_pictures_under_light(even_light())], unknown_texture(SPACE), 3.0, 0)
+    behind = SPACE.fragments.face_index[:, 64:] >= 0
+    assert float(found.trust[:, 64:][behind].mean()) < 0.2
+    assert float(found.trust[48:80, 24:40].min()) > 0.5
+    assert (found.albedo - SKIN.albedo)[48:80, 24:40].abs().median() < 0.05
