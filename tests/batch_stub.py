@@ -24,7 +24,6 @@ PROGRAM = (sys.executable, str(Path(__file__).resolve()))
 
 
 def stub_row(name: str, *steps: tuple[str, str], memory_mb: float = 100.0) -> Row:
-    """A row of stub steps."""
     return Row(name, steps, {"kind": "stub"}, memory_mb, fingerprint=str(hash(steps) & 0xFFFF))
 
 
@@ -36,7 +35,6 @@ def do_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, object], ...], dict
 
 
 def do_steps(batch: Batch, place: Path, row: Row) -> tuple[tuple[dict[str, object], ...], dict[str, float]]:
-    """Run the steps, with a begin and an end."""
     note(place, f"begin {row.name} {os.getpid()}\n")
     value = 0.0
     for what, argument, *_ in row.steps:
@@ -75,19 +73,16 @@ def watched(place: Path, name: str) -> Iterator[None]:
 
 
 def note(path: Path, line: str) -> None:
-    """Append a line at once."""
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     os.write(handle, line.encode())
     os.close(handle)
 
 
 def tries(path: Path, name: str) -> int:
-    """How often a row began."""
     return path.read_text().count(f"begin {name} ") if path.exists() else 0
 
 
 def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
-    """Return the driver of a batch of stub rows."""
     return Driver(batch, engine, EngineOptions(batch.root, jobs, 1), retry, store, PROGRAM)
 
 
@@ -110,7 +105,6 @@ def wait_for_begin(root: Path, name: str) -> int:
 
 
 def ended(process: int) -> bool:
-    """Wait until a process is gone, and return whether it is."""
     for _ in range(6_000):
         if not Path(f"/proc/{process}").exists():
             return True

@@ -17,13 +17,11 @@ _jaxtyped: Any = jaxtyping.jaxtyped
 
 
 def check_types(wanted: bool) -> None:
-    """Let calls be checked from now on, or not."""
     config.update("jaxtyping_disable", not wanted)
 
 
 @contextmanager
 def unchecked() -> Iterator[None]:
-    """Let calls within be unchecked."""
     before = config.jaxtyping_disable
     check_types(False)
     try:

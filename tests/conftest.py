@@ -124,24 +124,18 @@ def fork_server() -> "Iterator[ForkServer]":
         yield server
 
 
-@pytest.fixture(scope="module")
-def other() -> "Iterator[Holder]":
-    """Return another process that holds locks."""
-    yield from _holder()
-
-
-@pytest.fixture
-def mortal() -> "Iterator[Holder]":
-    """Return a process that holds locks, for a test that kills it."""
-    yield from _holder()
-
-
 def _holder() -> "Iterator[Holder]":
+    """Return another process that holds locks."""
     from other_process import Holder
 
     holder = Holder()
     yield holder
     holder.kill()
+
+
+other = pytest.fixture(scope="module")(_holder)
+mortal = pytest.fixture(_holder)
+"""The same for a test that kills it."""
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -66,12 +66,10 @@ def leave_network() -> bool:
 
 
 def skip_if_online(demo: Path) -> None:
-    """Skip a test that needs a network namespace."""
     if (demo / ONLINE).exists():
         pytest.skip(NO_NAMESPACE)
 
 
 def make_demo(server: ForkServer, folder: Path) -> None:
-    """Write the demo into a folder."""
     process = server.call("demo_case:write_demo", str(folder))
     assert process.wait() == 0, process.stderr[-2000:]

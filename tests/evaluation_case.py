@@ -102,7 +102,6 @@ def two_cameras(experiment: Experiment, name: str) -> Sequence:
 
 
 def write_sequence(root: Path, experiment: Experiment, sequence: Sequence) -> Path:
-    """Write a sequence into a workspace, and return its folder."""
     folder = root / "sequences" / sequence.name
     crops = np.repeat(experiment.scorings[0].crops, len(sequence.capture.camera_ids), axis=1)
     write_capture(folder / "capture", sequence.capture)
@@ -113,6 +112,5 @@ def write_sequence(root: Path, experiment: Experiment, sequence: Sequence) -> Pa
 
 
 def write_run(run_dir: Path, experiment: Experiment, folders: list[Path], settings: TrainSettings) -> None:
-    """Train some sequences for a few steps."""
     config = plain_config(DEFAULT_METHOD, face_tuning=FaceTuning(enabled=False))
     train([read_sequence(folder) for folder in folders], experiment.avatar.face_model, config, settings, run_dir)

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from evaluation_case import make_experiment, write_run, write_sequence
 from mien.capture.video import write_video
@@ -22,20 +23,16 @@ pytestmark = pytest.mark.unchecked
 PLAIN = ScoreSettings(perceptual=False)
 
 
-def write_pictures(folder: Path, names: list[str], seed: int = 0, size: tuple[int, int] = (40, 36)) -> np.ndarray:
-    """Write random pictures as png, and return them."""
+def write_pictures(folder: Path, names: str, seed: int = 0, size: tuple[int, int] = (40, 36)) -> None:
     folder.mkdir(exist_ok=True)
-    pictures = np.random.default_rng(seed).integers(0, 256, (len(names), *size, 3)).astype(np.uint8)
-    for name, picture in zip(names, pictures, strict=True):
-        cv2.imwrite(str(folder / f"{name}.png"), picture[..., ::-1])
-    return pictures
+    for name, picture in zip(names, np.random.default_rng(seed).integers(0, 256, (len(names), *size, 3)), strict=True):
+        cv2.imwrite(str(folder / f"{name}.png"), picture.astype(np.uint8))
 
 
 @pytest.fixture
 def folders(tmp_path: Path) -> ImageFolders:
-    names = ["a", "b", "c"]
-    write_pictures(tmp_path / "truth", names)
-    write_pictures(tmp_path / "mine", names, seed=1)
+    for seed, name in enumerate(("truth", "mine")):
+        write_pictures(tmp_path / name, "abc", seed)
     return ImageFolders(tmp_path / "mine", tmp_path / "truth")
 
 
@@ -54,7 +51,7 @@ def test_the_same_pictures_get_the_same_figures_as_in_evaluate(tmp_path: Path) -
         assert scores["head"][metric] == pytest.approx(entry["head"][metric], abs=1e-6)
 
 
-def test_mattes_cut_the_truth_and_give_the_head_crop(folders: ImageFolders, tmp_path: Path) -> None:
+def test_mattes_cut_the_truth_and_give_the_head_crop(folders: ImageFolders, tmp_path: Path, capsys) -> None:
     matte = np.zeros((40, 36), np.uint8)
     matte[10:30, 5:25] = 255
     (tmp_path / "mattes").mkdir()
@@ -66,74 +63,54 @@ def test_mattes_cut_the_truth_and_give_the_head_crop(folders: ImageFolders, tmp_
     black = score_folders(ImageFolders(folders.images, folders.truth, tmp_path / "mattes", background="black"), PLAIN)
     assert black["psnr"] == black["head"]["psnr"] == 100.0
     assert black["mask"] == "mattes, over black"
+    assert "not black where" not in " ".join(capsys.readouterr().err.split())
     white = score_folders(ImageFolders(folders.images, folders.truth, tmp_path / "mattes"), PLAIN)
     assert white["head"]["psnr"] == 100.0
     assert white["psnr"] < 10
-
-
-def test_background_that_does_not_fit_is_warned_of(
-    folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "mattes").mkdir()
-    for name in "abc":
-        cv2.imwrite(str(tmp_path / "mattes" / f"{name}.png"), np.eye(40, 36, dtype=np.uint8) * 255)
-    score_folders(ImageFolders(folders.images, folders.truth, tmp_path / "mattes"), PLAIN)
     assert "not white where the mattes are empty" in " ".join(capsys.readouterr().err.split())
 
 
-def test_alpha_channel_is_put_over_the_background(folders: ImageFolders, tmp_path: Path) -> None:
-    see_through = np.dstack([np.zeros((40, 36, 3), np.uint8), np.zeros((40, 36), np.uint8)])
+def test_figures_are_those_of_the_metrics(folders: ImageFolders, capsys, tmp_path: Path) -> None:
+    write_pictures(folders.images, "d")
+    scores = score_folders(folders, PLAIN)
+    assert scores["frames"] == 3
+    assert "1 pictures have no truth" in capsys.readouterr().err
+    pictures = [[cv2.imread(str(folder / f"{n}.png")) for n in "abc"] for folder in (folders.images, folders.truth)]
+    images, truths = torch.from_numpy(np.array(pictures)).float() / 255
+    figures = [psnr(image, truth) for image, truth in zip(images, truths, strict=True)]
+    assert scores["per_frame"]["psnr"] == pytest.approx(figures, rel=1e-6)
+    assert scores["psnr"] == pytest.approx(np.mean(figures))
+    assert (scores["crop"], scores["head"]["psnr"]) == (None, None)
+    # An alpha channel is put over the background.
     for name in "abc":
-        cv2.imwrite(str(folders.images / f"{name}.png"), see_through)
+        cv2.imwrite(str(folders.images / f"{name}.png"), np.zeros((40, 36, 4), np.uint8))
         cv2.imwrite(str(folders.truth / f"{name}.png"), np.full((40, 36, 3), 255, np.uint8))
     assert score_folders(folders, PLAIN)["psnr"] == 100.0
 
 
-def test_figures_are_those_of_the_metrics(folders: ImageFolders) -> None:
-    scores = score_folders(folders, PLAIN)
-    import torch
-
-    def floats(path: Path) -> torch.Tensor:
-        picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
-        assert picture is not None
-        return torch.from_numpy(picture).float() / 255
-
-    figures = [psnr(floats(folders.images / f"{n}.png"), floats(folders.truth / f"{n}.png")) for n in "abc"]
-    assert scores["per_frame"]["psnr"] == pytest.approx(figures, rel=1e-6)
-    assert scores["psnr"] == pytest.approx(np.mean(figures))
-    assert scores["crop"] is None
-    assert scores["head"]["psnr"] is None
-
-
 def test_crops_beside_the_truth_are_found(folders: ImageFolders) -> None:
-    write_crops(folders.truth / "crops.json", {name: (4, 4, 20, 20) for name in "abc"})
+    path = folders.truth / "crops.json"
+    write_crops(path, {name: (4, 4, 20, 20) for name in "abc"})
     assert score_folders(folders, PLAIN)["head"]["psnr"] is not None
-    write_crops(folders.truth / "crops.json", {"a": (4, 4, 20, 20)})
-    with pytest.raises(UserError, match="no head box for b, c"):
-        score_folders(folders, PLAIN)
-    write_crops(folders.truth / "crops.json", {name: (99, 4, 20, 20) for name in "abc"})
-    with pytest.raises(UserError, match="is outside the picture"):
-        score_folders(folders, PLAIN)
-    (folders.truth / "crops.json").write_text('{"format": "mien.crops", "version": 1, "crops": {"a": [1, 2, 3]}}')
+    for crops, words in (
+        ({"a": (4, 4, 20, 20)}, "no head box for b, c"),
+        ({name: (99, 4, 20, 20) for name in "abc"}, "is outside the picture"),
+    ):
+        write_crops(path, crops)
+        with pytest.raises(UserError, match=words):
+            score_folders(folders, PLAIN)
+    path.write_text('{"format": "mien.crops", "version": 1, "crops": {"a": [1, 2, 3]}}')
     with pytest.raises(UserError, match="'a' has no box"):
-        read_crops(folders.truth / "crops.json")
+        read_crops(path)
 
 
 def test_names_and_sizes_that_do_not_match(folders: ImageFolders, tmp_path: Path) -> None:
     (folders.images / "b.png").rename(folders.images / "z.png")
     with pytest.raises(UserError, match=r"lacks 1 of the 3 pictures.*\(b; it has a, c, z\)"):
         score_folders(folders, PLAIN)
-    write_pictures(folders.images, ["b"], size=(20, 20))
+    write_pictures(folders.images, "b", size=(20, 20))
     with pytest.raises(UserError, match="b has 20x20 pixels, and its truth has 36x40"):
         score_folders(folders, PLAIN)
-
-
-def test_pictures_without_a_truth_are_left_out_with_a_warning(
-    folders: ImageFolders, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_pictures(folders.images, ["d"])
-    assert score_folders(folders, PLAIN)["frames"] == 3
-    assert "1 pictures have no truth" in capsys.readouterr().err
 
 
 def test_damaged_pictures_are_named(folders: ImageFolders) -> None:
@@ -160,7 +137,6 @@ def test_videos_are_matched_by_order(folders: ImageFolders, tmp_path: Path) -> N
 
 
 def test_command(folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`mien evaluate --images` prints and writes the same scores, and refuses wrong options."""
     given = ["evaluate", "--images", str(folders.images), "--truth", str(folders.truth), "--no-perceptual"]
     out = tmp_path / "scores.json"
     assert main([*given, "--json", "--out", str(out)]) == 0

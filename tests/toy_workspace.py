@@ -26,7 +26,6 @@ def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
 
 
 def write_evaluated_workspace(root: Path) -> Path:
-    """Write the toy workspace with the figures of its run, and return its folder."""
     write_toy_workspace(root)
     evaluate(root / "runs/toy", [root / "sequences/clip"], EvaluationSettings(perceptual=False, video_frames=0))
     return root
