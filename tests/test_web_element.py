@@ -1,15 +1,34 @@
-"""The element <mien-avatar>, the playground and the example in three.js, in a real browser."""
+"""The element <mien-avatar>, the playground, the example in three.js, and the starter with the package of npm."""
 
+import json
+import math
 import shutil
+import subprocess
+import tarfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from mien import runtime
+from mien.camera import camera_from_fov, look_at
 from mien.export import write_glb, write_packed
 from test_glb import mesh_model
-from web_case import WEB, browse, bundle, drawn_head, expect_usable, likeness, picture, psnr, rendered, script, served
+from web_case import (
+    WEB,
+    browse,
+    bundle,
+    drawn_head,
+    expect_usable,
+    likeness,
+    picture,
+    psnr,
+    rendered,
+    script,
+    served,
+    violations,
+)
 
 EXAMPLES = WEB / "examples"
 LOADED = """
@@ -42,7 +61,6 @@ avatar.expression = "jawOpen:0";
 
 @pytest.fixture(scope="module")
 def site(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the package, an avatar, and the examples of the element and of the playground."""
     folder = Path(shutil.copytree(built, tmp_path_factory.mktemp("site"), dirs_exist_ok=True))
     write_packed(folder / "me.packed", drawn_head(2000, rank=2))
     shutil.copy(EXAMPLES / "element.html", folder / "index.html")
@@ -116,14 +134,20 @@ def test_an_avatar_stands_in_a_scene_of_three(site: Path) -> None:
     exact = runtime.Avatar(drawn_head(2000, rank=2))
     moved = runtime.Gaussians(**{**vars(exact.pose()), "T_world_local": np.eye(4, dtype=np.float32)})
     (expected, alpha), (aside, _) = (
-        exact.render(moved, scene_camera(np.radians(degrees), 400), background=(0xDD / 255, 0xE4 / 255, 0xEA / 255))
-        for degrees in (0.0, 20.0)
+        exact.render(moved, scene_camera(turn), background=(0xDD / 255, 0xE4 / 255, 0xEA / 255))
+        for turn in (0.0, math.radians(20))
     )
     assert psnr(alone, expected) >= 40
     assert psnr(turned, aside) >= 40
     # Where the head is opaque, the box behind it changes nothing.
     near_blue = np.s_[:200, :200]
     assert np.abs(scene - alone).max(-1)[near_blue][alpha[near_blue] > 0.99].max() < 0.03
+
+
+def scene_camera(turn: float) -> runtime.Camera:
+    eye = torch.tensor([0.8 * math.sin(turn), 0.05, 0.8 * math.cos(turn)])
+    camera = camera_from_fov(math.radians(25), 400, 400, look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])))
+    return runtime.Camera(camera.K.numpy(), camera.viewmat.numpy(), 400, 400)
 
 
 DROP = """
@@ -140,7 +164,6 @@ SEEN = """
 
 
 def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
-    """A .packed, a .mien and a .glb show the same person, and a face moves it; anything else is told."""
     drawn = drawn_head(1000)
     write_packed(site / "same.packed", drawn)
     runtime.write_portable(site / "same.mien", drawn)
@@ -168,22 +191,61 @@ def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
     assert psnr(packed, mien) >= 40
     np.testing.assert_array_equal(mien, glb)
     assert psnr(smile, glb) < 45
-
-
-def test_everybody_can_use_the_playground(site: Path) -> None:
     with served(site) as address:
         expect_usable(f"{address}/playground.html", "", DROP % ("me.packed", "me.packed"))
 
 
-def scene_camera(turn: float, side: int) -> runtime.Camera:
-    """The camera of the example, which looks at the origin from 0.8 m, with OpenCV's axes."""
-    eye = np.array([0.8 * np.sin(turn), 0.05, 0.8 * np.cos(turn)])
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0, 1, 0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    focal = side / (2 * np.tan(np.radians(25) / 2))
-    K = np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]])
-    return runtime.Camera(K.astype(np.float32), viewmat.astype(np.float32), side, side)
+SURPRISE = """
+const buttons = [...document.querySelectorAll("nav button")];
+const jaw = avatar.viewer.avatar.expression_names.indexOf("jawOpen");
+buttons.find((button) => /surprise/i.test(button.textContent)).click();
+avatar.viewer.draw();
+return [buttons.length, avatar.viewer.face.expression[jaw], avatar.viewer.canvas.toDataURL()];
+"""
+
+
+def npm(folder: Path, *arguments: str | Path) -> str:
+    command = [shutil.which("npm") or "npm", *map(str, arguments)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def packed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("package")
+    for name in ("package.json", "README.md", "LICENSE"):
+        shutil.copy(WEB / name, folder)
+    shutil.copytree(built, folder / "dist")
+    npm(WEB, "run", "types", "--", "--outDir", folder / "dist" / "types")
+    npm(folder, "pack", "--ignore-scripts")
+    (found,) = folder.glob("mien-web-*.tgz")
+    return found
+
+
+def test_the_starter_is_built_from_the_packed_package_and_shows_an_avatar(packed: Path, tmp_path: Path) -> None:
+    starter = Path(shutil.copytree(WEB / "examples" / "starter", tmp_path / "starter"))
+    npm(starter, "install", packed, "--no-audit", "--no-fund")
+    write_packed(starter / "public" / "me.packed", drawn_head(500))
+    npm(starter, "run", "build")
+    with served(starter / "dist") as address:
+        told = browse(address, [script(LOADED, SURPRISE)], size=(640, 480))
+        assert violations(address, (390, 844), (), "", LOADED) == [], "before and after its avatar is there"
+    ((count, jaw, shown),) = told["results"]
+    assert told["messages"] == []
+    assert count >= 6
+    assert jaw > 0.1
+    assert len(np.unique(picture(shown).reshape(-1, 4), axis=0)) > 500, "a head in many colours is drawn"
+    # The package has every file that package.json names, with types, and nothing else goes to a registry.
+    package = json.loads((WEB / "package.json").read_text())
+    assert "dependencies" not in package
+    readme = (WEB / "README.md").read_text()
+    assert "](" not in readme.replace("](https://", ""), "links to files of the repository lead nowhere on npm"
+    assert (WEB / "LICENSE").read_text() == (WEB.parent / "LICENSE").read_text()
+    with tarfile.open(packed) as archive:
+        files = {name.removeprefix("package/") for name in archive.getnames()}
+    wanted = {path.removeprefix("./") for export in package["exports"].values() for path in export.values()}
+    assert wanted <= files
+    beside = {"README.md", "LICENSE", "package.json"}
+    assert beside <= files
+    assert all(path.startswith("dist/") for path in files - beside)

@@ -1,4 +1,4 @@
-"""Recordings move a page's avatar as they move it in Python, and its signs of life are calm."""
+"""Recordings and a voice move a page's avatar as they move it in Python, and its signs of life are calm."""
 
 import json
 from pathlib import Path
@@ -9,12 +9,17 @@ import pytest
 import torch
 
 from mien import runtime
+from mien.capture.sound import RATE
+from mien.cli import main
 from mien.driving import drive, face_of_motion, read_blendshape_json, read_live_link_face, rest_of
+from mien.driving.constants import DRIVING
 from mien.driving.sides import PAIRS
 from mien.export import write_page
 from mien.face import FaceParams, load_face_model
 from recordings import COLUMNS, LAYOUTS, row, write_csv, write_json
-from web_case import browse, drawn_head, run_node
+from test_driving_by_speech import synthesised, tone, write_wav
+from test_web_webcam import ALLOWED, FAKE
+from web_case import WEB, browse, bundle, drawn_head, run_node
 
 EQUAL = 1e-4
 COUNT = 150_000
@@ -32,17 +37,13 @@ def driven_by_python(recording: Path) -> tuple[float, FaceParams]:
     read = read_live_link_face if recording.suffix == ".csv" else read_blendshape_json
     motion = read(recording)
     face, rest = face_of_motion(motion, model)
-    near = portable.neutral
-    neutral = FaceParams(
-        model.neutral().identity,
-        *(torch.from_numpy(array)[None] for array in (near.expression, near.joints)),
-        *(torch.from_numpy(array)[None] for array in (near.head_rotation, near.head_translation)),
-    )
+    names = ("expression", "joints", "head_rotation", "head_translation")
+    near = (torch.from_numpy(getattr(portable.neutral, name))[None] for name in names)
+    neutral = FaceParams(model.neutral().identity, *near)
     return motion.fps, drive(face, rest_of(rest, model).face, neutral, model.expression_bounds)
 
 
 def plain_recording(folder: Path) -> Path:
-    """Return a json with a frame that has no face."""
     frames: list[dict[str, Any]] = [
         {"timestamp_ms": 40 * at, "blendshapes": {"jawOpen": at / 9, "mouthSmileLeft": 0.3}} for at in range(5)
     ]
@@ -51,7 +52,6 @@ def plain_recording(folder: Path) -> Path:
 
 
 def turned_rows() -> list[list[str]]:
-    """Return rows of a csv with gaze and turns about all axes."""
     turns = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 3))
     return [
         row(f"0:00:00:{2 * at:02d}.0", JawOpen=at / 8, EyeBlinkLeft=0.5, EyeLookOutLeft=0.4, EyeLookInRight=0.4,
@@ -60,17 +60,21 @@ def turned_rows() -> list[list[str]]:
     ]  # fmt: skip
 
 
+def expect_as_in_python(built: Path, folder: Path, recording: Path, notes: int = 0) -> None:
+    found = read_by_node(built, folder, recording)
+    assert len(found["notes"]) == notes, found
+    fps, face = driven_by_python(recording)
+    assert found["fps"] == pytest.approx(fps, rel=1e-6)
+    for name in ("expression", "joints", "head_rotation"):
+        expected = getattr(face, name).numpy().reshape(-1)
+        np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
+
+
 def test_every_layout_is_read_as_in_python(built: Path, tmp_path: Path) -> None:
-    """Each coefficient goes to the same side, in every layout of every source."""
     names = [name for pair in PAIRS for name in pair]
     for write in (write for writers in LAYOUTS.values() for write in writers):
         recording = write(tmp_path, [{}, *({name: 0.5} for name in names), {"jawOpen": 0.5}])
-        found = read_by_node(built, tmp_path, recording)
-        assert found["notes"] == []
-        fps, face = driven_by_python(recording)
-        assert found["fps"] == pytest.approx(fps, rel=1e-6)
-        expected = face.expression.numpy().reshape(-1)
-        np.testing.assert_allclose(found["expression"], expected, rtol=0, atol=EQUAL, err_msg=recording.name)
+        expect_as_in_python(built, tmp_path, recording)
 
 
 def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
@@ -79,9 +83,9 @@ def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> No
     rows = [row(code, JawOpen=index / 8, MouthLeft=0.5, HeadYaw=0.1 * index) for index, code in enumerate(codes)]
     keep = [index for index, name in enumerate(COLUMNS) if name != "TongueOut"]
     lines = [";".join(cells[index].replace(".", ",") for index in keep) for cells in (COLUMNS, *rows)]
-    table = tmp_path / "take.csv"
-    lost = ";".join(["23:59:59:54", "0"])
-    table.write_text("\n".join(["sep=;", lines[0], lost, *lines[1:]]), encoding="utf-8-sig")
+    table = "\n".join(["sep=;", lines[0], "23:59:59:54;0", *lines[1:]])
+    (tmp_path / "take.csv").write_text(table, encoding="utf-8-sig")
+    expect_as_in_python(built, tmp_path, tmp_path / "take.csv", 2)
     turn = [[0.8, 0.6, 0, 0], [-0.6, 0.8, 0, 0], [0, 0, 1, 0], [1, 2, -40, 1]]
     results = [
         {
@@ -91,75 +95,59 @@ def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> No
         }
         for time in (0.0, 0.1, 0.2, 0.5, 0.5)
     ]
-    task = write_json(tmp_path / "task.json", results)
-    turned = write_csv(tmp_path / "turned.csv", *turned_rows())
-    for recording, notes in ((table, 2), (task, 2), (turned, 0)):
-        found = read_by_node(built, tmp_path, recording)
-        assert len(found["notes"]) == notes, found
-        fps, face = driven_by_python(recording)
-        assert found["fps"] == pytest.approx(fps, rel=1e-6)
-        for name in ("expression", "joints", "head_rotation"):
-            expected = getattr(face, name).numpy().reshape(-1)
-            np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
+    expect_as_in_python(built, tmp_path, write_json(tmp_path / "task.json", results), 2)
+    expect_as_in_python(built, tmp_path, write_csv(tmp_path / "turned.csv", *turned_rows()))
 
 
 def test_a_page_takes_as_long_a_csv_as_python(built: Path, tmp_path: Path) -> None:
     """A long list of rows is not spread into the arguments of a call, of which engines take some 100,000."""
-    rows = [
-        f"{at // 108000}:{at // 1800 % 60:02d}:{at // 30 % 60:02d}:{at % 30:02d},61,{at % 10 / 10}"
-        for at in range(COUNT)
-    ]
-    (tmp_path / "long.csv").write_text("\n".join(["Timecode,BlendshapeCount,JawOpen", *rows]))
+    times = ((at // 108000, at // 1800 % 60, at // 30 % 60, at % 30) for at in range(COUNT))
+    rows = [f"{hour}:{minute:02d}:{second:02d}:{frame:02d},61,0.5" for hour, minute, second, frame in times]
+    (tmp_path / "long.csv").write_text(CSV + "\n".join(rows))
     found = read_by_node(built, tmp_path, tmp_path / "long.csv")
     assert "error" not in found
     assert (found["moments"], found["fps"]) == (COUNT, pytest.approx(30))
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.csv", "hello", "is no csv of Live Link Face"),
-        ("a.csv", "Timecode,BlendshapeCount,JawOpen\n0:0:0:1,61,wide\n", "has wide for jawopen in line 2"),
-        ("a.csv", "Timecode,BlendshapeCount,JawOpen\nnoon,61,0\n", 'has the timecode "noon" in line 2'),
-        ("a.csv", "Timecode,BlendshapeCount,JawOpen\n0:0:0:5,61,0\n0:0:0:4,61,0\n", "has times that do not increase"),
-        ("a.json", "[{", "is no json"),
-        ("a.json", "[]", "has no frame with blend shapes"),
-        ("a.json", '[{"blendshapes": {"jawOpen": "wide"}}]', "has a value that is no number in frame 0"),
-        ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:0:0:5,0\n", "has times that do not increase"),
-        ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:2:0:5,0\n", "has a gap of more than 60 s"),
-        (
-            "a.json",
-            json.dumps([{"timestamp_ms": i / 30, "blendshapes": {"jawOpen": 0}} for i in range(3)]),
-            'has 30000 frames in a second; give milliseconds, or call seconds "time"',
-        ),
-        (
-            "a.json",
-            json.dumps([{"time": 33 * i, "blendshapes": {"jawOpen": 0}} for i in range(3)]),
-            'has frames of 33 s; give seconds, or call milliseconds "timestamp_ms"',
-        ),
-        (
-            "a.json",
-            json.dumps([{"face_blendshapes": [[]], "facial_transformation_matrixes": [[[1] * 4] * 4]}]),
-            "has a matrix whose last row is not 0 0 0 1 in frame 0",
-        ),
-        ("a.json", '{"names": ["jawOpen"], "frames": [{"weights": []}]}', "has other numbers of names and weights"),
-        ("a.json", '[{"blendshapes": {"smile": 1}}]', "has none of this avatar's expressions"),
-    ],
-)
-def test_what_is_no_recording_is_said(built: Path, tmp_path: Path, name: str, content: str, message: str) -> None:
-    (tmp_path / name).write_text(content)
-    assert read_by_node(built, tmp_path, tmp_path / name)["error"] == message
+def frames(count: int = 1, **parts: Any) -> str:
+    """Return json of frames with these parts. What is callable depends on the frame."""
+    plain = {"blendshapes": {"jawOpen": 0}} | parts
+    return json.dumps([{k: v(i) if callable(v) else v for k, v in plain.items()} for i in range(count)])
+
+
+CSV = "Timecode,BlendshapeCount,JawOpen\n"
+BROKEN = [
+    ("a.csv", "hello", "is no csv of Live Link Face"),
+    ("a.csv", CSV + "0:0:0:1,61,wide\n", "has wide for jawopen in line 2"),
+    ("a.csv", CSV + "noon,61,0\n", 'has the timecode "noon" in line 2'),
+    ("a.csv", CSV + "0:0:0:5,61,0\n0:0:0:4,61,0\n", "has times that do not increase"),
+    ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:2:0:5,0\n", "has a gap of more than 60 s"),
+    ("a.json", "[{", "is no json"),
+    ("a.json", "[]", "has no frame with blend shapes"),
+    ("a.json", frames(blendshapes={"jawOpen": "wide"}), "has a value that is no number in frame 0"),
+    ("a.json", frames(3, timestamp_ms=lambda i: i / 30),
+     'has 30000 frames in a second; give milliseconds, or call seconds "time"'),
+    ("a.json", frames(3, time=lambda i: 33 * i),
+     'has frames of 33 s; give seconds, or call milliseconds "timestamp_ms"'),
+    ("a.json", json.dumps([{"face_blendshapes": [[]], "facial_transformation_matrixes": [[[1] * 4] * 4]}]),
+     "has a matrix whose last row is not 0 0 0 1 in frame 0"),
+    ("a.json", '{"names": ["jawOpen"], "frames": [{"weights": []}]}', "has other numbers of names and weights"),
+    ("a.json", frames(blendshapes={"smile": 1}), "has none of this avatar's expressions"),
+]  # fmt: skip
+
+
+def test_what_is_no_recording_is_said(built: Path, tmp_path: Path) -> None:
+    for name, content, message in BROKEN:
+        (tmp_path / name).write_text(content)
+        assert read_by_node(built, tmp_path, tmp_path / name)["error"] == message
 
 
 def test_signs_of_life_are_calm(built: Path, tmp_path: Path) -> None:
-    """A minute has 10 to 30 blinks, each below half a second, and the head turns by less than 4 degrees."""
     found = read_by_node(built, tmp_path, plain_recording(tmp_path))
-    closed = np.array(found["blinks"]) > 0
-    starts = np.flatnonzero(np.diff(closed.astype(int)) == 1)
-    assert 10 <= len(starts) <= 30
-    assert closed.mean() < 0.12
-    assert max(found["blinks"]) > 0.9
-    assert min(found["blinks"]) == 0
+    blinks = np.array(found["blinks"])
+    assert 10 <= (np.diff((blinks > 0).astype(int)) == 1).sum() <= 30
+    assert (blinks > 0).mean() < 0.12
+    assert min(blinks) == 0 < 0.9 < max(blinks)
     assert 0.01 < np.linalg.norm(found["sways"], axis=1).max() < np.radians(4)
 
 
@@ -176,49 +164,133 @@ DROP = """(async () => {
   return [document.getElementById("message").textContent, row.hidden, Array.from(viewer.face.expression)];
 })()"""
 
-LIVE = """(async () => {
-  const viewer = await mien;
-  document.getElementById("reset").click();
-  for (const id of ["idle", "gaze"]) document.getElementById(id).click();
-  const box = viewer.canvas.getBoundingClientRect(), blink = viewer.avatar.expression_names.indexOf("eyeBlinkLeft");
-  const eye = 3 * viewer.avatar.joint_names.indexOf("left_eye"), began = performance.now();
-  let closed = 0, gaze = [0, 0, 0], head_rotation;
-  // Eyes follow a pointer for some seconds. A blink may come later, or at once: the pointer moves until both are seen.
-  while (performance.now() - began < 30000 && (closed < 0.3 || gaze[0] > -0.1 || gaze[1] < 0.2)) {
-    dispatchEvent(new PointerEvent("pointermove", { clientX: box.right, clientY: box.top }));
-    closed = Math.max(closed, viewer.shown.expression[blink]);
-    gaze = Array.from(viewer.shown.joints.subarray(eye, eye + 3));
-    ({ head_rotation } = viewer.shown);
-    await new Promise((done) => setTimeout(done, 10));
-  }
-  const turned = Array.from(head_rotation), blinks = () => viewer.shown.expression[blink] > 0;
-  for (const id of ["idle", "gaze"]) document.getElementById(id).click();
-  for (let i = 0; i < 100 && viewer.shown !== viewer.face && blinks(); ++i)
-    await new Promise((done) => setTimeout(done, 50));
-  return [closed, gaze, turned, viewer.shown.expression[blink], Array.from(viewer.shown.head_rotation)];
-})()"""
 
-
-def test_a_page_plays_dropped_recordings_and_lives(tmp_path: Path) -> None:
-    portable = drawn_head(500)
-    write_page(tmp_path / "a.html", portable)
-    plain = plain_recording(tmp_path)
-    table = write_csv(tmp_path / "take.csv", *turned_rows())
-    bad = DROP % (json.dumps("hello"), "csv")
-    good = DROP % (json.dumps(table.read_text()), "csv")
-    other = DROP % (json.dumps(plain.read_text()), "json")
-    told = browse(tmp_path / "a.html", [bad, good, other, LIVE], size=(500, 300))
-    assert told["requests"] == []
-    assert told["messages"] == []
-    refused, first, second, (closed, gaze, turned, opened, still) = told["results"]
-    assert refused[0] == "take.csv is no csv of Live Link Face. Give a csv of Live Link Face, or blend shapes as json."
-    assert refused[1] is True
+def test_a_page_plays_dropped_recordings(tmp_path: Path) -> None:
+    write_page(tmp_path / "a.html", drawn_head(500))
+    table, plain = write_csv(tmp_path / "take.csv", *turned_rows()), plain_recording(tmp_path)
+    drops = (("hello", "csv"), (table.read_text(), "csv"), (plain.read_text(), "json"))
+    scripts = [DROP % (json.dumps(content), ending) for content, ending in drops]
+    told = browse(tmp_path / "a.html", scripts, size=(500, 300))
+    assert (told["requests"], told["messages"]) == ([], [])
+    refused, first, second = told["results"]
+    words = "take.csv is no csv of Live Link Face. Give a csv of Live Link Face, or blend shapes as json."
+    assert refused[:2] == [words, True]
     for recording, (message, hidden, expression) in ((table, first), (plain, second)):
         assert (message, hidden) == ("", False)
         np.testing.assert_allclose(expression, driven_by_python(recording)[1].expression[3], atol=EQUAL)
-    assert closed >= 0.3
-    assert gaze[0] < -0.1  # up
-    assert gaze[1] > 0.2  # to the right of the picture, which is the subject's left
-    assert np.abs(np.array(turned) - still).max() > 1e-3
-    assert opened == pytest.approx(portable.neutral.expression[portable.expression_names.index("eyeBlinkLeft")])
-    np.testing.assert_allclose(still, portable.neutral.head_rotation, atol=1e-6)
+
+
+WINDOW = (320, 240)
+FPS = 60
+HEAR = """(async () => {
+  const viewer = await mien, ear = await microphone, button = document.getElementById("microphone"), log = [];
+  const jaw = viewer.avatar.expression_names.indexOf("jawOpen"), rest = viewer.avatar.neutral.expression[jaw];
+  const wait = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
+  ear.onMouth = (mouth) => log.push([mouth.jawOpen, viewer.shown.expression[jaw] - rest]);
+  button.click();
+  while (!ear.on) await wait(0.02);
+  const told = document.getElementById("microphone-state").textContent;
+  // Until the mouth has opened and shut three times, however slow the machine is.
+  const times = () => log.filter(([open], k) => k && open > 0.15 && log[k - 1][0] <= 0.15).length;
+  for (let i = 0; i < 400 && !(times() > 2 && log.at(-1)[0] < 0.03); ++i) await wait(0.2);
+  const pressed = button.getAttribute("aria-pressed"), tracks = ear.stream.getTracks();
+  button.click();
+  await wait(0.3);
+  return { log, told, pressed: [pressed, button.getAttribute("aria-pressed")],
+    left: viewer.shown.expression[jaw] - rest,
+    ended: tracks.every((track) => track.readyState === "ended") };
+})()"""
+PRESS = """(async () => {
+  await microphone;
+  %s
+  const [told, button] = ["microphone-state", "microphone"].map((id) => document.getElementById(id));
+  told.textContent = "";
+  button.click();
+  while (!told.textContent) await new Promise((done) => setTimeout(done, 20));
+  return [told.textContent, told.getAttribute("role"), button.getAttribute("aria-pressed")];
+})()"""
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Path:
+    runtime.write_portable(tmp_path / "me.mien", drawn_head(150))
+    assert main(["export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "me.html"), "--microphone"]) == 0
+    return tmp_path / "me.html"
+
+
+def mouths(voice: Path, sound: np.ndarray) -> list[dict[str, float]]:
+    """Return the mouths of sound with `RATE` samples a second, as the page makes them at 60 pictures a second."""
+    size = round(2048 / 48_000 * RATE)
+    frequencies, window, heard = np.fft.rfftfreq(size, 1 / RATE), np.blackman(size), []
+    padded = np.pad(sound.astype(np.float64), (size, 0))
+    for index in range(int(len(sound) / RATE * FPS)):
+        piece = padded[round(index / FPS * RATE) :][:size]
+        piece = piece - piece.mean()
+        power = np.abs(np.fft.rfft(piece * window)) ** 2
+        bands = ((0, 700), (2500.1, np.inf), *DRIVING.speech_bands)
+        parts = (power[(least <= frequencies) & (frequencies < most)].sum() for least, most in bands)
+        low, high, *vowel = (part / max(power.sum(), 1e-20) for part in parts)
+        vowel = 10 * np.dot(np.log10(np.maximum(vowel, DRIVING.speech_least_share)), DRIVING.speech_band_weights)
+        loudness = 10 * np.log10(max(float((piece**2).mean()), 1e-12))
+        heard.append([loudness, float(vowel), float(low), float(high), index / FPS])
+    return run_node("voice.mjs", voice, heard)
+
+
+@pytest.fixture(scope="module")
+def voice(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("voice") / "voice.js"
+    bundle(WEB / "src" / "voice.ts", path)
+    return path
+
+
+@pytest.mark.parametrize(("seed", "even"), [(0, False), (2, True)])
+def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(voice: Path, seed: int, even: bool) -> None:
+    """As those of `mien drive --by voice.wav`, without knowing what comes next. A second of noise comes before."""
+    sound, jaw, shut = synthesised(seed, 24, even)
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(RATE).astype(np.float32)
+    found = mouths(voice, np.concatenate([noise, sound]))
+    opened = np.array([mouth["jawOpen"] for mouth in found])
+    late = round(0.03 * FPS)
+    at = (np.arange(len(found) - late) / FPS * RATE).astype(int)
+    truth = np.concatenate([np.zeros(RATE), jaw])[at]
+    assert np.corrcoef(opened[late:], truth)[0, 1] >= 0.8
+    edges = np.flatnonzero(np.diff(shut.astype(int), prepend=0, append=0)) / RATE * FPS + FPS
+    closures = [slice(int(begin), int(end) + 3) for begin, end in edges.reshape(-1, 2)]
+    assert np.mean([opened[one].min() < 0.06 for one in closures]) >= 0.8
+    assert opened[: FPS - late].max() < 0.05, "noise opens no mouth"
+    press = np.array([mouth["mouthPressLeft"] for mouth in found])
+    assert max(press[one].max() for one in closures) > 0.2
+
+
+def test_low_sounds_round_the_lips_and_high_ones_stretch_them(voice: Path) -> None:
+    low, high = (mouths(voice, tone(frequency)[0]) for frequency in (200.0, 5000.0))
+    most = [{name: max(mouth[name] for mouth in found) for name in found[0]} for found in (low, high)]
+    assert most[0]["mouthFunnel"] > 0.2 > 0.05 > most[1]["mouthFunnel"]
+    assert most[1]["mouthStretchLeft"] > 0.2 > 0.05 > most[0]["mouthStretchLeft"]
+    assert most[1]["jawOpen"] < 0.6 * most[0]["jawOpen"]
+
+
+def test_a_voice_drives_the_page(page: Path, tmp_path: Path) -> None:
+    """The fake device plays a voice of six seconds, a second of silence first, again and again."""
+    sound = write_wav(tmp_path / "voice.wav", tone(300.0)[0])
+    told = browse(page, [HEAR], WINDOW, flags=[FAKE, ALLOWED, f"--use-file-for-fake-audio-capture={sound}"])
+    assert (told["requests"], told["messages"]) == ([], [])
+    (result,) = told["results"]
+    heard, shown = np.array(result["log"]).T
+    assert (result["pressed"], result["ended"]) == (["true", "false"], True)
+    assert result["told"].startswith("Speak: the lips follow your voice.")
+    assert result["left"] == pytest.approx(0, abs=1e-6)
+    assert heard.max() > 0.35 > 0.03 > heard[-1]
+    # A moment is heard before the picture that shows it.
+    assert np.corrcoef(heard[:-1], shown[1:])[0, 1] > 0.95, "the avatar's jaw is that of the voice"
+
+
+def test_what_is_wrong_with_a_microphone_is_said(page: Path) -> None:
+    gone = "Object.defineProperty(navigator, 'mediaDevices', { value: undefined });"
+    denied = "navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('', 'NotAllowedError'); };"
+    messages = ("The microphone is not allowed. Allow it for this page", "This browser gives no microphone")
+    pressed = browse(page, [PRESS % denied, PRESS % gone], WINDOW)["results"]
+    for (text, *state), message in zip(pressed, messages, strict=True):
+        assert text.startswith(message)
+        assert state == ["status", "false"]
+    assert "form-action 'none'; base-uri 'none'" in page.read_text()

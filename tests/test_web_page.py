@@ -50,9 +50,15 @@ ALIVE = """(async () => {
     if (viewer.playing) timesteps.add(viewer.timestep);
     else closed = Math.max(closed, viewer.shown.expression[blink]);
   }
-  dispatchEvent(new PointerEvent("pointermove", { clientX: box.right, clientY: box.top + box.height / 2 }));
+  document.getElementById("reset").click();
+  dispatchEvent(new PointerEvent("pointermove", { clientX: box.right, clientY: box.top }));
   await passes(2);
-  return [Math.max(...turns), viewer.yaw, timesteps.size, viewer.playing, closed, viewer.shown.joints[eye + 1]];
+  const looks = [viewer.shown.joints[eye + 1], viewer.shown.joints[eye]];
+  for (const id of ["idle", "gaze"]) document.getElementById(id).click();
+  await passes(1);
+  const { head_rotation, expression } = viewer.shown;
+  return [Math.max(...turns), viewer.yaw, timesteps.size, viewer.playing, closed, ...looks,
+    Array.from(head_rotation), expression[blink]];
 })()"""
 KEY = """(async () => {
   const viewer = await mien;
@@ -63,12 +69,15 @@ KEY = """(async () => {
 })()"""
 
 
-def test_a_page_opens_alive(page: Path) -> None:
-    """The camera turns to the front, the filmed motion plays once, then the head blinks and looks at the pointer."""
+def test_a_page_opens_alive(page: Path, portable: runtime.PortableAvatar) -> None:
+    """The camera turns to the front, the filmed motion plays once, then the head blinks and looks at the pointer, which
+    is to its left and up. With both switched off, it rests."""
     told = browse(page, [ALIVE], size=(300, 200), device=["lively"], opening=CLOCK)
-    first, last, timesteps, playing, closed, gaze = told["results"][0]
+    first, last, timesteps, playing, closed, aside, down, still, opened = told["results"][0]
     assert (told["requests"], told["messages"], last, playing) == ([], [], 0, False)
-    assert (first > 0.2, timesteps >= 2, closed > 0.3, gaze > 0.25) == (True,) * 4, told["results"]
+    assert (first > 0.2, timesteps >= 2, closed > 0.3, aside > 0.25, down < -0.1) == (True,) * 5, told["results"]
+    np.testing.assert_allclose(still, portable.neutral.head_rotation, atol=1e-6)
+    assert opened == pytest.approx(portable.neutral.expression[portable.expression_names.index("eyeBlinkLeft")])
 
 
 @pytest.mark.parametrize("looks", [-1, 1])
@@ -135,27 +144,15 @@ def test_faces_are_buttons_and_keys_work_without_a_click(page: Path, portable: r
     # What was filmed goes from 0 to 1 in `drawn_head`.
     most = portable.expression_bounds[portable.expression_names.index("jawOpen"), 1]
     assert marks == ["0%", f"{round(100 / most)}%", False]
-
-
-def test_everybody_can_use_the_page(page: Path) -> None:
-    """As it opens, and with all that is behind "More"."""
     expect_usable(page, "await mien;", 'document.getElementById("more").click();')
 
 
 OUTSIDE = """(async () => {
   await mien;
   const shown = [...document.querySelectorAll("button")].filter((each) => each.checkVisibility());
-  return shown.filter((each) => {
-    const { left, right, top, bottom } = each.getBoundingClientRect();
-    return left < 0 || right > innerWidth || top < 0 || bottom > innerHeight;
-  }).map((each) => each.textContent);
+  return shown.map((each) => each.getBoundingClientRect())
+    .filter(({ left, right, top, bottom }) => left < 0 || right > innerWidth || top < 0 || bottom > innerHeight);
 })()"""
-
-
-def test_no_face_is_cut_off_on_a_phone(page: Path) -> None:
-    assert browse(page, [OUTSIDE], size=(390, 844), device=["touch"])["results"] == [[]]
-
-
 COLUMNS = """(async () => {
   const viewer = await mien, { canvas } = viewer;
   return [-1.2, 0, 1.2].map((yaw) => {
@@ -174,27 +171,12 @@ def test_a_head_fills_a_phone_and_is_whole(portable: runtime.PortableAvatar, tmp
     """On a phone that is held upright, the filmed picture would leave half of the width empty."""
     small = replace(portable.camera, K=np.array([[780, 0, 256], [0, 780, 256], [0, 0, 1]], np.float32))
     write_page(tmp_path / "a.html", replace(portable, camera=small))
-    pages = (browse(tmp_path / "a.html", [COLUMNS], size=size) for size in ((390, 844), (600, 600)))
-    phone, square = (np.array(told["results"][0]) for told in pages)
+    sizes = ((390, 844), (600, 600))
+    pages = [browse(tmp_path / "a.html", [COLUMNS, OUTSIDE], size=size, device=["touch"])["results"] for size in sizes]
+    phone, square = (np.array(columns) for columns, _ in pages)
+    assert [outside for _, outside in pages] == [[], []], "no face is cut off"
     assert (np.abs(phone - 0.5) < 0.48).all()
     assert np.ptp(phone[1]) > 1.4 * np.ptp(square[1])
-
-
-RESIZED = """(async () => {
-  const viewer = await mien, log = [], draw = viewer.draw.bind(viewer);
-  const frame = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done, 50)));
-  new ResizeObserver(() => log.push("shown")).observe(viewer.canvas);
-  await frame();
-  log.length = 0;
-  viewer.draw = () => (log.push("drawn"), draw());
-  document.getElementById("more").click();
-  await frame();
-  return log;
-})()"""
-
-
-def test_the_head_is_drawn_before_a_resized_window_is_shown(page: Path) -> None:
-    assert browse(page, [RESIZED], size=(900, 500))["results"][0][:2] == ["drawn", "shown"]
 
 
 def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.PortableAvatar) -> None:
@@ -214,14 +196,11 @@ def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.P
     write_page(tmp_path / "b.html", portable)
     assert "og:" not in (tmp_path / "b.html").read_text()
     assert not (tmp_path / "b.jpg").exists()
-
-
-def test_title_and_address_of_the_command(tmp_path: Path) -> None:
     for address in ("me.html", "javascript:alert(1)", "https://"):
         with pytest.raises(UserError, match="is no address; give one such as"):
             check_address(address)
-    runtime.write_portable(tmp_path / "me.mien", replace(drawn_head(10), filmed=None))
-    given = ["--title", "Ada", "--address", "https://example.org/a.html"]
-    assert main(["export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "a.html"), *given]) == 0
-    assert (tmp_path / "a.jpg").is_file()
-    assert "<title>Ada</title>" in (tmp_path / "a.html").read_text()
+    runtime.write_portable(tmp_path / "c.mien", replace(drawn_head(10), filmed=None))
+    given = ["--title", "Ada", "--address", "https://example.org/c.html"]
+    assert main(["export", str(tmp_path / "c.mien"), "--out", str(tmp_path / "c.html"), *given]) == 0
+    assert (tmp_path / "c.jpg").is_file()
+    assert "<title>Ada</title>" in (tmp_path / "c.html").read_text()

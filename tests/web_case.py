@@ -38,42 +38,44 @@ PATIENCE_SECONDS = 300.0
 """Time after which a page or a script of node counts as hung."""
 
 
+def package(name: str, missing: str = NO_NODE_PACKAGES) -> Path:
+    """Return the folder of a package of npm, or skip the test."""
+    folder = WEB / "node_modules" / name
+    if not folder.is_dir():
+        pytest.skip(missing)
+    return folder
+
+
 def node() -> str:
     """Return the path of node, or skip the test."""
     found = shutil.which("node")
     if found is None:
         pytest.skip(NO_NODE)
-    if not (WEB / "node_modules" / "esbuild").is_dir():
-        pytest.skip(NO_NODE_PACKAGES)
+    package("esbuild")
     return found
+
+
+def found_chromium() -> str:
+    return os.environ.get("MIEN_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), "")
 
 
 def chromium() -> str:
     """Return the path of Chromium, or skip the test."""
-    given = os.environ.get("MIEN_CHROMIUM")
-    found = given or next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        pytest.skip(NO_CHROMIUM)
-    return found
+    return found_chromium() or pytest.skip(NO_CHROMIUM)
 
 
 def tasks_vision() -> Path:
     """Return the folder of MediaPipe's face landmarker for pages, or skip the test."""
     node()
-    folder = WEB / "node_modules" / "@mediapipe" / "tasks-vision"
-    if not folder.is_dir():
-        pytest.skip(NO_TASKS_VISION)
-    return folder
+    return package("@mediapipe/tasks-vision", NO_TASKS_VISION)
 
 
 def build(folder: Path) -> Path:
-    """Build mien.js and page.html into a folder, and return it."""
     subprocess.run([node(), str(WEB / "build.mjs"), str(folder)], check=True, capture_output=True)
     return folder
 
 
 def bundle(source: Path, out: Path, *options: str) -> None:
-    """Bundle a script and the packages that it imports into one file, as a module."""
     command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(source), "--bundle"]
     subprocess.run([*command, "--format=esm", f"--outfile={out}", *options], check=True, capture_output=True)
 
@@ -82,13 +84,11 @@ class _Server:
     """A process of node that serves all tests of a worker, with one browser (web/tests/server.mjs)."""
 
     def __init__(self) -> None:
-        browser = os.environ.get("MIEN_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), "")
-        command = [node(), str(WEB / "tests" / "server.mjs"), browser]
+        command = [node(), str(WEB / "tests" / "server.mjs"), found_chromium()]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         atexit.register(self.end)
 
     def end(self) -> None:
-        """Let it close its browser, and end."""
         try:
             self.process.communicate(timeout=PATIENCE_SECONDS)
         except (subprocess.TimeoutExpired, ValueError, OSError):
@@ -114,7 +114,6 @@ _servers: list[_Server] = []
 
 
 def ask_node(**question: Any) -> Any:
-    """Ask the worker's process of node, which is started if there is none."""
     if not _servers or _servers[-1].process.poll() is not None:
         _servers.append(_Server())
     return _servers[-1].ask(question)
@@ -155,13 +154,9 @@ def posed_by_python(baked: runtime.MeshBound, face: runtime.Face) -> tuple[np.nd
 
 
 def browse(
-    page: Path | str,
-    scripts: Sequence[str] = (),
-    size: tuple[int, int] = (900, 600),
-    fragment: str = "",
-    device: Sequence[str] = (),
-    **more: Any,
-) -> dict[str, Any]:
+    page: Path | str, scripts: Sequence[str] = (), size: tuple[int, int] = (900, 600), fragment: str = "",
+    device: Sequence[str] = (), **more: Any,
+) -> dict[str, Any]:  # fmt: skip
     """Run scripts in a page, a file or an address: their `results`, all `requests`, and `messages` of the console.
 
     The browser is what `device` lists: lively (it does not ask for reduced motion), dark, touch, mobile. See
@@ -174,16 +169,13 @@ def browse(
 
 
 def until(done: Callable[[], bool]) -> None:
-    """Wait until something is so."""
     ends = time.monotonic() + PATIENCE_SECONDS
     while not done():
         assert time.monotonic() < ends, "it never came"
         time.sleep(0.01)
 
 
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        """Say nothing."""
+_Quiet = type("_Quiet", (SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
 
 
 @contextmanager
@@ -196,7 +188,6 @@ def served(folder: Path) -> Iterator[str]:
 
 
 def script(*parts: str) -> str:
-    """Return parts of JavaScript, which may wait, as one script."""
     return "(async () => {" + "".join(parts) + "})()"
 
 
@@ -218,12 +209,10 @@ def rendered(
 
 
 def likeness(address: str, truth: np.ndarray) -> float:
-    """Return how alike a page's picture and another one are, in dB."""
     return psnr(picture(address)[..., :3], truth)
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
-    """Return how alike two pictures are, in dB."""
     error = np.square(first.clip(0, 1) - second.clip(0, 1), dtype=np.float64).mean()
     return float(-10 * np.log10(error)) if error > 0 else math.inf  # two back ends may draw the same bytes
 
@@ -234,7 +223,7 @@ def violations(page: Path | str, size: tuple[int, int], device: Sequence[str] = 
     With steps, which are JavaScript, the page is looked at after each of them.
     """
     node()
-    axe = (WEB / "node_modules" / "axe-core" / "axe.min.js").read_text()
+    axe = (package("axe-core") / "axe.min.js").read_text()
     look = """
       document.querySelectorAll("details").forEach((each) => (each.open = true));
       const { violations } = await axe.run();
@@ -245,7 +234,6 @@ def violations(page: Path | str, size: tuple[int, int], device: Sequence[str] = 
 
 
 def expect_usable(page: Path | str, *steps: str) -> None:
-    """Check that axe-core finds no fault in a page after each of the steps, on a desktop and on a dark phone."""
     for size, device in (((1280, 800), ()), ((390, 844), ("dark", "touch"))):
         assert violations(page, size, device, *steps) == []
 
@@ -308,34 +296,26 @@ def painted_head(count: int, **config: Any) -> runtime.PortableAvatar:
 def _filling(portable: runtime.PortableAvatar) -> runtime.PortableAvatar:
     """Return the avatar with a head that fills the picture, a little turned."""
     K = np.array([[1300, 0, 256], [0, 1300, 256], [0, 0, 1]], np.float32)
-    neutral = replace(
-        portable.neutral,
-        head_rotation=np.array([0.05, -0.1, 0.02], np.float32),
-        head_translation=np.array([0.01, 0.02, -0.9], np.float32),
-    )
+    turn, place = np.array([0.05, -0.1, 0.02], np.float32), np.array([0.01, 0.02, -0.9], np.float32)
+    neutral = replace(portable.neutral, head_rotation=turn, head_translation=place)
     return replace(portable, neutral=neutral, camera=replace(portable.camera, K=K))
 
 
 def faces_of(portable: runtime.PortableAvatar, count: int) -> list[runtime.Face]:
-    """Return random faces of an avatar."""
     random, neutral = np.random.default_rng(1), portable.neutral
 
     def some(like: np.ndarray, spread: float) -> np.ndarray:
         return (spread * random.standard_normal(like.shape)).astype(np.float32)
 
-    return [
-        runtime.Face(
-            np.abs(some(neutral.expression, 0.4)),
-            some(neutral.joints, 0.2),
-            neutral.head_rotation + some(neutral.head_rotation, 0.1),
-            neutral.head_translation,
-        )
-        for _ in range(count)
-    ]
+    def face() -> runtime.Face:
+        expression, joints = np.abs(some(neutral.expression, 0.4)), some(neutral.joints, 0.2)
+        rotation = neutral.head_rotation + some(neutral.head_rotation, 0.1)
+        return runtime.Face(expression, joints, rotation, neutral.head_translation)
+
+    return [face() for _ in range(count)]
 
 
 def motion_of(faces: list[runtime.Face], fps: float = 1.0) -> Motion:
-    """Return faces as a motion."""
     return Motion(*(np.stack([getattr(face, name) for face in faces]) for name in vars(faces[0])), fps=fps)
 
 

@@ -1,4 +1,4 @@
-// Mouths of what a voice sounds like at each moment [loudness, vowel, low, high, seconds], for tests/test_web_microphone.py.
+// Mouths of what a voice sounds like at each moment [loudness, vowel, low, high, seconds], for tests/test_web_motion.py.
 import { pathToFileURL } from "node:url";
 
 export default async function voice(script, moments) {

@@ -1,4 +1,4 @@
-// Follows what a detector found, without a camera, for tests/test_web_webcam_following.py: the readings (null without one),
+// Follows what a detector found, without a camera, for tests/test_web_webcam.py: the readings (null without one),
 // and the smoothed values.
 import { pathToFileURL } from "node:url";
 
