@@ -5,8 +5,8 @@ import dataclasses
 import os
 import runpy
 import shutil
-from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -174,11 +174,8 @@ def test_interrupted_writing_leaves_the_old_capture(stored, monkeypatch):
     assert_same_capture(random_capture(), read_capture(stored))
 
 
-Usage = namedtuple("Usage", "total used free")
-
-
 def leave(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(1 << 40, 0, free))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=1 << 40, used=0, free=free))
 
 
 def test_the_estimate_is_above_what_noise_without_pngs_takes(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -83,6 +83,7 @@ def test_bounded_least_squares():
 
     box = fitting.Bounds(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
     found = fitting.minimize_frames(equations, cost, torch.full((2, 2), 0.5, dtype=torch.float64), box, 30)
+    assert found[:, 0].tolist() == [1, 0]
     # With x clamped, y minimises on: y = target_y - (0.9 / 1.0) (x - target_x), clamped as well.
     torch.testing.assert_close(found, torch.tensor([[1.0, 1.0], [0.0, 0.0]], dtype=torch.float64))
 
