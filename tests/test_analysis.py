@@ -13,27 +13,14 @@ import pytest
 import torch
 from markupsafe import escape
 
+import mien.lab.analysis as lab
 import toy_scene
 import train_toy
 from capture_helpers import tree_bytes
 from damage import edit_json
-from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands.analyze import Command
 from mien.face import FaceModel
-from mien.lab.analysis import (
-    ANALYSES,
-    Analysis,
-    AnalysisOptions,
-    Chart,
-    Film,
-    Part,
-    PartResult,
-    Picture,
-    Table,
-    chosen_parts,
-    run_analysis,
-)
 from mien.lab.analysis.gaussian_avatars import growth, speed
 from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
 from mien.plots import Axes, Series
@@ -45,8 +32,6 @@ from web_case import violations
 
 pytestmark = pytest.mark.unchecked
 SIZES = {(16, 24): 187, (24, 32): 95}
-EVERYTHING = Analysis("gaussian_avatars", "a paper", (Part("all", "All kinds", "test_analysis:part_of_everything"),))
-"""An analysis with every kind of result."""
 _plain = toy_scene.toy_face_model
 
 
@@ -71,7 +56,6 @@ def workspace(made_once: MadeOnce, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def analyze(root: Path, *more: str) -> dict[str, Any]:
-    """Analyze a run, and return its record."""
     assert main(["analyze", "gaussian-avatars", str(root), *more]) == 0
     return json.loads((root / "analysis/toy/analysis.json").read_text())
 
@@ -89,18 +73,20 @@ def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[st
     shown = capsys.readouterr()
     parts = json.loads(shown.out)["parts"]
     assert parts == stored["parts"]
-    assert list(parts) == [part.name for part in ANALYSES["gaussian-avatars"].parts]
+    assert list(parts) == [part.name for part in lab.ANALYSES["gaussian-avatars"].parts]
     assert "scale: 2 trainings of 2 steps each, about" in shown.err
     assert "not measured" not in shown.err
     folder = workspace / "analysis/toy"
     page = (folder / "analysis.html").read_text()
-    for part in ANALYSES["gaussian-avatars"].parts:
+    for part in lab.ANALYSES["gaussian-avatars"].parts:
         assert escape(part.summary) in page
         kept = parts[part.name]
         assert kept["findings"] or part.name == "teeth-trained"
         for entry in (*kept["charts"], *kept["pictures"]):
             assert (folder / entry["file"]).read_bytes().startswith(b"\x89PNG")
     assert not re.search(r"<script|<link|(?:src|href)=\"(?!data:)", page), "the page is one file"
+    for device in ([], ["dark", "touch"]):  # axe-core finds no fault
+        assert violations(folder / "analysis.html", (390, 844), device) == []
     rows = parts["speed"]["values"]["rows"]
     assert {(row["width"], row["height"]): row["paper_fps"] for row in rows} == SIZES
     assert all(row["fps"] > 0 and row["peak_mb"] >= row["before_mb"] > 0 for row in rows)
@@ -197,57 +183,44 @@ def test_a_run_without_teeth_says_so(made_once: MadeOnce, tmp_path: Path) -> Non
     assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
 
 
-def test_parts_of_another_method(workspace: Path, tmp_path: Path) -> None:
-    """The frame knows no method: an analysis of tables, charts, pictures and films is written and read again."""
-    folder = tmp_path / "out"
-    arguments = (EVERYTHING, EVERYTHING.parts, workspace / "runs/toy", (), folder, AnalysisOptions())
-    first = run_analysis(*arguments)
-    page = (folder / "analysis.html").read_text()
-    for words in ("a &lt;b&gt; note", "1,234", "–", "<video", "data:video/mp4", "data:image/png", "<circle"):
-        assert words in page
-    assert {path.name for path in folder.iterdir()} >= {"dots.png", "grey.png", "film.mp4", "analysis.json"}
-    again = run_analysis(*arguments)
-    assert again["parts"] == first["parts"]
-    assert again["parts"]["all"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
-    assert (folder / "analysis.html").read_text() == page
-    for device in ([], ["dark", "touch"]):  # axe-core finds no fault
-        assert violations(folder / "analysis.html", (390, 844), device) == []
-
-
-def part_of_everything(context: Any) -> PartResult:
-    gray = np.full((16, 16, 3), 128, np.uint8)
-    write_video(context.folder / "film.mp4", [gray] * 3, 25.0)
+def part_of_dots(_: Any) -> lab.PartResult:
     dots = Series("dots", np.arange(3.0), np.array([1.0, np.nan, 3.0]), points=True)
-    return PartResult(
-        {"figure": 1},
-        ("It is found.",),
-        (Table(("name", "value"), (("some", 1234), ("none", None)), "a caption"),),
-        (Chart("dots", "Dots", (dots,), Axes("x", "y", shaded=((0.0, 1.0),))),),
-        (Picture("grey", gray, "grey"),),
-        (Film("film.mp4", "a film"),),
-        ("a <b> note",),
-    )
+    table = lab.Table(("name", "value"), (("some", 1234), ("none", None)), "a caption")
+    chart = lab.Chart("dots", "Dots", (dots,), Axes("x", "y", shaded=((0.0, 1.0),)))
+    return lab.PartResult({}, ("It is found.",), (table,), (chart,), notes=("a <b> note",))
+
+
+def test_tables_and_charts_of_any_analysis_are_read_again(workspace: Path, tmp_path: Path) -> None:
+    dotted = lab.Analysis("gaussian_avatars", "a paper", (lab.Part("dots", "Dots", "test_analysis:part_of_dots"),))
+    arguments = (dotted, dotted.parts, workspace / "runs/toy", (), tmp_path / "out", lab.AnalysisOptions())
+    parts, page = lab.run_analysis(*arguments)["parts"], (tmp_path / "out/analysis.html").read_text()
+    assert all(words in page for words in ("a &lt;b&gt; note", "1,234", "–", "<circle"))
+    assert parts["dots"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
+    assert lab.run_analysis(*arguments)["parts"] == parts
+    assert (tmp_path / "out/analysis.html").read_text() == page
 
 
 def test_parts_that_train_are_left_out_unless_asked_for() -> None:
-    for analysis in ANALYSES.values():
+    for analysis in lab.ANALYSES.values():
         names = [part.name for part in analysis.parts]
         assert all(name in str(Command.__doc__) for name in names)
         quick = [part.name for part in analysis.parts if not part.trainings]
-        assert [part.name for part in chosen_parts(analysis, (), False)] == quick
+        assert [part.name for part in lab.chosen_parts(analysis, (), False)] == quick
         trained = [part.name for part in analysis.parts if part.trainings or part.name == names[0]]
-        assert [part.name for part in chosen_parts(analysis, names[:1], True)] == trained
+        assert [part.name for part in lab.chosen_parts(analysis, names[:1], True)] == trained
 
 
 BAD = [
     ("gaussian-avatars gone", "gone: no such folder"),
     ("gaussian-avatars", "mien: gaussian-avatars: no such folder"),
     ("headgas W more", "takes a workspace"),
+    ("gaussian-avatars W --run none", "no run 'none'; there are: begun, foreign, other, toy"),
+    ("gaussian-avatars W --run toy --steps 0", "--steps 0: give a number from 1 to 1000000"),
+    ("gaussian-avatars W --run toy --out /proc/a", "/proc/a: cannot be written"),
     ("gaussian-avatars W --run begun", "begun: its training was not finished; run the same `mien train`"),
     ("gaussian-avatars W --run other", "other: is a run of headgas, not of gaussian_avatars"),
     ("gaussian-avatars W --run toy --parts speed hair", "--parts hair: no such part; there are: growth, speed"),
     ("gaussian-avatars W --run toy --seconds nan", "--seconds nan: give a number from 0.01"),
-    ("gaussian-avatars W --run toy --out W/runs/toy/config.json", "is a file, but a folder"),
     ("headgaz W", "headgaz: has no analysis; choose one of gaussian-avatars"),
     ("W --run foreign", "has no analysis"),
 ]
@@ -277,6 +250,10 @@ def test_bad_input_is_told_in_one_line(workspace: Path, monkeypatch: pytest.Monk
 def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     expected, path = analyze(workspace, "--parts", "growth"), workspace / "analysis/toy/analysis.json"
     whole = path.read_bytes()
+    edit_json(path, lambda content: content.update(paper={"2": []}, run=3))
+    again = analyze(workspace, "--parts", "growth")
+    assert [again[name] for name in ("run", "paper", "parts")] == [expected[name] for name in ("run", "paper", "parts")]
+    capsys.readouterr()
     for change in (
         lambda content: content["parts"]["growth"]["tables"].append(3),
         lambda content: content["parts"]["growth"]["charts"][0].update(file="../../a.png"),
@@ -284,13 +261,7 @@ def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.Ca
     ):
         path.write_bytes(whole)
         edit_json(path, change)
-        capsys.readouterr()
         assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "growth")
-    path.write_bytes(whole)
-    edit_json(path, lambda content: content.update(paper={"2": []}, run=3))
-    again = analyze(workspace, "--parts", "growth")
-    assert [again[name] for name in ("run", "paper", "parts")] == [expected[name] for name in ("run", "paper", "parts")]
-    capsys.readouterr()
     shutil.rmtree(workspace / "analysis")
     (workspace / "analysis").symlink_to(workspace.parent)
     assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace))

@@ -109,6 +109,15 @@ def test_rows_differ_only_in_what_they_say() -> None:
     without = rows["no_perceptual"]
     assert (without.variant, without.photometric.perceptual.weight) == ("full", 0.0)
     assert rows["full"] == replace(config, variant="full")
+    # A limit that all variants reach is no finding about their counts.
+    config = HeadGasConfig(density=GradientSettings(max_gaussians=100))
+    rows = [{"name": name, "gaussians": 100, "head_psnr": None} for name in ("delta", "full")]
+    same, limit = ablations.findings(config, 10, rows)
+    assert "All variants have 100" in same
+    assert "--method.density.max-gaussians" in limit
+    few = ablations.findings(config, 10, [rows[0] | {"gaussians": 40}, rows[1] | {"gaussians": 50}])
+    assert len(few) == 1
+    assert "with delta(mu, R) has the fewest Gaussians (40)" in few[0]
 
 
 def test_gaussians_are_removed_from_near_to_far() -> None:
@@ -159,9 +168,7 @@ def test_the_camera_goes_where_the_head_sees_it_at_an_angle(context: Context) ->
     shown = [math.degrees(yaw) for yaw in beyond.shown_yaws(Trained(trained.highest, (-0.5, 0.25), 0.0))]
     low, high = math.degrees(-0.5), math.degrees(0.25)
     assert shown == pytest.approx([low - 30, low - 15, low, (low + high) / 2, high, high + 15, high + 30])
-
-
-def test_views_hold_the_head() -> None:
+    # Views hold the head.
     model, face = toy_face_model(), toy_face(5)[0]
     camera = head_camera(model, face, toy_camera(64), 100)
     pixels, _ = camera.project(model(face)[0])
@@ -175,14 +182,3 @@ def test_views_hold_the_head() -> None:
     assert picture.shape == (30, 40, 3)
     assert (picture[20:] == 128).all()
     assert picture[:20].min() < 200
-
-
-def test_a_limit_that_all_variants_reach_is_no_finding_about_their_counts() -> None:
-    config = HeadGasConfig(density=GradientSettings(max_gaussians=100))
-    rows = [{"name": name, "gaussians": 100, "head_psnr": None} for name in ("delta", "full")]
-    same, limit = ablations.findings(config, 10, rows)
-    assert "All variants have 100" in same
-    assert "--method.density.max-gaussians" in limit
-    few = ablations.findings(config, 10, [rows[0] | {"gaussians": 40}, rows[1] | {"gaussians": 50}])
-    assert len(few) == 1
-    assert "with delta(mu, R) has the fewest Gaussians (40)" in few[0]

@@ -59,23 +59,15 @@ def test_short_trainings_write_their_pictures(workspace: Path, capsys: pytest.Ca
     asked = ("--parts", "convergence", "resolutions", "diversity", "--steps", "10")
     parts = analyze(workspace, *asked)
     assert "diversity: 3 trainings of 10 steps each" in capsys.readouterr().err
-    folder = workspace / "analysis/toy"
     for name in ("convergence", "convergence-psnr", "convergence-points", "resolutions", "diversity"):
-        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    shown = parts["convergence"]["values"]["rows"]
+        assert (workspace / f"analysis/toy/{name}.png").read_bytes().startswith(b"\x89PNG")
+    shown, sides, subsets = (parts[name]["values"]["rows"] for name in ("convergence", "resolutions", "diversity"))
     assert [row["step"] for row in shown] == [1, 2, 5, 10]
-    assert len({row["head_psnr"] for row in shown}) == 4
-    sides = parts["resolutions"]["values"]["rows"]
-    assert [row["side"] for row in sides] == [32, 16]
-    assert sides[0]["head_psnr"] != sides[1]["head_psnr"]
-    assert [row["scale_gain"] for row in sides] == [0.00625, 0.00625]
-    subsets = parts["diversity"]["values"]["rows"]
-    assert [(row["name"], row["timesteps"]) for row in subsets] == [
-        ("all frames", 4), ("frontal quarter", 1), ("mixed half", 2)
-    ]  # fmt: skip
-    assert len({row["head_psnr"] for row in subsets}) == 3
-    # All frames at full size is the same training in both parts.
-    assert subsets[0]["head_psnr"] == sides[0]["head_psnr"]
+    assert [(row["side"], row["scale_gain"]) for row in sides] == [(32, 0.00625), (16, 0.00625)]
+    wanted = [("all frames", 4), ("frontal quarter", 1), ("mixed half", 2)]
+    assert [(row["name"], row["timesteps"]) for row in subsets] == wanted
+    assert [len({row["head_psnr"] for row in rows}) for rows in (shown, sides, subsets)] == [4, 2, 3]
+    assert subsets[0]["head_psnr"] == sides[0]["head_psnr"], "all frames at full size is the same training in both"
     assert analyze(workspace, *asked) == parts
 
 
@@ -114,7 +106,6 @@ def measured(angles: np.ndarray, expressions: np.ndarray) -> Measured:
 
 
 def test_the_mixed_half_keeps_what_is_rare() -> None:
-    # Twenty equal timesteps, then one turned far, and one with a strong expression.
     angles, expressions = np.zeros((22, 2)), np.zeros((22, 3))
     angles[20, 0], expressions[21, 1] = 1.0, 4.0
     whole = measured(angles, expressions)
@@ -125,9 +116,7 @@ def test_the_mixed_half_keeps_what_is_rare() -> None:
     # The frontal quarter has the views that are nearest to the median.
     yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
     assert frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))) == [3, 7]
-
-
-def test_subsets_are_chosen_among_the_frames_of_the_training() -> None:
+    # Subsets are chosen among the frames of the training.
     _, sequence = toy_sequence(10, 32)
     frames = training_frames([sequence], TrainSettings(split="tail"))
     found = measure([sequence], frames)

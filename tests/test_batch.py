@@ -19,7 +19,6 @@ from other_process import Holder
 
 
 def run_stubs(batch: Batch, rows: list[Row], **options: object) -> dict[str, str]:
-    """Run stub rows, and return the status of each."""
     batch.write_plan(rows)
     driver(batch, **options).run(rows)  # type: ignore[arg-type]
     return {row["name"]: row["status"] for row in batch_progress(batch)["rows"]}
@@ -39,9 +38,7 @@ def test_a_process_that_never_claims_its_row_fails_anew_each_time(tmp_path: Path
         assert state.error.startswith(told)
 
 
-def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(
-    tmp_path: Path, mortal: Holder, monkeypatch: pytest.MonkeyPatch
-):
+def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(tmp_path: Path, mortal: Holder, monkeypatch):
     batch, row, queued = Batch(tmp_path / "people"), stub_row("long", ("sleep", "0")), tmp_path / "queued"
     batch.write_plan([row])
     (tmp_path / "squeue").write_text(f"#!/bin/sh\ncat {queued} 2>/dev/null; true\n")
@@ -110,8 +107,8 @@ def test_a_failing_row_stops_no_other_and_is_tried_again(tmp_path: Path):
 
 
 def test_a_row_whose_process_is_killed_is_tried_again(tmp_path: Path, fork_server: ForkServer):
-    batch = Batch(tmp_path)
-    batch.write_plan([stub_row("victim", ("wait", "go"), ("value", "21")), stub_row("other", ("sleep", "0"))])
+    batch, other = Batch(tmp_path), stub_row("other", ("sleep", "0"))
+    batch.write_plan([stub_row("victim", ("wait", "go"), ("value", "21")), other])
     running = fork_server.call("batch_stub:drive_stubs", str(tmp_path))
     os.kill(wait_for_begin(tmp_path, "victim"), signal.SIGKILL)
     (tmp_path / "go").touch()
@@ -119,13 +116,11 @@ def test_a_row_whose_process_is_killed_is_tried_again(tmp_path: Path, fork_serve
     state = batch.read_state("victim")
     assert state is not None
     assert (state.status, state.tries, state.runs[0]["psnr"]) == ("done", 2, 21.0)
-    assert batch.is_done(stub_row("other", ("sleep", "0")))
+    assert batch.is_done(other)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_rows_stop_when_their_driver_is_stopped_and_the_same_command_continues(
-    tmp_path: Path, number: int, fork_server: ForkServer
-):
+def test_rows_stop_with_their_driver_and_the_same_command_continues(tmp_path: Path, number: int, fork_server):
     batch = Batch(tmp_path)
     batch.write_plan([stub_row(name, ("wait", "never")) for name in ("long", "second", "queued")])
     running = fork_server.call("batch_stub:drive_stubs", str(tmp_path))
@@ -143,21 +138,22 @@ def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Hol
     batch.write_plan([row])
     log = batch.log_file("long")
     log.parent.mkdir(parents=True)
-
-    def told(text: str) -> tuple[str | None, int | None]:
-        log.write_text(text, encoding="utf-8")
-        found = batch_progress(batch)["rows"][0]
-        return found["stage"], found["percent"]
-
     with mortal.holding(batch.state_file("long")):
         batch.write_state(State("long", "running", row.fingerprint, 1, "here", time.time()))
-        early = "stage 2 of 4 (tracking), about 9 min left\nOverlay: 100/100 in 5 s\n"
-        assert told("") == (None, None)
-        assert told(early) == ("tracking (2 of 4)", 100)
-        late = early + "stage 3 of 4 (training), about 3 min left\n"
-        assert told(late) == ("training (3 of 4)", None)
-        late += "training: 200/800 in 10 s, ETA 64 s\rstage 3 of 4 (training), about 2 min left\n"
-        assert told(late) == ("training (3 of 4)", 25)
+        for more, stage, percent in (
+            ("", None, None),
+            ("stage 2 of 4 (tracking), about 9 min left\nOverlay: 100/100 in 5 s\n", "tracking (2 of 4)", 100),
+            ("stage 3 of 4 (training), about 3 min left\n", "training (3 of 4)", None),
+            (
+                "training: 200/800 in 10 s, ETA 64 s\rstage 3 of 4 (training), about 2 min left\n",
+                "training (3 of 4)",
+                25,
+            ),
+        ):
+            with log.open("a") as file:
+                file.write(more)
+            found = batch_progress(batch)["rows"][0]
+            assert (found["stage"], found["percent"]) == (stage, percent)
 
 
 def test_a_row_that_another_command_holds_is_left_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -64,7 +64,6 @@ def rows_of(seconds: str) -> list:
 
 
 def check_too_large(engine: str, root: Path, words: str, **options: object) -> None:
-    """Check that a row that needs more memory than any node has fails alone."""
     rows = [stub_row("large", ("value", "9"), memory_mb=1e7), *rows_of("0.1")]
     assert run_with(engine, root, rows, **options) == EXPECTED
     found = {row["name"]: row for row in batch_progress(Batch(root))["rows"]}

@@ -70,6 +70,12 @@ def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
     assert "Methods compared" in page
     for device in ([], ["dark", "touch"]):  # axe-core finds no fault
         assert violations(tmp_path / "index.html", (390, 844), device) == []
+    # A film of any length has a thumbnail there.
+    for count in (1, 3, 40):
+        write_video(tmp_path / "film.mp4", (np.full((32, 32, 3), 6 * index, np.uint8) for index in range(count)), 25)
+        write_strip(tmp_path / "film.mp4", tmp_path / "strip.jpg")
+        with Image.open(tmp_path / "strip.jpg") as strip:
+            assert strip.size == (12 * 160, 160)
 
 
 def test_status_and_table_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
@@ -121,9 +127,7 @@ def test_any_damage_of_a_state_is_shown(tmp_path: Path, capsys: pytest.CaptureFi
         assert "ann: failed, try 1: " in capsys.readouterr().out, changed
     assert main(["batch", "table", str(tmp_path), "--columns", "psnr"]) == 0
     assert "| a | 1 | 31.00 |" in capsys.readouterr().out
-
-
-def test_rows_of_an_earlier_table_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    # Rows of an earlier table are told.
     scored(Batch(tmp_path / "out"))
     (tmp_path / "d.mp4").write_bytes(b"a video")
     (tmp_path / "table.csv").write_text("name,video\nann,d.mp4\n")
@@ -132,14 +136,6 @@ def test_rows_of_an_earlier_table_are_told(tmp_path: Path, capsys: pytest.Captur
     told = capsys.readouterr().err
     assert "2 rows of an earlier table will not be listed any more (bob, eve)" in told
     assert "1 of 1 row failed" in told
-
-
-def test_a_film_of_any_length_has_a_thumbnail(tmp_path: Path):
-    for count in (1, 3, 40):
-        write_video(tmp_path / "film.mp4", (np.full((32, 32, 3), 6 * index, np.uint8) for index in range(count)), 25)
-        write_strip(tmp_path / "film.mp4", tmp_path / "strip.jpg")
-        with Image.open(tmp_path / "strip.jpg") as strip:
-            assert strip.size == (12 * 160, 160)
 
 
 @pytest.fixture

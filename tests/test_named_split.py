@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from capture_helpers import random_capture
 from mien.capture import write_capture
 from mien.cli import main
 from mien.commands.stages import training as training_stage
@@ -18,7 +19,7 @@ from mien.tracking import write_tracking
 from mien.training import PRESETS, TrainSettings, doubly_held_out, split_by_name, with_benchmark_split, with_named_split
 from mien.training.footage.frames import training_frames
 from mien.training.footage.named_split import SEQUENCES, driving_sequences
-from toy_scene import toy_sequence
+from toy_scene import toy_face_model, toy_sequence, toy_tracking
 
 FOLDERS = (
     "EMO-1-shout+laugh", "EMO-2-surprise+fear", "EMO-3-angry+sad", "EMO-4-disgust+happy", "EXP-2-eyes",
@@ -46,18 +47,13 @@ def test_table_2(subject: str) -> None:
         assert set(split.sequences) | set(split.left_out) == set(names)
         assert driving_sequences(split.left_out) == [name for name in names if "FREE" in name]
         assert with_named_split(NAMED, split).held_out_sequences == (split.held_out,)
-
-
-def test_a_given_subject_wins_over_the_folder() -> None:
-    assert split_by_name(FOLDERS, "104", "306").subject == "306"
-    assert split_by_name(FOLDERS, "somebody", "74").held_out == "EMO-4-disgust+happy"
+    assert split_by_name(FOLDERS, "104", subject).subject == subject, "a given subject wins over the folder"
 
 
 def test_what_the_names_do_not_say_is_told_with_the_remedy() -> None:
     for names, folder, subject, words in (
         (FOLDERS, "me", None, "'me' does not say which subject it is; give --subject (the subjects are 074"),
         (FOLDERS, "104_306", None, "does not say which subject"),
-        (FOLDERS, "1306", None, "does not say which subject"),
         (FOLDERS, "306", "307", "--subject 307: is not a subject of --split gaussian-avatars; the subjects are 074"),
         (FOLDERS[1:], "306", None, "EMO-1 of subject 306 is missing; capture it with --name EMO-1 and track again"),
         (("FREE",), "306", None, "EMO-1, EMO-2, EMO-3, EMO-4, EXP-2, EXP-3, EXP-4, EXP-5, EXP-8, EXP-9 of subject"),
@@ -78,45 +74,41 @@ def test_either_name_of_the_camera_is_held_out() -> None:
     assert settings.held_out_cameras == ("08", "222200037")
     assert with_named_split(settings, split, ids) == settings, "the config of a run can be repeated"
     ids["EXP-4"] = ("front",)
-    with pytest.raises(UserError, match=r"EXP-4 has no camera 08 or 222200037, which it holds out \(there are front\)"):
-        with_named_split(NAMED, split, ids)
-
-
-def test_nothing_else_may_be_held_out() -> None:
-    split = split_by_name(SEQUENCES, "306")
-    for settings, words in (
-        (replace(NAMED, held_out_sequences=("EMO-1",)), "--hold-out EMO-1: --split gaussian-avatars decides"),
-        (replace(NAMED, held_out_cameras=("03",)), "--hold-out-cameras 03: --split gaussian-avatars decides"),
+    for settings, cameras, words in (
+        (NAMED, ids, r"EXP-4 has no camera 08 or 222200037, which it holds out \(there are front\)"),
+        (replace(NAMED, held_out_sequences=("EMO-1",)), None, "--hold-out EMO-1: --split gaussian-avatars decides"),
+        (replace(NAMED, held_out_cameras=("03",)), None, "--hold-out-cameras 03: --split gaussian-avatars decides"),
     ):
         with pytest.raises(UserError, match=words):
-            with_named_split(settings, split)
+            with_named_split(settings, split, cameras)
     with pytest.raises(UserError, match="are not filled in"):
         training_frames([toy_sequence(6, 16)[1]], NAMED)
 
 
-def test_frames_withheld_twice_are_told() -> None:
+@pytest.mark.unchecked
+def test_frames_withheld_twice_are_told(first: Path, tmp_path: Path, asked: list[Any], capsys) -> None:
     assert doubly_held_out(TrainSettings()) is None
-    assert doubly_held_out(TrainSettings(split="none", held_out_sequences=("a",))) is None
-    told = str(doubly_held_out(TrainSettings(held_out_sequences=("a", "b"))))
-    assert told.startswith("--split blocks holds out a fifth of each other sequence as well, beside --hold-out a b; ad")
+    root = subject(first, tmp_path / "w", FOLDERS[:3])
+    assert main(["train", str(root), "--hold-out", FOLDERS[0]]) == 0
+    told = f"--split blocks holds out a fifth of each other sequence as well, beside --hold-out {FOLDERS[0]}; ad"
+    assert f"warning: {told}" in " ".join(capsys.readouterr().err.split())
+    assert main(["train", str(root), "--hold-out", FOLDERS[0], "--split", "none"]) == 0
+    assert "warning" not in capsys.readouterr().err
 
 
 def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:
-    ids: dict[str, tuple[str, ...]] = dict.fromkeys(RECORDED, (FRONTAL, "222200046", "222200036"))
-    filled = with_benchmark_split(BENCHMARK, RECORDED, ids)
-    assert filled.held_out_sequences == TESTS
-    assert filled.held_out_cameras == ("222200046", "222200036")
-    assert with_benchmark_split(filled, RECORDED, ids) == filled, "the config of a run can be repeated"
     short = ("306_EMO-1", "306_EMO-10", "EXP-2", "FREEZE", "SEN-9", "sen")
-    filled = with_benchmark_split(BENCHMARK, short, dict.fromkeys(short, (FRONTAL,)))
-    assert filled.held_out_sequences == ("306_EMO-1", "SEN-9")
-    # The task of novel views holds out the hidden cameras.
-    filled = with_benchmark_split(BENCHMARK, ["HAIR"], {"HAIR": ("222200036", FRONTAL, "222200039")})
-    assert filled.held_out_sequences == ()
-    assert filled.held_out_cameras == (FRONTAL, "222200039")
-
-
-def test_what_the_benchmark_cannot_hold_out_is_told() -> None:
+    for names, cameras, held, hidden in (
+        (RECORDED, (FRONTAL, "222200046", "222200036"), TESTS, ("222200046", "222200036")),
+        (short, (FRONTAL,), ("306_EMO-1", "SEN-9"), ()),
+        # The task of novel views holds out the hidden cameras.
+        (("HAIR",), ("222200036", FRONTAL, "222200039"), (), (FRONTAL, "222200039")),
+    ):
+        ids: dict[str, tuple[str, ...]] = dict.fromkeys(names, cameras)
+        filled = with_benchmark_split(BENCHMARK, names, ids)
+        assert (filled.held_out_sequences, filled.held_out_cameras) == (held, hidden)
+        assert with_benchmark_split(filled, names, ids) == filled, "the config of a run can be repeated"
+    # What it cannot hold out is told.
     for names, cameras, settings, words in (
         (["FREE"], (FRONTAL,), BENCHMARK, "holds out all of FREE, and nothing is left"),
         (["FREE", "HAIR"], ("222200046",), BENCHMARK, f"trains on camera {FRONTAL}, and there are 222200046"),
@@ -134,26 +126,16 @@ def test_what_the_benchmark_cannot_hold_out_is_told() -> None:
 # -- the command line -------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a sequence with the cameras 08 and 09."""
-    return _write_sequence(tmp_path_factory.mktemp("first"), "08")
+first = pytest.fixture(scope="module")(lambda tmp_path_factory: _write_sequence(tmp_path_factory.mktemp("first"), "08"))
 
 
 def _write_sequence(folder: Path, camera: str) -> Path:
-    _, sequence = toy_sequence(2, 16)
-    capture, tracking = sequence.capture, sequence.tracking
-    two = replace(
-        capture, camera_ids=(camera, "09"), images=capture.images.repeat(2, 1), mattes=capture.mattes.repeat(2, 1),
-        landmarks=capture.landmarks.repeat(2, 1), valid=capture.valid.repeat(2, 1),
-        principal_point=capture.principal_point.repeat(2, 0), calibration=tracking.cameras * 2,
-    )  # fmt: skip
-    write_capture(folder / "capture", two)
-    seen = replace(
-        tracking, cameras=tracking.cameras * 2, neck_lines=tracking.neck_lines.repeat(1, 2, 1),
-        residuals=tracking.residuals.repeat(1, 2),
-    )  # fmt: skip
-    write_tracking(folder / "tracking", seen)
+    tracking = toy_tracking(toy_face_model(), 2, 16)
+    cameras = tracking.cameras * 2
+    capture = replace(random_capture(2, 2, 16, 16), camera_ids=(camera, "09"), calibration=cameras)
+    write_capture(folder / "capture", capture)
+    lines, residuals = tracking.neck_lines.repeat(1, 2, 1), tracking.residuals.repeat(1, 2)
+    write_tracking(folder / "tracking", replace(tracking, cameras=cameras, neck_lines=lines, residuals=residuals))
     return folder
 
 
@@ -166,21 +148,14 @@ def subject(first: Path, root: Path, names: tuple[str, ...] = FOLDERS) -> Path:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], TrainSettings]]:
+    """Return the sequences and settings of trainings, which are left out."""
     found: list[tuple[list[str], TrainSettings]] = []
-
-    def remember(
-        workspace: object, names: list[str], run: object, method: object, settings: TrainSettings, view: bool
-    ) -> None:
-        found.append((names, settings))
-
-    monkeypatch.setattr(training_stage, "run_training_stage", remember)
+    monkeypatch.setattr(training_stage, "run_training_stage", lambda *given: found.append((given[1], given[4])))
     return found
 
 
 @pytest.mark.unchecked
-def test_train_takes_the_split_by_name(
-    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_train_takes_the_split_by_name(first: Path, tmp_path: Path, asked: list[Any], capsys) -> None:
     root = subject(first, tmp_path / "306")
     assert main(["train", str(root), "--split", "gaussian-avatars"]) == 0
     names, settings = asked.pop()
@@ -194,66 +169,33 @@ def test_train_takes_the_split_by_name(
     config.write_text(json.dumps({"settings": {"split": settings.split, "held_out_cameras": ["08"]}}))
     assert main(["train", str(root), "--config", str(config)]) == 0
     assert asked.pop() == (names, settings)
-
-
-@pytest.mark.unchecked
-def test_train_refuses_what_does_not_fit(
-    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    front = _write_sequence(tmp_path / "front", "front")
-    for root, line, words in (
-        (subject(first, tmp_path / "me"), "", "does not say which subject"),
-        (subject(front, tmp_path / "306"), "", "has no camera 08"),
-        (tmp_path / "306", "--hold-out FREE", "--hold-out FREE: --split gaussian-avatars decides"),
-        (tmp_path / "306", "--sequences FREE", "is missing"),
-    ):
-        capsys.readouterr()
-        assert main(["train", str(root), "--split", "gaussian-avatars", *line.split()]) == 2
-        (told,) = filter(str.strip, capsys.readouterr().err.splitlines())
-        assert words in told
-    assert not asked
-
-
-@pytest.mark.unchecked
-def test_train_takes_the_benchmark_s_split_by_name(
-    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
     root = subject(_write_sequence(tmp_path / "first", FRONTAL), tmp_path / "393", RECORDED)
     assert main(["train", str(root), "--split", "nersemble-benchmark"]) == 0
     names, settings = asked.pop()
     assert tuple(names) == RECORDED
     assert (settings.held_out_sequences, settings.held_out_cameras) == (TESTS, ("09",))
-    shown = capsys.readouterr().err
-    assert f"held out are the sequences {', '.join(TESTS)} and the cameras 09" in shown
-    line = ["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "new"), "--split", "nersemble-benchmark"]
-    assert main(line) == 2
-    assert "needs several sequences" in capsys.readouterr().err
+    assert f"held out are the sequences {', '.join(TESTS)} and the cameras 09" in capsys.readouterr().err
 
 
 @pytest.mark.unchecked
-def test_other_commands_and_splits_say_where_it_belongs(
-    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = subject(first, tmp_path / "306", FOLDERS[:2])
-    capsys.readouterr()
+def test_train_refuses_what_does_not_fit(first: Path, tmp_path: Path, asked: list[Any], capsys) -> None:
+    subject(_write_sequence(tmp_path / "front", "front"), tmp_path / "306")
+    subject(first, tmp_path / "me")
+    create, named = ("create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "new")), "--split gaussian-avatars"
     for line, words in (
-        (["create", str(root), "--out", str(tmp_path / "new"), "--split", "gaussian-avatars"], "needs ten sequences"),
-        (["train", str(root), "--subject", "306"], "--subject 306: is for --split gaussian-avatars"),
+        (("train", str(tmp_path / "me"), *named.split()), "does not say which subject"),
+        (("train", str(tmp_path / "306"), *named.split()), "has no camera 08"),
+        (("train", str(tmp_path / "306"), *named.split(), "--hold-out", "FREE"), f"--hold-out FREE: {named} decides"),
+        (("train", str(tmp_path / "306"), *named.split(), "--sequences", "FREE"), "is missing"),
+        (("train", str(tmp_path / "306"), "--subject", "306"), f"--subject 306: is for {named}"),
+        ((*create, *named.split()), "needs ten sequences"),
+        ((*create, "--split", "nersemble-benchmark"), "needs several sequences"),
     ):
+        capsys.readouterr()
         assert main(line) == 2
         (told,) = filter(str.strip, capsys.readouterr().err.splitlines())
         assert words in told
-
-
-@pytest.mark.unchecked
-def test_doubled_holding_out_is_told_before_training(
-    first: Path, tmp_path: Path, asked: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = subject(first, tmp_path / "w", FOLDERS[:3])
-    assert main(["train", str(root), "--hold-out", FOLDERS[0]]) == 0
-    assert "warning: --split blocks holds out a fifth of each other sequence as well" in capsys.readouterr().err
-    assert main(["train", str(root), "--hold-out", FOLDERS[0], "--split", "none"]) == 0
-    assert "warning" not in capsys.readouterr().err
+    assert not asked
 
 
 @pytest.mark.unchecked
