@@ -18,7 +18,6 @@ from mien.tracking.landmarks import EmbeddingSettings, embedding
 
 @pytest.mark.unchecked
 def test_a_head_of_gnm_gets_landmarks_and_regions_by_the_detector(tmp_path, monkeypatch, capsys) -> None:
-    """Landmarks come within millimetres of those of the head that the file was made from."""
     anny = load_face_model("anny")
     path = write_gnm(tmp_path / "gnm.npz", gnm_like(anny))
     shutil.copytree(cache_folder() / "face_models", tmp_path / "cache" / "face_models")

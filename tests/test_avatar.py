@@ -115,13 +115,6 @@ def test_rows_stay_together_with_their_moments_and_new_ones_have_none() -> None:
     assert moments_of(store, "means").first.any()
 
 
-def test_what_does_not_fit_a_store_is_our_bug() -> None:
-    with pytest.raises(AssertionError, match="triangle"):
-        make_store().append(torch.tensor([0]), {"triangle": torch.tensor([1])})
-    with pytest.raises(AssertionError, match="differ in length"):
-        GaussianStore({"means": torch.zeros(3, 3)}, {"face_index": torch.zeros(4)})
-
-
 def test_state_dict_holds_everything_and_loads_into_another_length() -> None:
     store, other = make_store(), make_store(2)
     other.resize(6)

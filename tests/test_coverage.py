@@ -256,7 +256,6 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: Toy) -> None:
 
 @pytest.mark.unchecked
 def test_a_run_keeps_its_coverage(toy: Toy, tmp_path: Path) -> None:
-    """tests/test_hair_surface.py resumes such a run."""
     model, sequence = toy
     config, seen = plain_gaussian_avatars(), covered(toy).seen
     whole = train([sequence], model, config, SETTINGS, tmp_path / "whole")

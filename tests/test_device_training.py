@@ -17,7 +17,7 @@ import mien.devices
 import train_toy
 from mien import _native
 from mien.adam import FactoredMoments
-from mien.avatar import METHODS, GaussianAvatarsConfig, MethodConfig, Moments, load_avatar
+from mien.avatar import METHODS, GaussianAvatarsConfig, MethodConfig, load_avatar
 from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render
@@ -217,12 +217,6 @@ def test_regions_are_looked_for_where_the_model_is(monkeypatch: pytest.MonkeyPat
     face_model, _ = toy_sequence(timesteps=1, size=32)
     face_model.to(META).region_mask("lips")
     assert asked == [("meta", "meta")]
-
-
-def test_steps_are_counted_on_the_host() -> None:
-    with pytest.raises(RuntimeError):
-        (META + 1).item()
-    assert Moments.zeros(META).step.device.type == "cpu"
 
 
 def _rendered(gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:

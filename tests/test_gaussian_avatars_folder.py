@@ -76,7 +76,6 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("config", [{}, {"sh_degree": 3}, {"sh_degree": 2, "sh_frame": "head"}])
 def test_a_written_folder_draws_the_same(config: dict, tmp_path: Path) -> None:
-    """Every frame looks as before; the face model is in the folder."""
     model, face = toy_face_model(), replace(toy_face(5), vertex_offsets=None)
     avatar = new_avatar(model, face, **config)
     write_gaussian_avatars_folder(tmp_path / "a", avatar, face)

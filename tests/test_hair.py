@@ -122,7 +122,6 @@ def test_hair_that_does_not_hang_at_both_sides_has_no_back_hair(anny):
 
 
 def test_margins_are_those_of_pictures(anny):
-    """A camera sees what is cut off where the margin of the points nearest to the neck's axis is negative."""
     cut = fit_neck_cut(NeckParts.of(anny), anny.template, torch.tensor([0.0, 1.0, 0.0]))
     camera = camera_from_fov(0.5, 128, 128, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     camera.viewmat[2, 3] = 1.0

@@ -1,4 +1,4 @@
-"""The surface of hair follows the loss as a whole, and hidden Gaussians are removed or become a closed surface again."""
+"""The surface of hair follows the loss as a whole. Hidden Gaussians are removed or become a closed surface again."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -131,7 +131,6 @@ def test_limits_and_side_views_follow_the_hair():
 
 @pytest.mark.unchecked
 def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
-    """Half of a run and its continuation, with hair that moves in between."""
     model, sequence = _toy_with_scalp()
 
     def run(name: str, *progress: Any, **changes: Any) -> list[bytes]:

@@ -79,7 +79,6 @@ def test_color_and_opacity_are_the_networks_of_features_and_place() -> None:
 
 
 def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None:
-    """The preset has the formulas' moments of all bases, and the encoding's gradients of the centres."""
     paper: Any = PRESETS["paper"].config("headgas")
     assert (paper.encoding_gradient, paper.factored_bases, paper.network_epsilon) == (True, False, 1e-8)
     groups = {group.name: group for group in new_avatar(replace(SMALL, network_epsilon=1e-8)).parameter_groups()}
@@ -130,12 +129,6 @@ def test_children_of_a_split_copy_features_and_opacity_has_no_reset() -> None:
         assert config.density.opacity_resets == ()
 
 
-def test_judged_expressions_are_far_from_each_other() -> None:
-    points = torch.tensor([[0.0, 0], [0.1, 0], [5, 0], [0, 1], [5.1, 0], [0.1, 0.1]])
-    assert [len(spread_out(points, count)) for count in (0, 3, 100)] == [0, 3, 6]
-    assert torch.equal(spread_out(points, 3), points[[4, 3, 1]])
-
-
 def test_higher_degrees_learn_slower_and_begin_later() -> None:
     config = replace(SMALL, sh_degree=3, sh_warmup=0.4, sh_higher_share=0.05)
     avatar, face = new_avatar(config), toy_face(5)[1]
@@ -175,10 +168,13 @@ def test_points_are_on_the_mesh_evenly_by_area() -> None:
     torch.testing.assert_close(points[large, :2].mean(0), torch.ones(2), atol=0.05, rtol=0)
 
 
-def test_neighbor_distances_and_the_encoding_of_places() -> None:
+def test_distances_of_neighbors_and_expressions_and_the_encoding_of_places() -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [10, 0, 0]])
     expected = torch.tensor([2.0, (9 + 10 + 104**0.5) / 3])
     torch.testing.assert_close(neighbor_distances(points)[[0, 4]], expected)
+    points = torch.tensor([[0.0, 0], [0.1, 0], [5, 0], [0, 1], [5.1, 0], [0.1, 0.1]])
+    assert [len(spread_out(points, count)) for count in (0, 3, 100)] == [0, 3, 6]
+    assert torch.equal(spread_out(points, 3), points[[4, 3, 1]]), "judged expressions are far from each other"
     point = torch.tensor([0.1, -0.2, 0.3])
     waves = [wave(octave * point) for octave in (1, 2, 4) for wave in (torch.sin, torch.cos)]
     torch.testing.assert_close(positional_encoding(point, 3), torch.cat([point, *waves]))

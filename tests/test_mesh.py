@@ -174,7 +174,6 @@ def test_native_interpolation_equals_the_reference():
 
 
 def test_texture_lookup():
-    """Textures are sampled between texels, and at the border beyond them."""
     texture = torch.arange(12.0).view(3, 4, 1)
     uv = torch.tensor([[[0.125, 1 - 1 / 6], [0.875, 1 / 6]], [[0.25, 0.5], [-1.0, 2.0]]])
     expected = torch.tensor([[[0.0], [11.0]], [[4.5], [0.0]]])
@@ -204,7 +203,6 @@ def test_normals_of_a_sphere_point_outwards():
 
 
 def test_picture_of_a_sphere():
-    """A sphere covers the area of its projection, and the background is as given."""
     vertices, faces = sphere(4)
     camera = camera_at([0.0, 0.0, 4.0], 0.8, 64)
     radius = float(camera.K[0, 0]) / (4**2 - 1) ** 0.5

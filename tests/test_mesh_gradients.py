@@ -193,7 +193,6 @@ def test_loss_has_the_gradients_of_finite_differences(scene: Scene, back_end: st
 
 
 def test_edges_of_a_square():
-    """A square of two triangles has five edges, each with its faces and opposite vertex."""
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     edges = mesh_edges(faces)
     rows = [tuple(row) for row in torch.cat([edges.vertices, edges.faces, edges.opposite[:, None]], 1).tolist()]
@@ -203,7 +202,6 @@ def test_edges_of_a_square():
 
 @pytest.mark.parametrize("size", [256, 512])
 def test_silhouette_gradient_of_a_head_is_that_of_its_area(anny: FaceModel, size: int):
-    """The silhouette gradient of a head is the growth of its area: a larger head covers more pixels."""
     vertices, faces, camera = anny(anny.neutral())[0], anny.faces, camera_at([0.15, 0.0, 0.6], 0.55, size)
     fragments, edges = rasterize_mesh(vertices, faces, camera), mesh_edges(faces)
     covered, fine = (fragments.face_index >= 0)[..., None].float(), camera.resized(2 * size, 2 * size)

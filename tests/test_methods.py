@@ -89,7 +89,6 @@ def test_first_fifty_steps_lower_the_loss(method: str) -> None:
 @pytest.mark.unchecked
 @each
 def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: str, tmp_path: Path) -> None:
-    """All tensors are equally long after each step."""
     undisturbed, data = started(CONFIGS[method])
     store, written = undisturbed.avatar.gaussian_store(), 0
     counts = {len(store)}
@@ -116,7 +115,6 @@ def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: s
 
 @each
 def test_saved_avatar_renders_the_same_picture(method: str, tmp_path: Path) -> None:
-    """From the folder of a run, and from that of the avatar alone."""
     avatar = new_avatar(method, disturbed=True)
     if not isinstance(avatar.density(), FixedDensity):
         avatar.gaussian_store().append(torch.arange(7))
@@ -151,7 +149,6 @@ def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> N
 @pytest.mark.unchecked
 @method
 def test_an_avatar_becomes_a_file_a_page_and_a_mesh(method: str, tmp_path: Path) -> None:
-    """The whole avatar is in a .mien and in a .glb file, and a page loses nothing that can be seen."""
     avatar = new_avatar(method)
     portable, model = make_portable(avatar, toy_camera(64), "toy"), avatar.face_model
     runtime.write_portable(tmp_path / "a.mien", portable)

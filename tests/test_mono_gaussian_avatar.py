@@ -56,7 +56,6 @@ def test_canonical_face_leaves_points_at_their_canonical_places() -> None:
 
 
 def test_canonical_jaw_is_open() -> None:
-    """A jaw that follows the expression opens by its coefficient, a free one by its angle."""
     follows, mean = toy_face_model(), toy_face(5).expression.mean(0)
     names, jaw = follows.joint_names, follows.joint_names.index("jaw")
     expression, joints = canonical_face(follows, mean)
@@ -116,7 +115,6 @@ class Perfect(DeformationNet):
 
 
 def test_vertices_with_their_own_directions_move_as_the_mesh_does_and_cost_nothing() -> None:
-    """The points are the canonical mesh's vertices."""
     avatar, face = new_avatar(face_model=with_pose_correctives()), toy_face(5)
     vertices = avatar.face_model.head_vertices(avatar.canonical_face())[0]
     avatar.store.resize(len(vertices))

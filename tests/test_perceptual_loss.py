@@ -147,7 +147,6 @@ def test_targets_have_parts_if_they_are_asked_for(scene: tuple[FaceModel, Sequen
 
 @pytest.mark.unchecked
 def test_the_loss_is_recorded_at_its_steps(scene: tuple[FaceModel, Sequence], tmp_path: Path) -> None:
-    """tests/test_methods.py resumes a run that has it."""
     for name, config in (("whole", CONFIG), ("plain", train_toy.CONFIG)):
         train([scene[1]], scene[0], config, replace(train_toy.SETTINGS, steps=12), tmp_path / name, silence)
     curves = read_curves(tmp_path / "whole")

@@ -70,7 +70,6 @@ def scenes(backend: Backend) -> Iterator[Scene]:
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 @pytest.mark.parametrize("level", [*ISAS, GSPLAT])
 def test_every_level_matches_the_reference(coefficients: int, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Instruction sets of the native core, and gsplat."""
     if level != "gsplat":
         use_instructions(level)
     backend = "gsplat" if level == "gsplat" else "native"

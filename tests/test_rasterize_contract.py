@@ -44,7 +44,7 @@ def stacked(scenes: list[Scene]) -> Gaussians:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_ball_on_the_axis_shows_its_color_at_the_center(backend: Backend) -> None:
+def test_balls_on_the_axis_show_their_colors_at_the_center(backend: Backend) -> None:
     rendering = rasterize(one_gaussian(), front_camera(), torch.zeros(3), backend)
     assert rendering.alpha[7, 10].item() == pytest.approx(0.8, abs=1e-4)
     torch.testing.assert_close(rendering.image[7, 10], 0.8 * torch.tensor([1.0, 0.5, 0.1]), atol=1e-4, rtol=0)
@@ -52,23 +52,16 @@ def test_a_ball_on_the_axis_shows_its_color_at_the_center(backend: Backend) -> N
     variance = (60 * 0.02) ** 2 + 0.3
     assert rendering.alpha[7, 12].item() == pytest.approx(0.8 * math.exp(-0.5 * 2**2 / variance), abs=1e-5)
     assert rendering.radii.tolist() == [math.ceil(3 * variance**0.5)]
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_nearer_hides_farther_and_ties_go_by_index(backend: Backend) -> None:
-    three = one_gaussian().select(torch.tensor([0, 0, 0]))
+    # Nearer ones hide farther ones, and ties go by the index.
     means = torch.tensor([[0.0, 0, 1.1], [0, 0, 1], [0, 0, 1]])
-    gaussians = replace(three, means=means, sh=sh_from_rgb(torch.eye(3))[:, None])
-    seen = rasterize(gaussians, front_camera(), torch.zeros(3), backend).image[7, 10]
+    three = replace(one_gaussian().select(torch.tensor([0, 0, 0])), means=means, sh=sh_from_rgb(torch.eye(3))[:, None])
+    seen = rasterize(three, front_camera(), torch.zeros(3), backend).image[7, 10]
     torch.testing.assert_close(seen, torch.tensor([0.8 * 0.04, 0.8, 0.8 * 0.2]), atol=1e-3, rtol=0)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_clamped_alpha_has_no_gradient(backend: Backend) -> None:
-    gaussians = replace(one_gaussian(scale=5.0), opacities=torch.ones(1, requires_grad=True))
-    alpha = rasterize(gaussians, front_camera(), torch.zeros(3), backend).alpha[7, 10]
+    # A clamped alpha has no gradient.
+    large = replace(one_gaussian(scale=5.0), opacities=torch.ones(1, requires_grad=True))
+    alpha = rasterize(large, front_camera(), torch.zeros(3), backend).alpha[7, 10]
     assert alpha.item() == pytest.approx(0.999, abs=1e-6)
-    assert torch.autograd.grad(alpha, gaussians.opacities)[0].item() == 0
+    assert torch.autograd.grad(alpha, large.opacities)[0].item() == 0
 
 
 @pytest.mark.exact
@@ -159,7 +152,6 @@ def test_what_is_not_finite_is_named(backend: Backend) -> None:
 
 
 def test_layouts_and_dtypes() -> None:
-    """Strided tensors draw the same picture, and other dtypes are refused by name."""
     scene = random_scene(4)
     spread = {name: getattr(scene.gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     spread = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in spread.items()}

@@ -75,7 +75,6 @@ def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
 
 @pytest.mark.unchecked
 def test_raw_recordings_of_nersemble_become_an_avatar(rig: SyntheticScene, tmp_path: Path) -> None:
-    """tests/test_training_on_datasets.py scores those of several calibrated cameras."""
     person, root = tmp_path / "017", tmp_path / "me"
     mattes = write_person(person, rig)
     assert main(["import", str(person), "--out", str(root)]) == 0
@@ -105,7 +104,7 @@ def cropped(capture: Capture, serial: str, drawn: np.ndarray) -> np.ndarray:
 
 
 def check_colors(rig: SyntheticScene, capture: Capture) -> None:
-    """Captured pictures have the drawn colours. tests/test_color_correction.py has the terms in any order."""
+    """Captured pictures have the drawn colours. tests/test_capture_lens.py has the terms in any order."""
     frames = list(rig.timestep_frames(0))
     for index, serial in enumerate(capture.camera_ids):
         drawn = cropped(capture, serial, frames[SERIALS.index(serial)].image)
@@ -132,7 +131,6 @@ def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mat
 @pytest.mark.unchecked
 @pytest.mark.usefixtures("short_films")
 def test_a_take_of_live_link_face_becomes_an_avatar(tmp_path: Path) -> None:
-    """Its video is captured, tracked and trained on, and its own csv drives the avatar."""
     scene = SyntheticScene(replace(PERSON, width=256, height=320, script=(Segment("speech", 0.48),)), 3)
     pictures = [frame.image for frame in scene.frames()]
     take, root = tmp_path / "20240131_Me_3", tmp_path / "me"

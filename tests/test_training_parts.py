@@ -255,7 +255,6 @@ def test_native_composite_has_the_integers_of_the_reference() -> None:
 
 
 def test_every_integer_is_the_rounded_one() -> None:
-    """All pairs of a value and an opacity, over a few backgrounds."""
     value, matte = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
     image = np.repeat(value[..., None], 3, axis=2)
     for gray in (0, 1, 100, 255):

@@ -33,7 +33,6 @@ def random_rig(
 
 
 def test_frame_of_a_known_triangle():
-    """A known triangle has the frame of the paper's formula."""
     vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1, 0]])
     frames = triangle_frames(vertices, torch.tensor([[0, 1, 2]]))
     # Columns: first edge (+x), normal (+z), their cross product (-y).
