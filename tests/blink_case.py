@@ -51,7 +51,6 @@ class BlinkCase:
         return shot_of(capture, TrackingSettings())
 
     def fit(self, lids: np.ndarray, size: int = 192) -> Fit:
-        """Return a fit that has these lids."""
         own = SequenceFit(batch_of((_camera(size),)), self.states(lids))
         return Fit(unknown_subject(self.reduced), (own,))
 

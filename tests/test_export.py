@@ -1,25 +1,39 @@
-""".ply files have the bytes of a layout built by hand, keep frames, and are refused if damaged or foreign."""
+""".ply files, options of `mien export`, pictures and films: what is wrong is refused before any work."""
 
+import math
 import struct
 from dataclasses import replace
 from pathlib import Path
 
+import av
+import cv2
+import numpy as np
 import pytest
 import torch
 
+from mien import runtime
 from mien.camera import camera_from_fov
+from mien.capture.video import probe_video
 from mien.cli import main
+from mien.commands.picture import PictureOptions
+from mien.commands.stages.pictures import draw
 from mien.errors import UserError
 from mien.export import in_world, read_ply, write_ply
+from mien.export.output import plan_output
+from mien.export.pictures import write_pictures
+from mien.export.pixels import to_rgb, to_rgba
 from mien.export.ply import property_names
+from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render import rasterize
+from mien.render.camera_paths import read_cameras, sway, write_cameras
 from mien.rotation import matrix_from_axis_angle, rigid_transform
+from mien.storage import write_json
 from shared_things import MadeOnce, toy_workspace
 from test_splat_files import some
+from web_case import drawn_head
 
 
 def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
-    """The layout is that of other programs, with the bytes of one Gaussian built from the format's description."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(9)] + ["opacity", "scale_0", "scale_1", "scale_2"]
     names += ["rot_0", "rot_1", "rot_2", "rot_3"]
@@ -47,23 +61,14 @@ def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
     assert "comment mien frame: world" in lines
 
 
-def test_local_frame_is_kept(tmp_path: Path) -> None:
-    pose = torch.eye(4)
-    pose[:3, 3] = torch.tensor([0.1, -0.2, 1 / 3])
-    local = some(5, 1)
-    write_ply(tmp_path / "a.ply", replace(local, T_world_local=pose))
+def test_a_local_frame_is_kept_and_gaussians_in_world_look_the_same(tmp_path: Path) -> None:
+    pose = rigid_transform(matrix_from_axis_angle(torch.tensor([0.4, -0.9, 0.2])), torch.tensor([0.05, 0.02, -1 / 3]))
+    local = replace(some(80, 16), T_world_local=pose)
+    write_ply(tmp_path / "a.ply", local)
     read = read_ply(tmp_path / "a.ply")
     assert read.T_world_local is not None
     assert torch.equal(read.T_world_local, pose)
     assert torch.equal(read.means, local.means)
-
-
-@pytest.mark.parametrize("coefficients", [1, 16])
-def test_in_world_looks_the_same(coefficients: int) -> None:
-    """Gaussians moved into the world look the same: positions, rotations and colours that depend on the view."""
-    pose = rigid_transform(matrix_from_axis_angle(torch.tensor([0.4, -0.9, 0.2])), torch.tensor([0.05, 0.02, -0.5]))
-    local = some(80, coefficients)
-    local = replace(local, T_world_local=pose)
     camera = camera_from_fov(0.6, 48, 40, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     moved = in_world(local)
     assert moved.T_world_local is None
@@ -74,56 +79,165 @@ def test_in_world_looks_the_same(coefficients: int) -> None:
 
 
 def test_damaged_and_foreign_files(tmp_path: Path) -> None:
-    good = tmp_path / "good.ply"
-    write_ply(good, some(5, 1))
-    content = good.read_bytes()
-    cases = {
+    path = tmp_path / "a.ply"
+    with pytest.raises(UserError, match="cannot be read"):
+        read_ply(path)
+    write_ply(path, some(5, 1))
+    content = path.read_bytes()
+    for message, damaged in {
         "truncated": content[:-7],
         "is not a .ply": b"GIF89a" + content,
         "not supported": content.replace(b"binary_little_endian", b"ascii", 1),
         "lacks f_dc_0": content.replace(b"f_dc_0", b"red_is"),
-        "lacks y": content.replace(b"float y", b"float w"),
         "not float": content.replace(b"property float x", b"property double x"),
         "first element": content.replace(b"element vertex", b"element corner"),
-    }
-    for message, damaged in cases.items():
-        path = tmp_path / "damaged.ply"
+    }.items():
         path.write_bytes(damaged)
         with pytest.raises(UserError, match=message):
             read_ply(path)
-    with pytest.raises(UserError, match="cannot be read"):
-        read_ply(tmp_path / "missing.ply")
 
 
-def test_nan_is_not_written(tmp_path: Path) -> None:
-    gaussians = some(3, 1)
-    gaussians.means[1, 0] = torch.nan
-    with pytest.raises(UserError, match="1 of 3 Gaussians"):
-        write_ply(tmp_path / "a.ply", gaussians)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_ply_can_have_coefficients_of_degree_3(
-    tmp_path: Path, made_once: MadeOnce, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ply_can_have_coefficients_of_degree_3(tmp_path: Path, made_once: MadeOnce) -> None:
     """Some programs expect 248 bytes for each Gaussian. The colours stay the same."""
-    line = ["export", str(toy_workspace(made_once)), "--out"]
-    assert main([*line, str(tmp_path / "own.ply")]) == 0
-    assert main([*line, str(tmp_path / "me.mien")]) == 0
-    assert main([*line, str(tmp_path / "padded.ply"), "--sh", "3"]) == 0
-    assert main([*line, str(tmp_path / "s.ply"), "--series", "clip", "--sh", "3"]) == 0
-    assert main(["export", str(tmp_path / "me.mien"), "--out", str(tmp_path / "file.ply"), "--sh", "3"]) == 0
+    workspace, file = toy_workspace(made_once), tmp_path / "me.mien"
+    padded, series, by_file = (tmp_path / name for name in ("padded.ply", "s.ply", "file.ply"))
+    for source, out, *options in (
+        (workspace, tmp_path / "own.ply"), (workspace, file), (workspace, padded, "--sh", "3"),
+        (workspace, series, "--series", "clip", "--sh", "3"), (file, by_file, "--sh", "3"),
+    ):  # fmt: skip
+        assert main(["export", str(source), "--out", str(out), *options]) == 0
     own = read_ply(tmp_path / "own.ply")
-    for path in (tmp_path / "padded.ply", tmp_path / "s_000000.ply", tmp_path / "file.ply"):
-        data = path.read_bytes()
-        assert len(data) - data.index(b"end_header\n") - len(b"end_header\n") == 248 * len(own)
+    for path in (padded, tmp_path / "s_000000.ply", by_file):
+        assert len(path.read_bytes().partition(b"end_header\n")[2]) == 248 * len(own)
         assert read_ply(path).sh.shape == (len(own), 16, 3)
-    padded = read_ply(tmp_path / "padded.ply")
-    assert torch.equal(padded.sh[:, : own.sh.shape[1]], own.sh)
-    assert not padded.sh[:, own.sh.shape[1] :].any()
-    assert torch.equal(padded.means, own.means)
-    capsys.readouterr()
-    assert main([*line, str(tmp_path / "a.spz"), "--sh", "3"]) == 2
-    assert "only a .ply has a degree to choose; leave --sh out" in capsys.readouterr().err
+    found = read_ply(padded)
+    assert torch.equal(found.sh[:, : own.sh.shape[1]], own.sh)
+    assert not found.sh[:, own.sh.shape[1] :].any()
+    assert torch.equal(found.means, own.means)
     with pytest.raises(UserError, match="--sh 1: the avatar has degree 3; give 3 or more, or leave it out"):
-        write_ply(tmp_path / "b.ply", padded, 1)
+        write_ply(tmp_path / "b.ply", found, 1)
+
+
+def test_options_that_do_not_fit_the_output_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runtime.write_portable(tmp_path / "me.mien", drawn_head(10))
+    for name, told, *options in (
+        ("a.spz", "only a .ply has a degree to choose; leave --sh out", "--sh", "3"),
+        ("a.ply", "only .html and .packed files are made smaller", "--largest", "1"),
+        ("a.html", "--largest 0: give a number of MB above 0", "--largest", "0"),
+        ("a.html", "--largest nan: give a number of MB above 0", "--largest", "nan"),
+        ("a.html", "together with --webcam", "--webcam-model", "a.task"),
+        ("a.packed", "only an .html page has a webcam", "--webcam"),
+        ("a.packed", "only an .html page has a microphone", "--microphone"),
+        ("a.packed", "only an .html page draws with WebGPU; leave --webgpu out", "--webgpu"),
+        ("a.packed", "only an .html page has", "--title", "Ada"),
+        ("a.packed", "only an .html page has", "--address", "https://example.org/a.html"),
+        ("a.ply", "leave --sharp-cut out", "--sharp-cut"),
+        ("a.glb", "cannot write .glb from a file; export the workspace, or use .mien, .html, .packed, .ply"),
+        ("me.mien", "is the file that is read"),
+        ("c.mien", "leave --run, --set, --series, --neutral and --every out", "--set", "drop=1"),
+    ):
+        capsys.readouterr()
+        assert main(["export", str(tmp_path / "me.mien"), "--out", str(tmp_path / name), *options]) == 2
+        assert told in " ".join(capsys.readouterr().err.split()), (name, options)
+    assert [path.name for path in tmp_path.iterdir()] == ["me.mien"]
+
+
+FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+
+
+def disc(size: int = 64) -> np.ndarray:
+    rows, columns = np.mgrid[:size, :size] + 0.5
+    distance = np.hypot(rows - size / 2, columns - size / 2)
+    alpha = np.clip((size / 3 - distance) / 4 + 0.5, 0, 1).astype(np.float32)
+    colors = np.broadcast_to(np.array([0.8, 0.3, 0.2], np.float32), (size, size, 3))
+    return to_rgba(colors * alpha[..., None], alpha)
+
+
+def test_colors_are_straight_and_a_png_keeps_every_value(tmp_path: Path) -> None:
+    picture = disc()
+    seen = picture[..., 3] > 8
+    assert np.abs(picture[seen][:, :3].astype(int) - [204, 77, 51]).max() <= 1
+    assert (seen & (picture[..., 3] < 200)).any()
+    assert not picture[picture[..., 3] == 0].any()
+    write_pictures(plan_output(tmp_path / "a.png", 1, True), [picture], 25)
+    read = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert read is not None
+    assert np.array_equal(cv2.cvtColor(read, cv2.COLOR_BGRA2RGBA), picture)
+
+
+def test_webm_keeps_alpha_and_outlines_have_no_fringe(tmp_path: Path) -> None:
+    write_pictures(plan_output(tmp_path / "a.webm", 3, True), [disc(65)] * 3, 25)
+    decoder, frames = av.CodecContext.create("libvpx-vp9", "r"), []
+    assert isinstance(decoder, av.VideoCodecContext)
+    with av.open(str(tmp_path / "a.webm")) as container:
+        for packet in container.demux(container.streams.video[0]):
+            frames += decoder.decode(packet if packet.size else None)
+    assert len(frames) == 3
+    expected = np.pad(disc(65), ((0, 1), (0, 1), (0, 0)), mode="edge")
+    colors, plane = frames[1].to_ndarray(format="rgb24"), frames[1].planes[3]
+    # Alpha is taken as decoded, since swscale reads beyond the rows of alpha planes.
+    alpha = np.frombuffer(bytes(plane), np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
+    assert np.abs(alpha.astype(int) - expected[..., 3]).mean() < 1
+    edge = (expected[..., 3] > 40) & (expected[..., 3] < 220)
+    assert np.abs(colors[edge].astype(int) - [204, 77, 51]).max() < 25, "black bleeds into the outline"
+
+
+def test_films_and_sequences(tmp_path: Path) -> None:
+    """Pictures become films or numbered files, depending on the name. What cannot be written is told first."""
+    for name in ("a.mp4", "a.webm", "frames", "f_%03d.png"):
+        write_pictures(plan_output(tmp_path / name, 4), [disc()[..., :3]] * 4, 25)
+    assert [probe_video(tmp_path / name).frames for name in ("a.mp4", "a.webm")] == [4, 4]
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [f"{i:06d}.png" for i in range(4)]
+    assert (tmp_path / "f_003.png").is_file()
+    (tmp_path / "file").write_text("")
+    for name, frames, transparent, part in (
+        ("a.gif", 1, False, "cannot write .gif"), ("a.png", 5, False, "a_%06d.png"),
+        ("a.mp4", 5, True, "cannot be transparent"), ("file/a.mp4", 5, False, "not a folder|Not a directory"),
+        ("file", 5, False, "is a file"), ("frames", 2, False, "longer sequence"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=part):
+            plan_output(tmp_path / name, frames, transparent)
+    assert PictureOptions(background="#3060a0").color() == (48 / 255, 96 / 255, 160 / 255)
+    wrong = (PictureOptions(size=8193), PictureOptions(width=5), PictureOptions(background="pinkish"))
+    for options, part in zip(wrong, ("--size 8193", "--width 5", "--background pinkish"), strict=True):
+        with pytest.raises(UserError, match=part):
+            options.plan(tmp_path / "a.png", 1)
+
+
+def test_one_view_over_every_background() -> None:
+    """Straight colours and alpha, put over a colour, give the picture rendered over it."""
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0, -0.6]]), quats=torch.tensor([[1.0, 0, 0, 0]]), scales=torch.full((1, 3), 0.04),
+        opacities=torch.tensor([0.8]), sh=sh_from_rgb(torch.tensor([[[0.9, 0.4, 0.1]]])),
+    )  # fmt: skip
+    camera = camera_from_fov(0.6, 48, 48, FACING)
+    blue = draw(PictureOptions(background="#0000ff"), gaussians, camera)
+    clear = draw(PictureOptions(background="transparent"), gaussians, camera).astype(float)
+    alpha = clear[..., 3:] / 255
+    assert np.abs(clear[..., :3] * alpha + (1 - alpha) * [0, 0, 255] - blue).max() <= 2
+    assert to_rgb(np.full((600, 2, 3), 1.5, np.float32)).min() == 255
+
+
+def test_cameras_sway_around_the_head_and_come_from_a_file(tmp_path: Path) -> None:
+    camera, center = camera_from_fov(0.5, 64, 64, FACING), torch.tensor([0.0, 0.0, -0.6])
+    views = sway(camera, center, 8, math.radians(40), math.radians(20))
+    torch.testing.assert_close(views[0].viewmat, camera.viewmat, atol=1e-6, rtol=0)
+    for view in views:
+        torch.testing.assert_close(view.project(center)[0], torch.tensor([32.0, 32.0]), atol=1e-3, rtol=0)
+        assert float((view.position - center).norm()) == pytest.approx(0.6, abs=1e-5)
+    assert float((views[2].position - center)[0]) == pytest.approx(0.6 * math.sin(math.radians(20)), abs=1e-5)
+    path, camera = tmp_path / "path.json", camera_from_fov(0.6, 100, 80, FACING)
+    write_cameras(path, [camera, camera])
+    _, read = read_cameras(path)
+    assert torch.equal(read.viewmat, camera.viewmat)
+    assert torch.equal(read.K, camera.K)
+    entry = {"K": camera.K.tolist(), "viewmat": camera.viewmat.tolist(), "width": 100, "height": 80}
+    turned = entry | {"viewmat": (2 * torch.eye(4)).tolist()}
+    for wrong, part in (
+        ([], "no list"), ([entry | {"K": [[1]]}], "camera 0: K must be 3x3"), ([3], "has no K"),
+        ([entry, turned], "camera 1: viewmat is not a rotation"), ([entry | {"width": 100000}], "100000x80"),
+        ([entry | {"K": "big"}], "needs K"),
+    ):  # fmt: skip
+        write_json(path, "mien.cameras", 1, {"cameras": wrong})
+        with pytest.raises(UserError, match=part):
+            read_cameras(path)

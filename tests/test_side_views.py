@@ -1,27 +1,40 @@
-"""Side views: pictures that no camera took, of a head from the side and of raised expressions."""
+"""Side views, which no camera took, and the soft cut: opacities fade towards the neck cut."""
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from mien.avatar import GaussianAvatars, Progress, method_named
+from mien import runtime
+from mien.avatar import GaussianAvatars, Progress, make_portable, method_named
 from mien.camera import camera_from_fov
+from mien.cli import main
 from mien.commands.picture import PictureOptions
 from mien.commands.stages import pictures
-from mien.face import FaceModel, FaceParams
+from mien.commands.stages.exporting import RunContent
+from mien.commands.stages.pictures import posed_softly
+from mien.export import write_packed
+from mien.face import FaceModel, FaceParams, load_face_model
+from mien.gaussians import world_means
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking import NeckParts, head_cutter
+from mien.runtime import MeshBound
+from mien.tracking import NeckCut, NeckParts, fit_neck_cut, head_cutter
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame, resolved
+from mien.training.whole_head import with_soft_cut
+from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
+from mien.training.whole_head.soft_cut import opacity_shares
 from mien.training.whole_head.unseen import fills_sides
+from mien.workspace import open_workspace
 from plain_settings import plain_gaussian_avatars
+from shared_things import MadeOnce, toy_workspace
 from test_methods import new_avatar
-from toy_scene import surface_of
+from toy_scene import surface_of, toy_camera
 
 _PROGRESS = Progress(0, 100, 0, 1.0, 1)
 _HAIR = 0.02
@@ -55,7 +68,6 @@ def _loss(views: SideViews, avatar: GaussianAvatars, face: FaceParams, step: int
 
 
 def _opaque_avatar(model: FaceModel, color: float) -> GaussianAvatars:
-    """One flat opaque Gaussian of one colour on each triangle."""
     torch.manual_seed(0)
     avatar = method_named("gaussian_avatars").avatar(PRESETS["paper"].config("gaussian_avatars"), model, _face(model))
     assert isinstance(avatar, GaussianAvatars)
@@ -78,6 +90,12 @@ def test_a_head_turns_about_its_own_upright_axis(anny):
 def test_a_head_in_other_colors_than_the_mesh_costs_and_so_do_transparent_sides(anny):
     views, face, avatar = _views(anny), _face(anny), _opaque_avatar(anny, 0.5)
     other = _opaque_avatar(anny, 0.9)
+    held = replace(face, head_translation=face.head_translation.clone().requires_grad_())
+    _loss(views, other, held, 0).backward()
+    gradient = other.store["sh_constant"].grad
+    assert gradient is not None
+    assert float(gradient.abs().sum()) > 0
+    assert held.head_translation.grad is None, "gradients do not reach the face"
     costs = {step: float(_loss(views, avatar, face, step).detach()) for step in (0, 4)}
     for step, most in ((0, 0.7), (4, 0.3)):  # From aside, the neck below the cut costs too.
         assert costs[step] < most * float(_loss(views, other, face, step).detach())
@@ -106,16 +124,6 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     assert float(_loss(views, avatar, face, 4).detach()) == pytest.approx(float(raised))
 
 
-def test_gradients_reach_gaussians_and_not_the_face(anny):
-    avatar, face = _opaque_avatar(anny, 0.9), _face(anny)
-    face = replace(face, head_translation=face.head_translation.requires_grad_())
-    _loss(_views(anny), avatar, face, 0).backward()
-    gradient = avatar.store["sh_constant"].grad
-    assert gradient is not None
-    assert float(gradient.abs().sum()) > 0
-    assert face.head_translation.grad is None
-
-
 def test_raised_expressions_stay_within_the_bounds_and_change_with_the_random_numbers(anny):
     views, rest = _views(anny), _face(anny).expression
     assert [step for step in range(17) if views.due(step)] == [0, 4, 8, 12, 16]
@@ -127,37 +135,30 @@ def test_raised_expressions_stay_within_the_bounds_and_change_with_the_random_nu
     assert not raised[0].equal(raised[1])
 
 
-def test_the_outline_has_the_hair(anny):
-    views = [_view(_views(anny, hair=hair), _face(anny), 0) for hair in (0.0, _HAIR)]
-    alphas = [view.alpha for view in views]
-    head_faces = anny.faces[~anny.region_mask("neck")]
-    head = rasterize_mesh(anny(views[0].plan.face)[0], head_faces, views[0].plan.camera).face_index >= 0
-    assert bool((alphas[0][head] == 1).all())
-    assert float(alphas[1].sum()) > 1.05 * float(alphas[0].sum())
-
-
-def test_the_outline_ends_at_the_cut_at_the_neck(anny):
-    view = _view(_views(anny), _face(anny), 0)
-    face, camera, picture, alpha = view.plan.face, view.plan.camera, view.picture, view.alpha
-    bare = np.where(rasterize_mesh(anny(face)[0], anny.faces, camera).face_index.numpy() >= 0, 255, 0).astype(np.uint8)
+def test_the_outline_has_the_hair_and_ends_at_the_cut_at_the_neck(anny):
+    view, hairy = (_view(_views(anny, hair=hair), _face(anny), 0) for hair in (0.0, _HAIR))
+    face, camera, alpha = view.plan.face, view.plan.camera, view.alpha
+    assert float(hairy.alpha.sum()) > 1.05 * float(alpha.sum())
+    vertices = anny(face)[0]
+    head = rasterize_mesh(vertices, anny.faces[~anny.region_mask("neck")], camera).face_index >= 0
+    assert bool((alpha[head] == 1).all())
+    bare = np.where(rasterize_mesh(vertices, anny.faces, camera).face_index.numpy() >= 0, 255, 0).astype(np.uint8)
     expected = head_cutter(anny, NeckParts.of(anny), face)(bare, camera)
     assert alpha.equal(torch.from_numpy(expected).float() / 255)
     assert float(alpha.sum()) < 0.97 * (bare > 0).sum(), "the mesh goes on below the cut"
-    torch.testing.assert_close(picture[alpha == 0], view.plan.background.expand(int((alpha == 0).sum()), 3))
+    shown = view.picture[alpha == 0]
+    torch.testing.assert_close(shown, view.plan.background.expand(len(shown), 3))
 
 
-@pytest.mark.parametrize(("cameras", "filled"), [(1, True), (3, False)])
-def test_sides_are_filled_by_themselves_if_one_camera_filmed(cameras, filled):
-    frames = [Frame(0, 0, camera) for camera in range(cameras)]
+def test_sides_are_filled_by_themselves_if_one_camera_filmed():
     settings = PRESETS["standard"].settings_of("gaussian_avatars")
     assert settings.unseen == "auto"
-    assert fills_sides(frames, settings, bound=True) is filled
-    assert fills_sides(frames, replace(settings, unseen="filled"), bound=False)
-    assert not fills_sides(frames, replace(settings, unseen="trained"), bound=True)
-    assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
-
-
-def test_background_and_edges_follow_the_sides() -> None:
+    for cameras, filled in ((1, True), (3, False)):
+        frames = [Frame(0, 0, camera) for camera in range(cameras)]
+        assert fills_sides(frames, settings, bound=True) is filled
+        assert fills_sides(frames, replace(settings, unseen="filled"), bound=False)
+        assert not fills_sides(frames, replace(settings, unseen="trained"), bound=True)
+        assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
     for filled, background, edges in ((True, "mixed", "cleaned"), (False, "white", "filmed")):
         assert resolved(TrainSettings(background="auto"), filled=filled).background == background
         assert resolved(TrainSettings(background="white"), filled=filled).background == "white"
@@ -168,15 +169,88 @@ def test_background_and_edges_follow_the_sides() -> None:
 def test_transparent_pictures_warn_of_white_only_where_it_was(tmp_path, monkeypatch):
     said: list[str] = []
     monkeypatch.setattr(pictures, "say", said.append)
+    bound = "gaussian_avatars"
     for method, background, unseen, white in (
-        ("gaussian_avatars", "auto", "auto", False),
-        ("gaussian_avatars", "auto", "trained", True),
-        ("gaussian_avatars", "white", "auto", True),
-        ("gaussian_avatars", "random", "trained", False),
-        ("headgas", "auto", "auto", True),
-    ):
+        (bound, "auto", "auto", False), (bound, "auto", "trained", True), (bound, "white", "auto", True),
+        (bound, "random", "trained", False), ("headgas", "auto", "auto", True),
+    ):  # fmt: skip
         config = {"settings": {"background": background, "unseen": unseen}}
         monkeypatch.setattr(pictures, "read_run_config", lambda run_dir, config=config: config)
         said.clear()
         pictures.warn_of_white(PictureOptions(background="transparent"), tmp_path, new_avatar(method))
         assert bool(said) is white, (method, background, unseen)
+
+
+model = pytest.fixture(scope="module")(lambda: load_face_model("anny"))
+
+
+@pytest.fixture(scope="module")
+def avatar(model: FaceModel) -> GaussianAvatars:
+    face = replace(model.neutral(), head_translation=torch.tensor([[0, 0, -0.9]]))
+    return GaussianAvatars(plain_gaussian_avatars(), model, face)
+
+
+def cut_of(model: FaceModel, vertices: torch.Tensor | None = None) -> NeckCut:
+    vertices = model.template if vertices is None else vertices
+    return fit_neck_cut(NeckParts.of(model), vertices, torch.tensor([0.0, 1.0, 0.0]))
+
+
+def opacities(portable: runtime.PortableAvatar) -> np.ndarray:
+    assert isinstance(portable.baked, MeshBound)
+    return 1 / (1 + np.exp(-portable.baked.attributes.opacity_logits.astype(np.float64)))
+
+
+def test_what_is_far_from_the_cut_stays_and_the_end_of_the_neck_is_clear(model, avatar) -> None:
+    before = make_portable(avatar, toy_camera(64), "soft")
+    after = with_soft_cut(before, avatar)
+    assert isinstance(before.baked, MeshBound)
+    neck = model.region_mask("neck").numpy()[before.baked.face_index]
+    was, now = opacities(before), opacities(after)
+    np.testing.assert_array_equal(now[~neck], was[~neck])
+    cut = cut_of(model, model(avatar.subject)[0])
+    margins = cut.margins(world_means(avatar.pose(avatar.subject).gaussians.timestep(0)).detach()).numpy()
+    between = (margins > 0) & (margins < WHOLE_HEAD.soft_cut_width) & neck
+    far = neck & (margins < -WHOLE_HEAD.soft_cut_head[1])
+    assert far.any()
+    assert (now[far] <= 1.01 * WHOLE_HEAD.soft_cut_least).all()
+    assert (now[between] <= was[between]).all()
+    assert (now[between] < 0.9 * was[between]).any()
+    # Pictures end as softly as files.
+    soft, sharp = posed_softly(avatar)(avatar.subject), avatar.pose(avatar.subject).gaussians.timestep(0)
+    np.testing.assert_allclose(soft.opacities.numpy(), now, atol=WHOLE_HEAD.soft_cut_least + 1e-6)
+    assert torch.equal(soft.means, sharp.means)
+    assert float((soft.opacities / sharp.opacities.detach()).min()) < 0.01
+
+
+def test_shares_grow_with_the_distance_from_the_cut(model: FaceModel) -> None:
+    """What stands off the skin goes just above the cut alone: shards of a collar go, and hair at the neck stays."""
+    cut = cut_of(model)
+    origin, side, up = (torch.from_numpy(each).float() for each in (cut.origin, cut.axes[0], cut.axes[2]))
+    points, far = origin + torch.linspace(-0.02, 0.05, 15)[:, None] * up, torch.full((1, 3), 10.0)
+    shares = opacity_shares(points, cut, far, points)
+    assert (shares.diff() >= 0).all()
+    assert (float(shares[0]), float(shares[-1])) == (0.0, 1.0)
+    assert ((shares > 0.1) & (shares < 0.9)).any()
+    assert (opacity_shares(points, cut, points, points) == 1).all(), "what lies on the head is not cut off"
+    gap, (low, high) = WHOLE_HEAD.soft_cut_off_skin[1] + 1e-3, WHOLE_HEAD.soft_cut_collar
+    skin = origin + torch.tensor([0.95 * low, 1.1 * high])[:, None] * up
+    on_skin, off_skin = (opacity_shares(skin + away * side, cut, far, skin) for away in (0.0, gap))
+    assert (on_skin > 0.7).all()
+    assert off_skin[0] == 0
+    assert off_skin[1] == on_skin[1] == 1
+
+
+@pytest.mark.unchecked
+def test_pages_and_files_have_the_soft_cut_unless_it_is_declined(tmp_path: Path, made_once: MadeOnce) -> None:
+    """Whatever is made of a .mien file later ends as the file does."""
+    workspace, packed = toy_workspace(made_once), []
+    content = RunContent(open_workspace(workspace), "toy")
+    for options, soft in (((), True), (("--sharp-cut",), False)):
+        for ending in ("packed", "mien"):
+            assert main(["export", str(workspace), "--out", str(tmp_path / f"a.{ending}"), *options]) == 0
+        packed.append((tmp_path / "a.packed").read_bytes())
+        write_packed(tmp_path / "direct.packed", content.portable(confidence=False, soft_cut=soft))
+        assert packed[-1] == (tmp_path / "direct.packed").read_bytes()
+        written, expected = runtime.load(tmp_path / "a.mien").portable, content.portable(soft_cut=soft)
+        np.testing.assert_array_equal(opacities(written), opacities(expected))
+    assert packed[0] != packed[1]

@@ -173,6 +173,8 @@ def test_export_writes_a_page(tmp_path: Path, made_once: MadeOnce, capsys: pytes
     line = ["export", str(toy_workspace(made_once)), "--out", str(tmp_path / "a.html")]
     assert main([*line, "--series", "clip", "--every", "2"]) == 0
     assert "a motion of 3 frames" in capsys.readouterr().err
+    assert main([*line, "--set", "drop=1"]) == 2
+    assert "a page sets every expression itself" in capsys.readouterr().err
 
 
 COUNT = 1500

@@ -1,4 +1,4 @@
-// What three.js makes of a .glb file, in a page; tests/test_gaze_pixels.py bundles it with esbuild.
+// What three.js makes of a .glb file, in a page; tests/test_other_engines.py bundles it with esbuild.
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
