@@ -4,7 +4,6 @@ Time is an argument: the clock of a `Stage` goes on when a test lets it.
 """
 
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,15 +14,9 @@ from mien.capture.camera_names import CameraName, camera_named, is_camera
 from mien.capture.live_camera import LiveCamera
 from mien.capture.video import write_video
 from mien.errors import UserError
+from web_case import until
 
 FPS = 25
-
-
-def until(done: Callable[[], bool], seconds: float = 60.0) -> None:
-    ends = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < ends, "it never came"
-        time.sleep(0.005)
 
 
 class Stage:
@@ -48,11 +41,9 @@ class Stage:
         return LiveCamera(name, again, say, lambda: self.now, self.wait)
 
 
-def test_names_of_cameras(tmp_path: Path) -> None:
-    assert is_camera("camera")
-    assert is_camera("camera:/dev/video7")
-    assert not is_camera("camera.mp4")
-    assert not is_camera("out/camera")
+def test_names_of_cameras_and_devices_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("camera", "camera:/dev/video7", "camera.mp4", "out/camera")
+    assert [is_camera(name) for name in names] == [True, True, False, False]
     clip = tmp_path / "clip.mp4"
     clip.write_bytes(b"x")
     assert camera_named(f"camera:{clip}", None).is_file
@@ -61,9 +52,6 @@ def test_names_of_cameras(tmp_path: Path) -> None:
     for name, words in (("", "names no camera"), (str(tmp_path), "is a folder")):
         with pytest.raises(UserError, match=words):
             camera_named(f"camera:{name}", None)
-
-
-def test_a_missing_device_is_named_with_those_that_exist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError, match="there is no /dev/video99.*camera:clip.mp4|there is no /dev/video99.*these"):
         camera_named("camera:/dev/video99", "v4l2")
     monkeypatch.setattr("mien.capture.camera_names.DEVICES", tmp_path)
@@ -71,13 +59,8 @@ def test_a_missing_device_is_named_with_those_that_exist(tmp_path: Path, monkeyp
         (tmp_path / name).touch()
     with pytest.raises(UserError, match=f"one of these: {tmp_path}/video2, {tmp_path}/video10$"):
         camera_named("camera:/dev/video99", "v4l2")
-
-
-def test_a_device_that_is_no_camera_is_refused() -> None:
-    with (
-        pytest.raises(UserError, match="camera:/dev/null: cannot be opened"),
-        LiveCamera(camera_named("camera:/dev/null", "v4l2"), False),
-    ):
+    no_camera = LiveCamera(camera_named("camera:/dev/null", "v4l2"), False)
+    with pytest.raises(UserError, match="camera:/dev/null: cannot be opened"), no_camera:
         pass
 
 

@@ -32,9 +32,6 @@ def test_few_participants_have_wider_intervals_by_student_s_factor() -> None:
     wanted = wilson(share, evidence * (z / 4.3027) ** 2, z)
     assert interval(shares, 10) == pytest.approx(wanted, abs=0.005)
     assert wanted[1] - wanted[0] > 1.5 * np.ptp(wilson(share, evidence, z)), "what the factor is about"
-
-
-def test_intervals_at_the_edges() -> None:
     low, high = interval(np.zeros(15), 10)
     assert low == 0
     assert 0.15 < high < 0.25  # 15 people, not 150

@@ -14,18 +14,15 @@ pytest.importorskip("viser")
 
 import msgspec
 import websockets
-import zstandard
 from viser import _messages
 
 from fuzzing.viewer_messages import campaign
 from mien import runtime
-from mien.viewer import panel
-from mien.viewer.access import Door
+from mien.viewer import Session, panel
 from mien.viewer.messages import MOST_TEXT, Gate
 from mien.viewer.server import MOST_BROWSERS, Serving
-from mien.viewer.session import Session
 from test_viewer import clip_of
-from test_viewer_page import Client, connect
+from test_viewer_page import Client, connect, served
 from web_case import drawn_head, until
 
 CAMERA = {
@@ -34,21 +31,16 @@ CAMERA = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def avatar() -> runtime.Avatar:
-    return runtime.Avatar(drawn_head(500))
+avatar = pytest.fixture(scope="module")(lambda: runtime.Avatar(drawn_head(500)))
 
 
 @pytest.fixture
 def serving(avatar: runtime.Avatar) -> Iterator[Serving]:
-    session = Session(avatar, None, {"clip": lambda: clip_of(avatar)})
-    running = Serving(session, Door.of("127.0.0.1"), 0, "drawn")
-    yield running
-    running.stop()
+    with served(Session(avatar, None, {"clip": lambda: clip_of(avatar)})) as running:
+        yield running
 
 
 def control(serving: Serving, label: str) -> Any:
-    """The handle of a control, by its label."""
     handles = serving.server.gui._gui_input_handle_from_uuid.values()
     return next(handle for handle in handles if handle.label == label)  # type: ignore[attr-defined]
 
@@ -59,46 +51,26 @@ def update(serving: Serving, label: str, value: object, name: str = "value") -> 
 
 
 def passed(serving: Serving, label: str, value: object, name: str = "value") -> object:
-    """The value of a control that the gate lets through, or None."""
     gate = Gate()
     gate.open(serving.server.gui)
     message = gate.checked(update(serving, label, value, name))
     return None if message is None else msgspec.msgpack.decode(message)["updates"]["value"]
 
 
-@pytest.mark.parametrize(
-    ("label", "value", "expected"),
-    [
-        ("jaw open", 0.25, 0.25),
-        ("jaw open", 1, 1.0),
-        ("jaw open", 1e300, float(np.float32(1.2))),
-        ("jaw open", -5, 0.0),
-        ("jaw open", math.nan, None),
-        ("jaw open", math.inf, None),
-        ("jaw open", "0.5", None),
-        ("jaw open", True, None),
-        ("jaw open", [0.5], None),
-        ("Frame", 1e300, 1),
-        ("Frame", 0.7, 0),
-        ("Height in pixels", 1e300, 1080),
-        ("Height in pixels", -(2**63), 128),
-        ("Height in pixels", 2**64 - 1, 1080),
-        ("Background", "grey", "grey"),
-        ("Background", "purple", None),
-        ("Motion", "clip", "clip"),
-        ("Motion", "../clip", None),
-        ("Filmed frame beside it", True, True),
-        ("Filmed frame beside it", 1, None),
-        ("Search", "smile left", "smile left"),
-        ("Search", "x" * 50_000, "x" * MOST_TEXT),
-        ("Search", 5, None),
-        ("Random face", {"no": "value"}, None),
+def test_values_are_checked_and_clamped(serving: Serving) -> None:
+    for label, value, expected in (
+        ("jaw open", 0.25, 0.25), ("jaw open", 1, 1.0), ("jaw open", 1e300, float(np.float32(1.2))),
+        ("jaw open", -5, 0.0), ("jaw open", math.nan, None), ("jaw open", math.inf, None), ("jaw open", "0.5", None),
+        ("jaw open", True, None), ("jaw open", [0.5], None), ("Frame", 1e300, 1), ("Frame", 0.7, 0),
+        ("Height in pixels", 1e300, 1080), ("Height in pixels", -(2**63), 128),
+        ("Height in pixels", 2**64 - 1, 1080), ("Background", "grey", "grey"), ("Background", "purple", None),
+        ("Motion", "clip", "clip"), ("Motion", "../clip", None), ("Filmed frame beside it", True, True),
+        ("Filmed frame beside it", 1, None), ("Search", "smile left", "smile left"),
+        ("Search", "x" * 50_000, "x" * MOST_TEXT), ("Search", 5, None), ("Random face", {"no": "value"}, None),
         ("Random face", "anything", True),
-    ],
-)
-def test_values_are_checked_and_clamped(serving: Serving, label: str, value: object, expected: object) -> None:
-    value_passed = passed(serving, label, value)
-    assert (value_passed, type(value_passed)) == (expected, type(expected))
+    ):  # fmt: skip
+        through = passed(serving, label, value)
+        assert (through, type(through)) == (expected, type(expected)), (label, value)
 
 
 def test_only_values_of_controls_pass(serving: Serving) -> None:
@@ -110,10 +82,8 @@ def test_only_values_of_controls_pass(serving: Serving) -> None:
     gate.open(serving.server.gui)
     assert gate.checked(good) is not None
     strange = {"type": "GuiUpdateMessage", "uuid": "none", "updates": {"value": 0.5}}
-    for message in (
-        msgspec.msgpack.encode(strange), b"", "text", good[:-1], good + b"\x00", b"\x91" * 60_000,
-        b"\xdd\xff\xff\xff\xff", b"\x81\xa4type\xa4none", b"\xa3\xff\xfe\xfd",
-    ):  # fmt: skip
+    odd = (b"", "text", good[:-1], good + b"\x00", b"\x91" * 60_000, b"\xdd\xff\xff\xff\xff", b"\xa3\xff\xfe\xfd")
+    for message in (msgspec.msgpack.encode(strange), b"\x81\xa4type\xa4none", *odd):
         assert gate.checked(message) is None, message[:40]
     for kind in _messages.Message._subclass_from_type_string():
         message = {**strange, **CAMERA, "uuid": control(serving, "Play")._impl.uuid, "type": kind}
@@ -128,12 +98,12 @@ def test_cameras_are_checked_and_clamped() -> None:
 
     plain = camera()
     assert plain == {**CAMERA, "near": pytest.approx(0.01)}
-    for changes in (
-        {"wxyz": [0, 0, 0, 0]}, {"wxyz": [1, 0, 0]}, {"wxyz": [math.nan, 0, 0, 1]}, {"position": [1e300, 0, 0]},
-        {"position": [math.inf, 0, 0]}, {"look_at": [0, math.nan, 0]}, {"up_direction": "up"}, {"fov": math.nan},
-        {"image_width": math.inf}, {"fov": None}, {"wxyz": [1e300, 0, 0, 0]},
+    for name, value in (
+        ("wxyz", [0, 0, 0, 0]), ("wxyz", [1, 0, 0]), ("wxyz", [math.nan, 0, 0, 1]), ("wxyz", [1e300, 0, 0, 0]),
+        ("position", [1e300, 0, 0]), ("position", [math.inf, 0, 0]), ("look_at", [0, math.nan, 0]),
+        ("up_direction", "up"), ("fov", math.nan), ("fov", None), ("image_width", math.inf),
     ):  # fmt: skip
-        assert camera(**changes) is None, changes
+        assert camera(**{name: value}) is None, (name, value)
     for name, value, expected in (
         ("image_width", 1e300, 1 << 14), ("image_height", -1, 0), ("image_height", 700.5, 700), ("fov", 1e-300, 0.01),
         ("fov", 9, math.pi - 0.01), ("far", 1e300, 1e5),
@@ -144,26 +114,25 @@ def test_cameras_are_checked_and_clamped() -> None:
 
 
 def test_one_browser_cannot_end_the_viewer_for_others(serving: Serving) -> None:
-    session, gui = serving.session, serving.server.gui
+    session = serving.session
     joint = serving.panel.sliders[f"{session.avatar.joint_names[0]}_x"].label
-    messages = [update(serving, joint, value) for value in (math.nan, math.inf, -math.inf)]
-    messages += [update(serving, "Background", "purple"), update(serving, "Search", "x" * 60_000)]
-    messages += [update(serving, label, 1e300) for label in ("Height in pixels", "Frame", "jaw open")]
-    known = {"source_component_uuid": control(serving, "Search")._impl.uuid, "transfer_uuid": "t"}
-    start = {"filename": "x", "mime_type": "x", "part_count": 9, "size_bytes": 9}
-    messages.append(msgspec.msgpack.encode({"type": "FileTransferStartUpload", **known, **start}))
-    part = {"type": "FileTransferPart", **known, "part_index": 0, "content": b"x" * 1000}
-    messages.append(msgspec.msgpack.encode(part))
+    upload = {"source_component_uuid": control(serving, "Search")._impl.uuid, "transfer_uuid": "t"}
+    start = {"type": "FileTransferStartUpload", "filename": "x", "mime_type": "x", "part_count": 9, "size_bytes": 9}
+    part = {"type": "FileTransferPart", "part_index": 0, "content": b"x" * 1000}
+    messages = [
+        *(update(serving, joint, value) for value in (math.nan, math.inf, -math.inf)),
+        update(serving, "Background", "purple"), update(serving, "Search", "x" * 60_000),
+        *(update(serving, label, 1e300) for label in ("Height in pixels", "Frame", "jaw open")),
+        *(msgspec.msgpack.encode(upload | message) for message in (start, part)),
+        update(serving, "Background", "grey"), "text", update(serving, "Search", "x" * 100_000),
+    ]  # fmt: skip
 
     async def talk() -> None:
         async with connect(serving) as hostile, connect(serving) as other:
-            await Client(hostile).look(session, 96, 64)
-            await Client(other).look(session, 96, 64)
+            for each in (hostile, other):
+                await Client(each).look(session, 96, 64)
             for message in messages:
                 await hostile.send(message)
-            await hostile.send(update(serving, "Background", "grey"))
-            await hostile.send("text")
-            await hostile.send(update(serving, "Search", "x" * 100_000))
             with pytest.raises(websockets.ConnectionClosed, match="1009"):
                 await Client(hostile).picture(9999)
             async with connect(serving) as fresh:
@@ -176,18 +145,28 @@ def test_one_browser_cannot_end_the_viewer_for_others(serving: Serving) -> None:
     assert np.isfinite(session.face.joints).all()
     assert session.height == 1080
     assert control(serving, "Search").value == "x" * MOST_TEXT
-    assert gui._current_file_upload_states == {}
+    assert serving.server.gui._current_file_upload_states == {}
     assert (serving.loop.error, serving.failures) == (None, [])
 
 
 @contextlib.asynccontextmanager
 async def watching(serving: Serving) -> AsyncIterator[Client]:
-    """Connect a browser that has seen a picture."""
     async with connect(serving) as connection:
         client = Client(connection)
         await client.look(serving.session, 96, 64)
         await client.picture(64)
         yield client
+
+
+def press(serving: Serving, *pressed: tuple[str, object]) -> None:
+    async def talk() -> None:
+        async with watching(serving) as client:
+            for label, value in pressed:
+                await client.connection.send(update(serving, label, value))
+            await client.look(serving.session, 48, 32)
+            await client.picture(32)
+
+    asyncio.run(talk())
 
 
 def test_queued_screenshots_are_dropped(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,15 +178,7 @@ def test_queued_screenshots_are_dropped(serving: Serving, monkeypatch: pytest.Mo
         return b"x" * 100
 
     monkeypatch.setattr(panel, "screenshot", slow)
-
-    async def talk() -> None:
-        async with watching(serving) as client:
-            for _ in range(300):
-                await client.connection.send(update(serving, "Screenshot", True))
-            await client.look(serving.session, 48, 32)
-            await client.picture(32)
-
-    asyncio.run(talk())
+    press(serving, *[("Screenshot", True)] * 300)
     until(lambda: len(taken) == 1)
     threading.Timer(0.2, go_on.set).start()
     serving.stop()
@@ -222,17 +193,11 @@ def test_files_wait_until_a_browser_takes_them(serving: Serving, monkeypatch: py
     async def talk() -> None:
         async with watching(serving) as client:
             await client.connection.send(update(serving, "Screenshot", True))
-            while b"still on its way" not in await told(client.connection):
+            while "still on its way" not in str(await client.told()):
                 pass
 
     asyncio.run(talk())
     assert serving.failures == []
-
-
-async def told(connection: Any) -> bytes:
-    content = await asyncio.wait_for(connection.recv(), 60)
-    packed = content[16 : 16 + int.from_bytes(content[8:16], "little")]
-    return zstandard.ZstdDecompressor().decompress(packed)
 
 
 def test_a_failure_is_told_and_the_viewer_goes_on(
@@ -243,15 +208,7 @@ def test_a_failure_is_told_and_the_viewer_goes_on(
 
     monkeypatch.setattr(serving.session, "set_expression", fail)
     monkeypatch.setattr(panel, "screenshot", fail)
-
-    async def talk() -> None:
-        async with watching(serving) as client:
-            await client.connection.send(update(serving, "jaw open", 0.5))
-            await client.connection.send(update(serving, "Screenshot", True))
-            await client.look(serving.session, 48, 32)
-            await client.picture(32)
-
-    asyncio.run(talk())
+    press(serving, ("jaw open", 0.5), ("Screenshot", True))
     until(lambda: len(serving.failures) == 2)
     assert capsys.readouterr().err.count("which is a bug in mien, and the viewer goes on (ArithmeticError: a bug)") == 2
 
@@ -264,17 +221,14 @@ def test_there_are_only_so_many_browsers(serving: Serving) -> None:
                 with pytest.raises(websockets.ConnectionClosed, match="too many browsers"):
                     await one_more.recv()
             await there[0].close()
-            while not await gets_a_picture(serving):
+            for _ in range(1000):
+                with contextlib.suppress(websockets.ConnectionClosed):
+                    async with watching(serving):
+                        return
                 await asyncio.sleep(0.05)
+            pytest.fail("nobody else gets in")
 
     asyncio.run(talk())
-
-
-async def gets_a_picture(serving: Serving) -> bool:
-    with contextlib.suppress(websockets.ConnectionClosed):
-        async with watching(serving):
-            return True
-    return False
 
 
 def test_hostile_messages_do_no_harm() -> None:
