@@ -140,7 +140,7 @@ def test_footage_is_imported_an_avatar_trained_and_exported(
             "holds sequences, which are no run; leave --run",
         ),
         (("import", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b")), "; give one of gaussian-avatars ("),
-        (("import", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b")), "puppet9 (a .puppet9 file)"),
+        (("import", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b")), "puppet9 (a .puppet"),
         ((*export, str(tmp_path / "a.xyz9"), "--sh", "3"), "only a .ply has a degree"),
         ((*export, str(tmp_path / "a.abc")), " or .xyz9, or --format"),
         (("train", out, "--method", "nerf"), f"give one of {names} instead"),
@@ -248,21 +248,11 @@ EXPORT, IMPORT, BATCH = (
     "import {here}/F --out {here}/O",
     "batch {table} --on none9",
 )
-METHOD = """
-from dataclasses import dataclass
-from mien.avatar import Method, MethodConfig
-
-@dataclass(frozen=True)
-class ToyConfig(MethodConfig): ...
-
-IT = Method("mien_none9:Toy", "mien_none9:{}Config")
-"""
+METHOD = "from mien.avatar import Method\nIT = Method('mien_none9:Toy', 'mien_none9:TypoConfig')\n"
 TRAIN = "train {run} --method none9 --run new --steps 2"
 WRONG = (
     ("methods", "IT = 1", TRAIN, "and it is no Method; update or uninstall mien-none9"),
-    ("methods", METHOD.format("Typo"), TRAIN, "mien_none9:TypoConfig: cannot be imported"),
-    ("methods", METHOD.format("Toy"), TRAIN, "mien_none9:Toy: cannot be imported"),
-    ("formats", "IT = 1", EXPORT, "and it is no Format; update or uninstall mien-none9"),
+    ("methods", METHOD, TRAIN, "mien_none9:TypoConfig: cannot be imported"),
     (
         "formats",
         "from mien.formats.format import Format\nIT = Format('none9', 'pose', print, ('.ply',))",
@@ -344,6 +334,9 @@ def methods_are_found_by_name() -> None:
     assert method_names() == [*METHODS, "toy", "twice"]
     assert (has_method("toy"), has_method("nerf")) == (True, False)
     assert method_named("toy") == Method("nowhere:Toy", "nowhere:ToyConfig")
+    for part in ("config", "avatar"):
+        with pytest.raises(UserError, match="^nowhere:Toy(Config)?: cannot be imported .*; update or uninstall"):
+            getattr(method_named("toy"), part)
     assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
     with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'twice' to mien.methods; uninstall"):
         method_named("twice")
