@@ -338,13 +338,14 @@ def test_attribute_network_has_the_published_layers() -> None:
 def test_attribute_network_starts_with_the_published_weights() -> None:
     torch.manual_seed(0)
     network = AttributeNet(256, 7, 6)
-    first, skip, last = (dict(network.trunk[index].named_parameters()) for index in (0, 3, -1))
+    layers: list[Any] = list(network.trunk)
+    first, skip, last = (layers[index] for index in (0, 3, -1))
     # The waves have no effect at first, and the positions have no more than theirs.
-    assert first["weight"][:, 3:].abs().max() == skip["weight"][:, -36:].abs().max() == 0
-    assert float(first["weight"][:, :3].std()) == pytest.approx((2 / 256) ** 0.5, rel=0.1)
-    assert float(last["weight"].mean()) == pytest.approx((torch.pi / 256) ** 0.5, rel=1e-3)
-    assert float(last["weight"].std()) == pytest.approx(1e-4, rel=0.1)
-    assert last["bias"].unique().tolist() == pytest.approx([-0.6])
+    assert first.weight[:, 3:].abs().max() == skip.weight[:, -36:].abs().max() == 0
+    assert float(first.weight[:, :3].std()) == pytest.approx((2 / 256) ** 0.5, rel=0.1)
+    assert float(last.weight.mean()) == pytest.approx((torch.pi / 256) ** 0.5, rel=1e-3)
+    assert float(last.weight.std()) == pytest.approx(1e-4, rel=0.1)
+    assert last.bias.unique().tolist() == pytest.approx([-0.6])
 
 
 def test_summed_directions_are_exactly_the_sums_of_directions() -> None:

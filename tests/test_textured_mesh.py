@@ -54,7 +54,8 @@ def plane_model(cells: int = 5) -> FaceModel:
     torch.manual_seed(1)
     steps = torch.linspace(-0.1, 0.1, cells + 1)
     sheet = torch.stack([*torch.meshgrid(steps, steps, indexing="xy"), torch.zeros(cells + 1, cells + 1)], -1)
-    sheet[1:-1, 1:-1, :2] += 0.35 * 0.2 / cells * (2 * torch.rand(cells - 1, cells - 1, 2) - 1)
+    shifts = 2 * torch.rand(2, cells + 1, cells + 1).movedim(0, -1) - 1
+    sheet[1:-1, 1:-1, :2] += 0.35 * 0.2 / cells * shifts[1:-1, 1:-1]
     corner = (torch.arange(cells)[:, None] * (cells + 1) + torch.arange(cells)).flatten()
     right, up = corner + 1, corner + cells + 1
     faces = torch.cat([torch.stack([corner, right, up + 1], 1), torch.stack([corner, up + 1, up], 1)])

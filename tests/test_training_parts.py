@@ -183,7 +183,7 @@ def test_rates() -> None:
         (Rate(1.0, 0.01), 50, 0.1), (Rate(1.0, 0.01), 100, 0.01), (Rate(0.3), 70, 0.3), (Rate(0.0, 1e-3), 50, 0.0),
         (late, 49, 0.0), (late, 50, 1.0), (late, 75, 0.1),
     ):  # fmt: skip
-        assert rate.at(Progress(step, 100)) == pytest.approx(expected, abs=0)
+        assert rate.at(Progress(step, 100)) == pytest.approx(expected, rel=1e-6, abs=0)
 
 
 def test_frames_with_rare_expressions_come_more_often() -> None:
