@@ -6,10 +6,11 @@ A case is a layout and a number; the number decides the fault and the way in whi
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from random import Random
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -51,9 +52,6 @@ _LARGEST = 1e3
 COEFFICIENTS = "nerf-blendshape, on its coefficients"
 
 
-_COLORS = {serial: np.eye(3, 11) for serial in ("222200036", writers.FRONTAL)}
-
-
 def _film(path: Path, _: str = "") -> None:
     write_video(path, iter(np.full((3, SIDE, SIDE, 3), 90, np.uint8)), 25.0)
 
@@ -79,14 +77,15 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
     COEFFICIENTS: partial(writers.write_nerf_blendshape, scale=7.0, detected=True),
     "nersemble-benchmark": writers.write_benchmark,
     "nersemble-benchmark, novel views": partial(writers.write_benchmark, serials=("7", writers.FRONTAL), tracked=False),
-    "nersemble": lambda folder, scene: writers.write_nersemble(folder, film=_film, colors=_COLORS),
+    "nersemble": lambda folder, scene: writers.write_nersemble(
+        folder, film=_film, colors=dict.fromkeys(("222200036", writers.FRONTAL), np.eye(3, 11))
+    ),
     "live-link-face": lambda folder, scene: writers.write_take(folder, film=_film),
     "gaussian-avatars": _write_avatar,
 }
 
 
 def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the networks and the capture of videos, and draw pictures of a quarter of the size."""
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
     monkeypatch.setattr(sequences, "detected_landmarks", unfound)
     monkeypatch.setattr(matting, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
@@ -95,7 +94,7 @@ def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
     layouts.draw_at(SIDE / writers.SIDE, monkeypatch)
 
 
-def _film_is_read(video: Path, out: Path, settings: CaptureSettings, name: str) -> None:
+def _film_is_read(video: Path, out: Path, *_: Any) -> None:
     """Read a video in place of the capture, whose own fuzzer is `tests/fuzzing`."""
     assert "canary" not in str(video.resolve()), "a link that leads out of the dataset"
     next(read_video_frames(video))
@@ -103,13 +102,11 @@ def _film_is_read(video: Path, out: Path, settings: CaptureSettings, name: str) 
 
 
 def _rig_is_read(videos: list[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings) -> None:
-    cameras = read_calibration(calibration)
-    assert len(cameras) == len(videos)
-    plates = [] if settings.clean_plate is None else sorted(settings.clean_plate.iterdir())
-    for plate in plates:
+    assert len(read_calibration(calibration)) == len(videos)
+    for plate in [] if settings.clean_plate is None else sorted(settings.clean_plate.iterdir()):
         assert "canary" not in str(plate.resolve()), "a link that leads out of the dataset"
     for video in videos:
-        _film_is_read(video, out / video.stem, settings, name)
+        _film_is_read(video, out / video.stem)
 
 
 def tiny_scene(folder: Path) -> Scene:
@@ -129,15 +126,12 @@ def another_flame(scene: Scene, folder: Path) -> FaceModel:
     return replace(flame_face_model(read_flame(path), "other"), landmarks=scene.model.landmarks)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The outcome of a case."""
+class Outcome(NamedTuple):
+    """The outcome of a case: its fault, the line that refused the dataset, if any, and what the importer did wrong."""
 
     fault: str
     complaint: str
-    """The line that refused the dataset; nothing if it was imported."""
     wrong: str
-    """The fault of the importer in words, or an empty text if there is none."""
 
 
 class Campaign:
@@ -158,7 +152,6 @@ class Campaign:
             self.check_written(folder / name)
 
     def run(self, number: int) -> Outcome:
-        """Make one fault in a copy of the dataset, and import it."""
         dice = Random(f"{self.layout} {number}")
         root, out, canary = (self.folder / f"{name}{number}" for name in ("case", "out", "canary"))
         shutil.copytree(self.material, root)

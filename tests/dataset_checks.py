@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from av.video.reformatter import Interpolation
 
-from dataset_layouts import MIRROR, Layout, View
+from dataset_layouts import Layout, View
 from dataset_scene import Scene, draw, projected
+from dataset_writers import MIRROR, rigid
 from mien.camera import Camera
 from mien.datasets import Findings, TrackedSequence, recognised
 from mien.render import rasterize_mesh
@@ -36,26 +37,23 @@ def check_intrinsics(camera: Camera, K: np.ndarray) -> None:
 
 
 def check_view(camera: Camera, rotation: np.ndarray, translation: np.ndarray) -> None:
-    """Check where a camera stands in the world."""
     viewmat = camera.viewmat.double().numpy()
-    assert np.abs(viewmat[:3, :3] - rotation).max() < CAMERA
-    assert np.abs(viewmat[:3, 3] - translation).max() < CAMERA
+    assert np.abs(viewmat - rigid(rotation, translation)).max() < CAMERA
     assert np.array_equal(viewmat[3], [0, 0, 0, 1])
 
 
 def filmed_camera(sequence: Any, camera: int = 0) -> Camera:
-    """Return a camera that is given with the pictures."""
     calibration = sequence.capture.calibration
     assert calibration is not None
     return calibration[camera]
 
 
-def _motion_between(points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation and translation that carry points onto others best (Kabsch 1976)."""
+def _motion_between(points: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Return the rigid matrix that carries points onto others best (Kabsch 1976)."""
     middle, middle_moved = points.mean(0), moved.mean(0)
     u, _, vt = np.linalg.svd((points - middle).T @ (moved - middle_moved))
     rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-    return rotation, middle_moved - rotation @ middle
+    return rigid(rotation, middle_moved - rotation @ middle)
 
 
 def check_projection(
@@ -77,9 +75,7 @@ def check_projection(
     viewmat = found.viewmat.double().numpy()
     seen = (mesh.double().numpy() @ viewmat[:3, :3].T + viewmat[:3, 3]) * scale
     assert np.abs(seen - (vertices @ rotation.T + translation))[which].max() < METRES
-    found_rotation, found_translation = _motion_between(vertices[which], seen[which])
-    assert np.abs(found_rotation - rotation).max() < CAMERA
-    assert np.abs(found_translation - translation).max() < CAMERA
+    assert np.abs(_motion_between(vertices[which], seen[which]) - rigid(rotation, translation)).max() < CAMERA
     pixels = found.project(mesh)[0].double().numpy()
     assert np.abs(pixels - projected(vertices, K, rotation, translation))[which].max() < PIXELS
 
@@ -124,7 +120,6 @@ def read(path: Path, name: str, model: Any = None) -> list[Any]:
 
 
 def read_pictures(path: Path) -> Any:
-    """Return the pictures of a dataset, for them to be tracked again."""
     dataset, _ = recognised(path)
     assert dataset.read_pictures is not None
     (found,) = dataset.read_pictures(path)
@@ -132,14 +127,12 @@ def read_pictures(path: Path) -> Any:
 
 
 def surveyed(path: Path) -> Findings:
-    """Return what is told of a dataset before it is read."""
     dataset, _ = recognised(path)
     assert dataset.survey is not None
     return dataset.survey(path)
 
 
 def check_import(found: list[Any], layout: Layout, scene: Scene) -> None:
-    """Check sequences that were read: names, faces, cameras, pictures, landmarks and what is held out."""
     shown = layout.shown(scene)
     for sequence, (name, timesteps), split in zip(found, layout.clips.items(), layout.splits, strict=True):
         assert isinstance(sequence, TrackedSequence)

@@ -14,36 +14,26 @@ import numpy as np
 import pytest
 
 import dataset_scene
-import dataset_writers
+import dataset_writers as writers
 from dataset_scene import Scene, draw, head_view
-from dataset_writers import (
-    IMAVATAR_PLACE,
-    npz,
-    write_flash_avatar,
-    write_imavatar,
-    write_insta,
-    write_picture,
-    write_vhap,
-)
 from mien.training import OwnSplit
 
-MIRROR = np.diag([1.0, -1.0, -1.0])
 View = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Intrinsics, and the rotation and translation from the world to a camera with OpenCV's axes."""
 
 
 def draw_at(factor: float, patch: pytest.MonkeyPatch) -> None:
     """Let writers draw so many times as many pixels on each side."""
-    side = round(factor * dataset_writers.SIDE)
-    for module in (dataset_scene, dataset_writers):
+    side = round(factor * writers.SIDE)
+    for module in (dataset_scene, writers):
         patch.setattr(module, "SIDE", side)
     for name in ("OFF_CENTRE", "UNEQUAL"):
-        patch.setattr(dataset_writers, name, enlarged(getattr(dataset_writers, name), factor))
+        patch.setattr(writers, name, enlarged(getattr(writers, name), factor))
 
 
 def write_gaussian_blendshapes(folder: Path, scene: Scene) -> Path:
     """Write a subject of GaussianBlendshapes or RGBAvatar: pictures with opacities, and checkpoints."""
-    write_insta(folder, scene)
+    writers.write_insta(folder, scene)
     (folder / "transforms.json").unlink()
     return folder
 
@@ -71,8 +61,8 @@ def write_masked(folder: Path, scene: Scene, channels: int = 1) -> Path:
     """Write GaussianBlendshapes' copy of a person of NeRFBlendShape: masks beside the pictures, and the empty scene."""
     write_gaussian_blendshapes(folder, scene)
     for name, matte in _split_opacity(folder / "images").items():
-        write_picture(folder / f"image_mask/mask_{name}", np.repeat(matte[..., None], channels, -1))
-    assert cv2.imwrite(str(folder / "bc.jpg"), np.full((dataset_writers.SIDE, dataset_writers.SIDE, 3), 255, np.uint8))
+        writers.write_picture(folder / f"image_mask/mask_{name}", np.repeat(matte[..., None], channels, -1))
+    assert cv2.imwrite(str(folder / "bc.jpg"), np.full((writers.SIDE, writers.SIDE, 3), 255, np.uint8))
     return folder
 
 
@@ -83,15 +73,15 @@ def enlarged(K: np.ndarray, factor: float) -> np.ndarray:
 
 def draw_larger(scene: Scene, timestep: int, factor: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture and its matte with `factor` times as many pixels on each side as the tracker saw."""
-    vertices, side = scene.vertices(timestep, root=False, neck=False), factor * dataset_writers.SIDE
-    return draw(scene, vertices, enlarged(dataset_writers.OFF_CENTRE, factor), *head_view(timestep), (side, side))
+    vertices, side = scene.vertices(timestep, root=False, neck=False), factor * writers.SIDE
+    return draw(scene, vertices, enlarged(writers.OFF_CENTRE, factor), *head_view(timestep), (side, side))
 
 
 def write_larger(folder: Path, scene: Scene, factor: int = 2) -> Path:
     """Write a subject whose pictures are larger than those that were tracked."""
     write_gaussian_blendshapes(folder, scene)
     for timestep, file in enumerate(sorted((folder / "images").glob("*.png"))):
-        write_picture(folder / f"images.HQ/{file.name}", *draw_larger(scene, timestep, factor))
+        writers.write_picture(folder / f"images.HQ/{file.name}", *draw_larger(scene, timestep, factor))
         file.unlink()
     (folder / "images").rmdir()
     return folder
@@ -99,12 +89,12 @@ def write_larger(folder: Path, scene: Scene, factor: int = 2) -> Path:
 
 def write_splatting_avatar(subject: Path, scene: Scene) -> Path:
     """Write a subject of SplattingAvatar: one clip of IMavatar's layout, whose pictures have opacities."""
-    clip = write_imavatar(subject.with_name("x"), scene, ("clip",)) / "x/clip"
+    clip = writers.write_imavatar(subject.with_name("x"), scene, ("clip",)) / "x/clip"
     for file in sorted((clip / "image").glob("*.png")):
         pixels, matte = (cv2.imread(str(each)) for each in (file, clip / "mask" / file.name))
         assert pixels is not None
         assert matte is not None
-        write_picture(subject / "images" / file.name, pixels[..., ::-1], matte[..., 0])
+        writers.write_picture(subject / "images" / file.name, pixels[..., ::-1], matte[..., 0])
     content = json.loads((clip / "flame_params.json").read_text())
     for frame in content["frames"]:
         frame["file_path"] = frame["file_path"].replace("image/", "images/")
@@ -122,7 +112,7 @@ def write_union(union: Path, scene: Scene) -> Path:
     """
     parts: dict[str, list[dict]] = {"train": [], "val": [], "test": []}
     for index, name in enumerate(UNITED):
-        export = write_vhap(union.with_name(name), scene)
+        export = writers.write_vhap(union.with_name(name), scene)
         for frame in json.loads((export / "transforms.json").read_text())["frames"]:
             frame["timestep_index"] += index * len(scene)
             for key in ("file_path", "fg_mask_path", "flame_param_path"):
@@ -142,35 +132,18 @@ def with_static_offset(scene: Scene) -> tuple[Scene, np.ndarray]:
 
 
 def write_offset(folder: Path, scene: Scene) -> Path:
-    """Write an export of VHAP with `static_offset`."""
     shown, offset = with_static_offset(scene)
-    write_vhap(folder, shown)
+    writers.write_vhap(folder, shown)
     for file in sorted((folder / "flame_param").glob("*.npz")):
-        file.write_bytes(npz({**np.load(file), "static_offset": offset[None]}))
+        file.write_bytes(writers.npz({**np.load(file), "static_offset": offset[None]}))
     return folder
 
 
 # The table -----------------------------------------------------------------------------------------------------------
 
 
-def _from_the_tracker(scene: Scene, timestep: int) -> np.ndarray:
-    return scene.vertices(timestep, root=False, neck=False)
-
-
 def _tracker_view(timestep: int, _: int, factor: int = 1) -> View:
-    return enlarged(dataset_writers.OFF_CENTRE, factor), *head_view(timestep)
-
-
-def _at_the_origin(scene: Scene, timestep: int) -> np.ndarray:
-    return scene.vertices(timestep) - scene.translation[timestep]
-
-
-def _imavatar_view(*_: int) -> View:
-    return dataset_writers.UNEQUAL, MIRROR, MIRROR @ IMAVATAR_PLACE / 4
-
-
-def _rig_view(_: int, camera: int) -> View:
-    return dataset_writers.UNEQUAL, *head_view(2 + camera, 1.0)
+    return enlarged(writers.OFF_CENTRE, factor), *head_view(timestep)
 
 
 @dataclass(frozen=True)
@@ -180,7 +153,7 @@ class Layout:
     write: Callable[[Path, Scene], Path]
     reads: str = "insta"
     """The importer that recognises it."""
-    vertices: Callable[[Scene, int], np.ndarray] = _from_the_tracker
+    vertices: Callable[[Scene, int], np.ndarray] = lambda scene, timestep: scene.vertices(timestep, False, False)
     """Vertices of a timestep in the writer's world."""
     view: Callable[[int, int], View] = _tracker_view
     """The camera of a timestep."""
@@ -198,25 +171,32 @@ class Layout:
 
 
 _RIG = ("222200036", "222200037")
-_TALL = (dataset_writers.SIDE, 136)
+_TALL = (writers.SIDE, 136)
 _PART = OwnSplit(((5, 6),), _RIG[1:])
-_VHAP = Layout(write_vhap, "vhap", Scene.vertices, _rig_view, splits=(_PART,), cameras=_RIG, size=_TALL)
+_VHAP = Layout(
+    writers.write_vhap, "vhap", Scene.vertices, lambda _, camera: (writers.UNEQUAL, *head_view(2 + camera, 1.0)),
+    splits=(_PART,), cameras=_RIG, size=_TALL,
+)  # fmt: skip
+_IMAVATAR = Layout(
+    write_splatting_avatar, "imavatar", lambda scene, timestep: scene.vertices(timestep) - scene.translation[timestep],
+    lambda *_: (writers.UNEQUAL, writers.MIRROR, writers.MIRROR @ writers.IMAVATAR_PLACE / 4),
+)  # fmt: skip
 
 TRACKED = {
-    "insta": Layout(write_insta),
-    "flash-avatar": Layout(write_flash_avatar, retracked=True),
+    "insta": Layout(writers.write_insta),
+    "flash-avatar": Layout(writers.write_flash_avatar, retracked=True),
     "gaussian-blendshapes": Layout(write_gaussian_blendshapes, retracked=True),
     "masks": Layout(write_masked, retracked=True),
     "masks of three channels": Layout(partial(write_masked, channels=3), retracked=True),
-    "imavatar": Layout(
-        write_imavatar, "imavatar", _at_the_origin, _imavatar_view,
-        {"MVI_1810": range(3), "MVI_1812": range(3, 6)}, (OwnSplit(), OwnSplit(((0, 3),))),
+    "imavatar": replace(
+        _IMAVATAR, write=writers.write_imavatar, clips={"MVI_1810": range(3), "MVI_1812": range(3, 6)},
+        splits=(OwnSplit(), OwnSplit(((0, 3),))),
     ),
-    "splatting-avatar": Layout(write_splatting_avatar, "imavatar", _at_the_origin, _imavatar_view),
+    "splatting-avatar": _IMAVATAR,
     "vhap": _VHAP,
-    "vhap, from below": replace(_VHAP, write=partial(write_vhap, from_below=True)),
+    "vhap, from below": replace(_VHAP, write=partial(writers.write_vhap, from_below=True)),
     "vhap, one camera": replace(
-        _VHAP, write=partial(write_vhap, cameras=("0",)), cameras=("0",), splits=(OwnSplit(((5, 6),)),)
+        _VHAP, write=partial(writers.write_vhap, cameras=("0",)), cameras=("0",), splits=(OwnSplit(((5, 6),)),)
     ),
     "vhap, a union": replace(
         _VHAP, write=write_union, clips=dict.fromkeys(UNITED, range(6)),
@@ -226,7 +206,7 @@ TRACKED = {
     **{
         f"pictures {factor} times as large": Layout(
             partial(write_larger, factor=factor), view=partial(_tracker_view, factor=factor), retracked=True,
-            size=(factor * dataset_writers.SIDE, factor * dataset_writers.SIDE),
+            size=(factor * writers.SIDE, factor * writers.SIDE),
         ) for factor in (2, 3)
     },
 }  # fmt: skip

@@ -3,6 +3,7 @@
 Vertices come from `posed_as_flame`, a forward pass of its own, in float64. Nothing here calls the importers.
 """
 
+import contextlib
 import tempfile
 from dataclasses import dataclass, replace
 from functools import cache
@@ -42,8 +43,7 @@ class Scene:
         pose[0] *= root
         pose[1] *= neck
         shift = self.translation[timestep] * root
-        identities = int(self.arrays["identities"])
-        expressions = self.arrays["shapedirs"].shape[2] - identities
+        identities, expressions = counts(self.arrays)
         coefficients = np.concatenate([self.shape[:identities], self.expr[timestep, :expressions]])
         return posed_as_flame(self.arrays, pose, coefficients, shift)
 
@@ -54,8 +54,13 @@ class Scene:
         return (corners * marks.barycentric.double().numpy()[..., None]).sum(1)
 
     def __len__(self) -> int:
-        """Return the number of timesteps."""
         return len(self.expr)
+
+
+def counts(arrays: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Return the numbers of identities and expressions."""
+    identities = int(arrays["identities"])
+    return identities, arrays["shapedirs"].shape[2] - identities
 
 
 @cache
@@ -72,8 +77,7 @@ def scene_of(arrays: dict[str, np.ndarray], model: FaceModel, timesteps: int, se
     """Return random poses of a random person of a face model, whose arrays are in FLAME's schema."""
     random = np.random.default_rng(seed)
     shape, expr = np.zeros(300), np.zeros((timesteps, 100))
-    identities = int(arrays["identities"])
-    expressions = arrays["shapedirs"].shape[2] - identities
+    identities, expressions = counts(arrays)
     shape[:identities] = 0.5 * random.standard_normal(identities)
     expr[:, :expressions] = 0.5 * random.standard_normal((timesteps, expressions))
     pose = np.zeros((timesteps, 5, 3))
@@ -114,14 +118,11 @@ def projected(vertices: np.ndarray, K: np.ndarray, rotation: np.ndarray, transla
     return seen[:, :2] / seen[:, 2:]
 
 
-class NoDetector:
+class NoDetector(contextlib.AbstractContextManager):
     """A detector that finds nothing, since loading the real one for each case would take minutes."""
 
     def __init__(self, several_faces: bool) -> None:
         pass
-
-    def __enter__(self) -> "NoDetector":
-        return self
 
     def __exit__(self, *_: object) -> None:
         pass

@@ -13,46 +13,53 @@ import numpy as np
 import torch
 
 from dataset_scene import SIDE, Scene, draw, head_view, projected
+from mien.capture.video import write_video
 from mien.rotation import matrix_from_axis_angle
 from recordings import live_link_face
 
 OFF_CENTRE = np.array([[155.0, 0, 66.3], [0, 155.0, 61.9], [0, 0, 1]])
 """Intrinsics with square pixels, whose principal point is off the centre in both axes."""
 UNEQUAL = np.array([[159.0, 0, 66.3], [0, 151.0, 61.9], [0, 0, 1]])
+MIRROR = np.diag([1.0, -1.0, -1.0])
+"""The rotation between OpenCV's axes and OpenGL's."""
 
 
 def write_picture(path: Path, image: np.ndarray, matte: np.ndarray | None = None) -> None:
-    """Write an RGB or RGBA picture."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = image[..., ::-1] if matte is None else np.concatenate([image[..., ::-1], matte[..., None]], axis=-1)
     assert cv2.imwrite(str(path), pixels)
 
 
 def rotation_of(axis_angle: np.ndarray) -> np.ndarray:
-    """Return the matrix of an axis-angle vector."""
     return matrix_from_axis_angle(torch.from_numpy(axis_angle)).numpy()
+
+
+def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    return np.vstack([np.column_stack([rotation, translation]), [0, 0, 0, 1]])
+
+
+def tripled(matte: np.ndarray) -> np.ndarray:
+    """Return a matte [h, w] with three channels."""
+    return np.repeat(matte[..., None], 3, -1)
 
 
 def tracker_frame(scene: Scene, timestep: int, K: np.ndarray) -> dict[str, Any]:
     """Return the dictionary of a checkpoint of metrical-tracker: root and neck are at rest."""
     rotation, translation = head_view(timestep)
-
-    def six(axis_angle: np.ndarray) -> np.ndarray:
-        return rotation_of(axis_angle)[:2].reshape(1, 6)  # the first two rows
-
-    def float32(array: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(array, np.float32)
-
-    eyes = np.concatenate([six(scene.pose[timestep, 3]), six(scene.pose[timestep, 4])], axis=1)
-    return {
+    # Rotations are their first two rows.
+    jaw, *eyes = (rotation_of(angles)[:2].reshape(1, 6) for angles in scene.pose[timestep, 2:])
+    arrays = {
         "flame": {
-            "exp": float32(scene.expr[timestep][None]), "shape": float32(scene.shape[None]),
-            "jaw": float32(six(scene.pose[timestep, 2])), "eyes": float32(eyes),
-            "eyelids": float32(np.array([[0.1, 0.4]])),
+            "exp": scene.expr[timestep][None], "shape": scene.shape[None], "jaw": jaw,
+            "eyes": np.concatenate(eyes, axis=1), "eyelids": np.array([[0.1, 0.4]]),
         },
-        "opencv": {"R": float32(rotation[None]), "t": float32(translation[None]), "K": float32(K[None])},
-        "img_size": np.array([SIDE, SIDE]), "frame_id": f"{timestep:05d}", "global_step": 7,
+        "opencv": {"R": rotation[None], "t": translation[None], "K": K[None]},
     }  # fmt: skip
+    exact = {
+        part: {name: np.ascontiguousarray(array, np.float32) for name, array in content.items()}
+        for part, content in arrays.items()
+    }
+    return {**exact, "img_size": np.array([SIDE, SIDE]), "frame_id": f"{timestep:05d}", "global_step": 7}
 
 
 def write_frame(path: Path, content: dict[str, Any]) -> None:
@@ -64,7 +71,6 @@ def write_frame(path: Path, content: dict[str, Any]) -> None:
 
 
 def seen_by_tracker(scene: Scene, timestep: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return picture and matte of a frame of metrical-tracker."""
     return draw(scene, scene.vertices(timestep, root=False, neck=False), K, *head_view(timestep))
 
 
@@ -77,11 +83,9 @@ def write_insta(folder: Path, scene: Scene, checkpoints: bool = True, held_out: 
         write_picture(folder / f"images/{number:05d}.png", image, matte)
         if checkpoints:
             write_frame(folder / f"checkpoint/{number:05d}.frame", tracker_frame(scene, timestep, OFF_CENTRE))
-        rotation, translation = head_view(timestep)
-        view = np.eye(4)
-        view[:3, :3], view[:3, 3] = rotation, translation
+        pose = np.linalg.inv(rigid(*head_view(timestep))).tolist()
         frames.append({
-            "transform_matrix": np.linalg.inv(view).tolist(), "file_path": f"images/{number:05d}.png",
+            "transform_matrix": pose, "file_path": f"images/{number:05d}.png",
             "exp_path": f"flame/exp/{number:05d}.txt", "mesh_path": f"meshes/{number:05d}.obj",
         })  # fmt: skip
     content = {"w": SIDE, "h": SIDE, "fl_x": OFF_CENTRE[0, 0], "fl_y": OFF_CENTRE[1, 1], "cx": OFF_CENTRE[0, 2],
@@ -97,7 +101,7 @@ def write_flash_avatar(root: Path, scene: Scene) -> Path:
     for timestep in range(len(scene)):
         image, matte = seen_by_tracker(scene, timestep, OFF_CENTRE)
         write_picture(root / f"dataset/me/imgs/{timestep + 1:05d}.png", image)
-        write_picture(root / f"dataset/me/alpha/{timestep + 1:05d}.png", np.repeat(matte[..., None], 3, -1))
+        write_picture(root / f"dataset/me/alpha/{timestep + 1:05d}.png", tripled(matte))
         place = root / f"metrical-tracker/output/me/checkpoint/{timestep:05d}.frame"
         write_frame(place, tracker_frame(scene, timestep, OFF_CENTRE))
     return root
@@ -124,10 +128,9 @@ def write_imavatar(folder: Path, scene: Scene, clips: tuple[str, ...] = ("MVI_18
         for number in range(share):
             timestep = index * share + number
             vertices = scene.vertices(timestep) - scene.translation[timestep]
-            rotation, shift = np.diag([1.0, -1.0, -1.0]), np.diag([1.0, -1.0, -1.0]) @ IMAVATAR_PLACE / 4
-            image, matte = draw(scene, vertices, UNEQUAL, rotation, shift)
+            image, matte = draw(scene, vertices, UNEQUAL, MIRROR, MIRROR @ IMAVATAR_PLACE / 4)
             write_picture(place / f"image/{number + 1}.png", image)
-            write_picture(place / f"mask/{number + 1}.png", np.repeat(matte[..., None], 3, -1))
+            write_picture(place / f"mask/{number + 1}.png", tripled(matte))
             write_picture(place / f"semantic/{number + 1}.png", imavatar_classes(matte)[..., None])
             frames.append({
                 "file_path": f"./image/{number + 1}",
@@ -143,7 +146,6 @@ def write_imavatar(folder: Path, scene: Scene, clips: tuple[str, ...] = ("MVI_18
 
 
 def npz(arrays: dict[str, Any]) -> bytes:
-    """Return an .npz."""
     file = io.BytesIO()
     np.savez(file, **arrays)
     return file.getvalue()
@@ -171,13 +173,12 @@ def write_vhap(
             name = f"{timestep:05d}_{index:02d}.png"
             write_picture(folder / f"images/{name}", image)
             write_picture(folder / f"fg_masks/{name}", matte[..., None])
-            to_world = np.eye(4)
-            to_world[:3, :3], to_world[:3, 3] = rotation.T, -rotation.T @ translation
+            to_world = np.linalg.inv(rigid(rotation, translation)) @ rigid(MIRROR, np.zeros(3))
             cy = size[1] - UNEQUAL[1, 2] if from_below else UNEQUAL[1, 2]
             frames.append({
                 "timestep_index": timestep, "camera_index": index, "camera_id": camera, "fl_x": UNEQUAL[0, 0],
                 "fl_y": UNEQUAL[1, 1], "cx": UNEQUAL[0, 2], "cy": cy, "w": size[0], "h": size[1],
-                "transform_matrix": (to_world @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+                "transform_matrix": to_world.tolist(),
                 "file_path": f"images/{name}", "fg_mask_path": f"fg_masks/{name}",
                 "flame_param_path": f"flame_param/{timestep:05d}.npz",
             })  # fmt: skip
@@ -189,9 +190,10 @@ def write_vhap(
 
 def nerface_landmarks(scene: Scene, images: np.ndarray) -> np.ndarray:
     """Return the landmarks of the pictures of a clip of `write_nerface` with `detected`, in place of a detector's."""
-    timesteps = range(4) if len(images) == 4 else [5]
-    marks = [projected(scene.marks(scene.vertices(timestep, root=False, neck=False)), UNEQUAL, *head_view(timestep))
-             for timestep in timesteps]  # fmt: skip
+    marks = [
+        projected(scene.marks(scene.vertices(timestep, root=False, neck=False)), UNEQUAL, *head_view(timestep))
+        for timestep in (range(4) if len(images) == 4 else [5])
+    ]
     return np.stack(marks)[:, None].astype(np.float32)
 
 
@@ -203,22 +205,16 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6, detected: bool
     A ray of the file through the whole pixel (u, v) has the direction R ((u - cx) / fx, -(v - cy) / fy, -1).
     """
     order = [2, 0, 3, 1]  # number of each training picture in the clip
-    index = np.full((5, 2), -1.0)
-    index[:, 0] = np.arange(5)
-    for number, timestep in enumerate(order):
-        index[timestep, 1] = number
+    index = np.stack([np.arange(5.0), [*np.argsort(order), -1]], axis=1)
     mirror = np.diag([-1.0, 1.0, 1.0])
     for part, timesteps in (("train", order), ("val", [4]), ("test", [5])):
         frames = []
         for number, timestep in enumerate(timesteps):
             rotation, translation = head_view(timestep)
             vertices = scene.vertices(timestep, root=False, neck=not detected)
-            write_picture(
-                folder / f"{part}/f_{number:04d}.png", draw(scene, vertices, UNEQUAL, rotation, translation)[0]
-            )
-            pose = np.eye(4)
-            pose[:3, :3] = -mirror @ rotation.T
-            pose[:3, 3] = mirror @ (-rotation.T @ translation) * scale
+            image, _ = draw(scene, vertices, UNEQUAL, rotation, translation)
+            write_picture(folder / f"{part}/f_{number:04d}.png", image)
+            pose = rigid(-mirror @ rotation.T, mirror @ (-rotation.T @ translation) * scale)
             frames.append({"file_path": f"./{part}/f_{number:04d}", "transform_matrix": pose.tolist(),
                            "expression": [timestep, *[0.5] * 75], "bbox": [0, 1, 0, 1]})  # fmt: skip
         intrinsics = [-UNEQUAL[0, 0], UNEQUAL[1, 1], (UNEQUAL[0, 2] - 0.5) / SIDE, (UNEQUAL[1, 2] - 0.5) / SIDE]
@@ -249,10 +245,7 @@ def write_nerf_blendshape(folder: Path, scene: Scene, scale: float = 1.0, detect
         if detected:
             points = projected(scene.marks(vertices), UNEQUAL, rotation, translation)
         (folder / f"ori_imgs/{number}.lms").write_text("\n".join(f"{x} {y}" for x, y in points))
-        view = np.eye(4)
-        view[:3, :3], view[:3, 3] = rotation, translation
-        pose = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        pose[:3, 3] *= scale
+        pose = np.linalg.inv(rigid(rotation, translation * scale)) @ rigid(MIRROR, np.zeros(3))
         frames.insert(0, {"img_id": number, "transform_matrix": pose.tolist(), "exp_ori": [timestep / 10] * 46})
     content = {"h": SIDE, "w": SIDE, "fx": UNEQUAL[0, 0], "fy": UNEQUAL[1, 1], "cx": UNEQUAL[0, 2] - 0.5,
                "cy": UNEQUAL[1, 2] - 0.5, "frames": frames}  # fmt: skip
@@ -264,12 +257,14 @@ BENCHMARK_SCALE = 1.07
 FRONTAL = "222200037"
 
 
+def turn_of(angles: np.ndarray) -> np.ndarray:
+    """Return the benchmark's rotation by Euler angles: about x, y and z."""
+    return np.linalg.multi_dot([rotation_of(axis * angle) for axis, angle in zip(np.eye(3), angles, strict=True)])
+
+
 def benchmark_vertices(scene: Scene, timestep: int, angles: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Return the vertices of the benchmark's forward pass: scaled, turned and shifted about the model's origin."""
-    turn = np.eye(3)
-    for axis in range(3):
-        turn = turn @ rotation_of(np.eye(3)[axis] * angles[axis])
-    return BENCHMARK_SCALE * scene.vertices(timestep, root=False) @ turn.T + shift
+    return BENCHMARK_SCALE * scene.vertices(timestep, root=False) @ turn_of(angles).T + shift
 
 
 def write_benchmark(
@@ -280,32 +275,26 @@ def write_benchmark(
 
     If it is tracked, FREE is a test sequence that has a tracking only.
     """
-    from mien.capture.video import write_video
-
     random = np.random.default_rng(8)
     angles, shifts = random.uniform(-0.3, 0.3, (len(scene), 3)), random.uniform(-0.03, 0.03, (len(scene), 3))
-    poses, intrinsics = {}, {}
-    share = len(scene) // len(clips)
+    poses, share = {}, len(scene) // len(clips)
     parts = {clip: slice(index * share, (index + 1) * share) for index, clip in enumerate(clips)}
     for index, serial in enumerate(serials):
         rotation, translation = head_view(2 + index, 1.0)
-        poses[serial] = np.eye(4)
-        poses[serial][:3, :3], poses[serial][:3, 3] = rotation, translation
-        intrinsics[serial] = UNEQUAL.tolist()
+        poses[serial] = rigid(rotation, translation).tolist()
         drawn = [
             draw(scene, benchmark_vertices(scene, t, angles[t], shifts[t]), UNEQUAL, rotation, translation)
             for t in range(len(scene))
         ]
-        mattes = [np.repeat(matte[..., None], 3, -1) for _, matte in drawn]
+        mattes = [tripled(matte) for _, matte in drawn]
         for clip, part in parts.items():
             place = folder / "sequences" / clip
             write_video(place / f"images/cam_{serial}.mp4", iter([image for image, _ in drawn[part]]), 24.3, crf=1)
             write_video(place / f"alpha_maps/cam_{serial}.mp4", iter(mattes[part]), 24.3, crf=1)
-    calibration = {"world_2_cam": {serial: pose.tolist() for serial, pose in poses.items()}, "intrinsics": intrinsics}
+    calibration = {"world_2_cam": poses, "intrinsics": dict.fromkeys(poses, UNEQUAL.tolist())}
     (folder / "calibration").mkdir()
     (folder / "calibration/camera_params.json").write_text(json.dumps(calibration))
-    turns = np.stack([np.linalg.multi_dot([rotation_of(np.eye(3)[axis] * angle[axis]) for axis in range(3)])
-                      for angle in angles])  # fmt: skip
+    turns = np.stack([turn_of(each) for each in angles])
     for name, part in {**parts, "FREE": slice(None)}.items() if tracked else ():
         arrays = {
             "expression": scene.expr[part], "rotation": angles[part], "rotation_matrices": turns[part],
@@ -332,10 +321,9 @@ def write_nersemble(
 
     `colors` has the correction [3, n] of each camera's colours.
     """
-    poses = {serial: np.eye(4).tolist() for serial in serials}
     (folder / "calibration").mkdir(parents=True)
     K = [[8000.0, 0, 1100], [0, 8000, 1604], [0, 0, 1]]
-    content = {"world_2_cam": poses, "intrinsics": K}
+    content = {"world_2_cam": dict.fromkeys(serials, np.eye(4).tolist()), "intrinsics": K}
     (folder / "calibration/camera_params.json").write_text(json.dumps(content))
     if colors is not None:
         content = {serial: matrix.tolist() for serial, matrix in colors.items()}

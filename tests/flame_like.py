@@ -22,7 +22,6 @@ _SHIFT = np.array([0.003, -0.021, -0.044])
 
 
 def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
-    """Return the arrays of a file in FLAME's schema."""
     order, faces, _ = _cut(anny)
     template = anny.template.double().numpy()[order]
     weights, jaw, hinge, residual = _joints(anny, order, template)
@@ -72,7 +71,6 @@ def true_regions(anny: FaceModel) -> np.ndarray:
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> Path:
-    """Write the arrays as a user would save them."""
     np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
     return path
 

@@ -68,7 +68,6 @@ def gnm_landmarks(anny: FaceModel) -> dict[str, Landmarks]:
 
 
 def write_gnm(path: Path, arrays: dict[str, Any]) -> Path:
-    """Write the arrays as the published file has them."""
     np.savez(path, **arrays)
     return path
 

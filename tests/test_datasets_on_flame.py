@@ -1,11 +1,9 @@
 """Datasets that are tracked on FLAME: what independent writers wrote is imported, and lies on its pictures."""
 
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -41,6 +39,15 @@ def refused(folder: Path, scene: Scene, words: str, name: str = "insta") -> None
         checks.read(folder, name, scene.model)
 
 
+def check_retracked(folder: Path, name: str, scene: Scene) -> None:
+    sequence, layout = checks.read_pictures(folder), layouts.TRACKED[name]
+    checks.check_view(checks.filmed_camera(sequence), writers.MIRROR, np.zeros(3))
+    for timestep in range(len(scene)):
+        view = layout.view(timestep, 0)
+        checks.check_intrinsics(checks.filmed_camera(sequence), view[0])
+        checks.check_pictures(sequence, timestep, draw(scene, layout.vertices(scene, timestep), *view, layout.size))
+
+
 @pytest.mark.parametrize("name", EACH)
 def test_what_was_written_comes_back(name: str, scene: Scene, tmp_path: Path) -> None:
     layout = layouts.TRACKED[name]
@@ -51,16 +58,6 @@ def test_what_was_written_comes_back(name: str, scene: Scene, tmp_path: Path) ->
     assert not any("mattes" in each for each in found.missing)
     if layout.retracked:
         check_retracked(folder, name, scene)
-
-
-def check_retracked(folder: Path, name: str, scene: Scene) -> None:
-    """Check what is tracked again: the tracker's camera, pictures and mattes."""
-    sequence, layout = checks.read_pictures(folder), layouts.TRACKED[name]
-    checks.check_view(checks.filmed_camera(sequence), layouts.MIRROR, np.zeros(3))
-    for timestep in range(len(scene)):
-        view = layout.view(timestep, 0)
-        checks.check_intrinsics(checks.filmed_camera(sequence), view[0])
-        checks.check_pictures(sequence, timestep, draw(scene, layout.vertices(scene, timestep), *view, layout.size))
 
 
 @pytest.mark.unchecked
@@ -114,24 +111,17 @@ def test_the_imported_mesh_is_drawn_over_some_pictures(name: str, scene: Scene, 
 # Mattes, sizes and splits of what metrical-tracker leaves -------------------------------------------------------------
 
 
-@pytest.fixture
-def matted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
-    """Replace the network of mattes by the drawn ones. Return the list of the pictures that it was asked about."""
-    asked: list[np.ndarray] = []
+@pytest.mark.unchecked
+def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path, monkeypatch) -> None:
+    matted: list[np.ndarray] = []
 
     def fill(images: np.ndarray, mattes: np.ndarray, plate: np.ndarray | None = None) -> None:
         assert not mattes.any()
-        asked.append(np.array(images))
+        matted.append(np.array(images))
         for timestep in range(len(images)):
             mattes[timestep, 0] = writers.seen_by_tracker(scene, timestep, writers.OFF_CENTRE)[1]
 
-    with monkeypatch.context() as patch:
-        patch.setattr(matting, "fill_mattes", fill)
-        yield asked
-
-
-@pytest.mark.unchecked
-def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path, matted: list[np.ndarray]) -> None:
+    monkeypatch.setattr(matting, "fill_mattes", fill)
     folder = layouts.write_tracker_output(tmp_path / "me", scene)
     found = checks.read(folder, "insta", scene.model)
     checks.check_import(found, layouts.TRACKED["insta"], scene)
@@ -146,37 +136,19 @@ def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path
     assert len(matted) == 2
 
 
+@pytest.mark.unchecked
 def test_a_picture_without_opacity_or_mask_is_a_damaged_copy(scene: Scene, tmp_path: Path) -> None:
     folder = layouts.write_gaussian_blendshapes(tmp_path / "me", scene)
-    pixels = cv2.imread(str(folder / "images/00004.png"))
-    assert pixels is not None
-    assert cv2.imwrite(str(folder / "images/00004.png"), pixels)
+    file = folder / "images/00004.png"
+    writers.write_picture(file, read_picture(file)[0])
     refused(folder, scene, r"00004.png: has no opacity and no matte; copy")
     folder = layouts.write_masked(tmp_path / "masked", scene)
     (folder / "image_mask/mask_00002.png").unlink()
     refused(folder, scene, r"00002.png: has no opacity and no matte; copy")
-
-
-@pytest.mark.unchecked
-def test_larger_pictures_beside_images_are_told_and_in_their_place_used(scene: Scene, tmp_path: Path) -> None:
-    folder = writers.write_insta(tmp_path / "me", scene)
-    layouts.write_larger(tmp_path / "other", scene)
-    (tmp_path / "other/images.HQ").rename(folder / "images.HQ")
-    assert "the larger pictures of images.HQ, which are not used beside images" in checks.surveyed(folder).missing
-    checks.check_import(checks.read(folder, "insta", scene.model), layouts.TRACKED["insta"], scene)
-    for file in sorted((folder / "images.HQ").iterdir()):
-        file.replace(folder / "images" / file.name)
-    for sequence in (*checks.read(folder, "insta", scene.model), checks.read_pictures(folder)):
-        checks.check_intrinsics(checks.filmed_camera(sequence), layouts.enlarged(writers.OFF_CENTRE, 2))
-
-
-@pytest.mark.unchecked
-def test_impossible_sizes_are_refused(scene: Scene, tmp_path: Path) -> None:
+    # Impossible sizes are refused.
     folder = layouts.write_larger(tmp_path / "me", scene)
     for file in sorted((folder / "images.HQ").iterdir()):
-        pixels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        assert pixels is not None
-        assert cv2.imwrite(str(file), pixels[:-1])
+        writers.write_picture(file, read_picture(file)[0][:-1], np.full((255, 256), 255, np.uint8))
     words = "have 256x255 pixels, which is no whole multiple of the 128x128 that were"
     refused(folder, scene, words)
     with pytest.raises(UserError, match=words):
@@ -190,6 +162,19 @@ def test_impossible_sizes_are_refused(scene: Scene, tmp_path: Path) -> None:
             frame = {**writers.tracker_frame(scene, number, writers.OFF_CENTRE), "img_size": np.array(size)}
             writers.write_frame(folder / f"checkpoint/{number:05d}.frame", frame)
         refused(folder, scene, words)
+
+
+@pytest.mark.unchecked
+def test_larger_pictures_beside_images_are_told_and_in_their_place_used(scene: Scene, tmp_path: Path) -> None:
+    folder = writers.write_insta(tmp_path / "me", scene)
+    layouts.write_larger(tmp_path / "other", scene)
+    (tmp_path / "other/images.HQ").rename(folder / "images.HQ")
+    assert "the larger pictures of images.HQ, which are not used beside images" in checks.surveyed(folder).missing
+    checks.check_import(checks.read(folder, "insta", scene.model), layouts.TRACKED["insta"], scene)
+    for file in sorted((folder / "images.HQ").iterdir()):
+        file.replace(folder / "images" / file.name)
+    for sequence in (*checks.read(folder, "insta", scene.model), checks.read_pictures(folder)):
+        checks.check_intrinsics(checks.filmed_camera(sequence), layouts.enlarged(writers.OFF_CENTRE, 2))
 
 
 @pytest.mark.unchecked

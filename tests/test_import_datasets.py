@@ -208,6 +208,7 @@ def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFix
     for line, message in (
         (("import", str(tmp_path / "gone"), *into), "no such file or folder; give one of gaussian-avatars ("),
         (("import", str(made / "W"), *into), "is no dataset that mien knows; give one of"),
+        (("import", str(made / "W"), *into, "--dataset", "gaussian-avatars"), "has no point_cloud.ply"),
         (("import", str(made / "F"), *into, "--dataset", "nobody"), "there is no such dataset; choose one of"),
         (("import", str(made / "F"), "--out", imported), "is there already; give the imported run"),
         (("import", str(made / "F"), *into, "--run", "a/b"), "cannot be the name"),
