@@ -72,8 +72,8 @@ def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path) -> N
         assert read_by_node(built, content, tmp_path) == "is damaged: it cannot be unpacked"
 
 
-def test_arrays_that_share_their_bytes_are_refused(built: Path, tmp_path: Path) -> None:
-    """A file of some kilobytes would become 4 GB."""
+def test_files_that_would_become_gigabytes_are_refused(built: Path, tmp_path: Path) -> None:
+    """Arrays that share their bytes, of a .packed and of a .mien file, and a file that unpacks to 3 GB."""
     header, arrays = parts()
     count = 1 << 20
     described = {"shape": [count], "bits": 8, "axis": "columns", "middle": [0], "step": [1], "at": len(arrays)}
@@ -92,12 +92,8 @@ def test_arrays_that_share_their_bytes_are_refused(built: Path, tmp_path: Path) 
     text = json.dumps(header).encode()
     content = struct.pack("<Q", len(text)) + text + data[8 + size :]
     assert read_by_node(built, content, tmp_path) == "is damaged: an array lies beyond its end"
-
-
-def test_a_file_that_unpacks_to_gigabytes_is_refused(built: Path, tmp_path: Path) -> None:
-    header, arrays = parts()
-    bomb = gzip.compress(bytes(1 << 28), 9)
-    content = packed(header, arrays) + bomb * 12  # members of one gzip file follow each other
+    # Members of one gzip file follow each other.
+    content = packed(*parts()) + 12 * gzip.compress(bytes(1 << 28), 9)
     assert len(content) < 4 << 20
     assert read_by_node(built, content, tmp_path) == "is larger than 128 MB"
 
