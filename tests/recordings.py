@@ -80,11 +80,34 @@ def audio2face(folder: Path, frames: Frames) -> Path:
     return write_json(folder / "audio.json", content)
 
 
+def table(key: str, step: float) -> Callable[[Path, Frames], Path]:
+    """Return what writes a csv with ARKit's names and one column of times."""
+
+    def write(folder: Path, frames: Frames) -> Path:
+        rows = [
+            [str(step * at), *(str(scores.get(name, 0)) for name in ARKIT_NAMES)] for at, scores in enumerate(frames)
+        ]
+        return write_csv(folder / f"{key}.csv", *rows, columns=[key, *ARKIT_NAMES])
+
+    return write
+
+
+def azure_speech(folder: Path, frames: Frames) -> Path:
+    """Write a piece for each frame. Left comes before right in all pairs of Azure's list."""
+    pairs = {"jawRight": "jawLeft", "mouthRight": "mouthLeft"}
+    swapped = pairs | {left: right for right, left in pairs.items()}
+    rows = [[*(scores.get(swapped.get(name, name), 0) for name in ARKIT_NAMES), 0, 0, 0] for scores in frames]
+    pieces = [{"FrameIndex": 2 * at, "BlendShapes": [row]} for at, row in enumerate(rows)]
+    return write_json(folder / "speech.json", pieces)
+
+
 LAYOUTS: dict[str, list[Callable[[Path, Frames], Path]]] = {
     "Live Link Face (.csv)": [live_link_face],
+    "table without a timecode (.csv)": [table("timestamp_ms", 33), table("time", 1 / 30)],
     "plain list (.json)": [plain],
     "MediaPipe's FaceLandmarker (.json)": [landmarker_in_javascript, landmarker_in_python],
     "BEAT, LAM (.json)": [named_weights],
     "Audio2Face (.json)": [audio2face],
+    "Azure speech (.json)": [azure_speech],
 }
 """What writes the layouts of each source of the table of sides."""

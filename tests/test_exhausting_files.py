@@ -225,9 +225,9 @@ def test_huge_numbers_lines_and_gaps_of_recordings(tmp_path: Path, monkeypatch: 
     for read in (read_live_link_face, read_blendshape_json):
         refused(read, sparse(csv, motion.MAX_FILE_BYTES + 1), "has more than 134,217,728 bytes")
     monkeypatch.setattr(motion, "MAX_MOMENTS", 5_000)
-    monkeypatch.setattr("mien.driving.live_link_face.MAX_CELLS_BYTES", 1 << 20)
+    monkeypatch.setattr("mien.tables.MAX_CELLS_BYTES", 1 << 20)
     csv.write_text("Timecode,EyeBlinkLeft\n" + "12,12,12,12,12,12,12,12,12\n" * 5000)
-    refused(read_live_link_face, csv, "it has too many values; cut it into shorter recordings")
+    refused(read_live_link_face, csv, "it has too many values; cut it into shorter tables")
     for rows, words in CSV:
         refused(read_live_link_face, write_csv(csv, *rows), words)
     for content, words in JSON:

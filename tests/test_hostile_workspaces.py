@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,10 @@ from mien.face.loading import read_landmarks
 from mien.inside import check_tree, inside, is_plain_name, open_new, remove_tree
 from mien.storage import file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.tracking import TrackingSettings, pipeline, read_scoring, read_tracking, track_subject
-from mien.training import read_run_config, read_sequence
+from mien.training import read_run_config, read_sequence, trainer
 from mien.workspace import Workspace, check_new_workspace, open_workspace
 from shared_things import MadeOnce, evaluated_workspace
-from toy_scene import toy_face_model
+from toy_scene import toy_face_model, toy_sequence
 
 COMMANDS = (
     "render W --out OUT/a.png --size 32", "view W", "export W --out OUT/a.ply",
@@ -325,3 +326,10 @@ def test_what_counts_only_at_the_beginning_takes_no_memory(tmp_path: Path) -> No
         assert found.config.points == 1_000_000  # pyright: ignore[reportAttributeAccessIssue]
         posed = [avatar.pose(avatar.subject).gaussians.means for avatar in (found, expected)]
         assert torch.equal(*posed)
+
+
+def test_a_tracking_with_the_hash_of_another_model_names_its_folder(tmp_path: Path) -> None:
+    model, sequence = toy_sequence(timesteps=2, size=32)
+    foreign = replace(sequence, folder=tmp_path, tracking=replace(sequence.tracking, face_model_hash="f" * 16))
+    with pytest.raises(UserError, match=f"^{tmp_path}: was tracked with another version of face model"):
+        trainer.check_trackings([foreign], model)

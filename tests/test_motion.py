@@ -108,7 +108,7 @@ def test_bad_csv_files(tmp_path: Path) -> None:
         ([good, row("0:00:00:02.0", JawOpen="nan")], COLUMNS, "line 3: JawOpen is nan"),
         ([row("0:00:00:02.0", JawOpen="")], COLUMNS, "line 2: JawOpen is ''"),
         ([row("0:00:00:02.0", JawOpen=45)], COLUMNS, "line 2: JawOpen is 45; coefficients go from 0 to 1"),
-        ([row("0:00:00:02.0", HeadYaw=20)], COLUMNS, "convert it if it is in degrees"),
+        ([row("0:00:00:02.0", HeadYaw=20)], COLUMNS, "no camera sees a face beyond 1.7; divide degrees by 57.3"),
         (rows_of("1:0:0:5", "1:0:0:9", "1:0:0:6"), COLUMNS, "line 4: its Timecode does not come after"),
         (rows_of("1:0:0:5", "1:0:0:5", "1:0:0:5"), COLUMNS, "line 3: its Timecode does not come after"),
         ([row("soon")], COLUMNS, "line 2: Timecode 'soon'"),
@@ -120,7 +120,7 @@ def test_bad_csv_files(tmp_path: Path) -> None:
             read_live_link_face(write_csv(tmp_path / "a.csv", *rows, columns=columns))
     with pytest.raises(UserError, match="--fps 24: its frame numbers go up to 29; give more"):
         read_rows(tmp_path, *rows_of("1:0:0:28", "1:0:0:29", "1:0:1:0"), fps=24.0)
-    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x81" * 9)
+    (tmp_path / "b.csv").write_bytes(b"\x81\xff" * 9)
     with pytest.raises(UserError, match="cannot be read as csv"):
         read_live_link_face(tmp_path / "b.csv")
 

@@ -236,7 +236,7 @@ def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     expect_refused(
         path, read_spz, (b"ply", cannot), (content[:100], cannot), (gzip.compress(plain[:-9]), cannot),
         (gzip.compress(plain[:8] + many + plain[12:]), "at most 2,000,000 are read"),
-        (gzip.compress(plain[:4] + b"\x09" + plain[5:]), "another version"),
+        (gzip.compress(plain[:4] + b"\x09" + plain[5:]), "of version 9"),
     )  # fmt: skip
     write_spz(path, some(50, 4))
     content = path.read_bytes()
@@ -245,7 +245,7 @@ def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     long = content[:32] + struct.pack("<Q", len(bomb)) + content[40:128] + bomb + content[128 + first :]
     expect_refused(
         path, read_spz, (content[:20], cannot), (content[:-1], "truncated, or a column has another size"),
-        (content[:4] + b"\x05" + content[5:], "of another version"),
+        (content[:4] + b"\x05" + content[5:], "of version 5"),
         (content[:15] + b"\x05" + content[16:], "its table is damaged"),
         (content[:130] + b"\xff" * 8 + content[138:], cannot),
         (content[:8] + many + content[12:], "at most 2,000,000 are read"), (long, "a column has another size"),

@@ -194,3 +194,12 @@ def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
     watch("done", 1.0)
     assert drawn[-1] == 39, "what came last is not shown at the end"
     assert [last for _, last in written] == [False] * 4 + [True]
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])
+def test_a_piece_that_is_not_finite_is_made_again(tmp_path, capsys, value):
+    cache = StageCache(tmp_path / "kept")
+    cache.write("odd", {"whole": torch.ones(3, dtype=torch.int64), "odd": torch.tensor([1.0, value])})
+    assert cache.get_or_compute("odd", lambda: {"odd": torch.ones(2)})["odd"].tolist() == [1, 1]
+    assert "odd.safetensors: is damaged, so this part of tracking runs again" in capsys.readouterr().err
+    assert cache.read("odd") is not None

@@ -165,7 +165,7 @@ def open_handle(path: Path | str, flags: int, *, follow_link: bool) -> int:
         OSError: it is missing or cannot be opened.
     """
     try:
-        handle = os.open(path, flags | NO_WAIT | BINARY | (0 if follow_link else NO_LINK), 0o644)
+        handle = os.open(path, flags | NO_WAIT | BINARY | (0 if follow_link else NO_LINK), 0o666)
     except OSError as error:
         if error.errno in _NOT_ORDINARY or (error.errno == errno.ELOOP and not follow_link):
             raise NotOrdinaryError("it is not an ordinary file") from None

@@ -8,6 +8,7 @@ import errno
 import hashlib
 import json
 import os
+import secrets
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ import safetensors.numpy
 
 from mien.bounded import open_ordinary, parse_json, read_bytes
 from mien.errors import CannotWriteError, UserError
-from mien.inside import remove_tree
+from mien.inside import open_new, remove_tree
 
 _KEPT_OF_NAME = 100
 """Number of characters of a file's name that its temporary name keeps. File systems allow 255 bytes in all."""
@@ -87,14 +88,10 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.name[:_KEPT_OF_NAME]}.", suffix=path.suffix[-20:]
-        )
-        os.close(handle)
-        temporary = Path(name)
+        temporary = path.parent / f".{path.name[:_KEPT_OF_NAME]}.{secrets.token_hex(4)}{path.suffix[-20:]}"
+        open_new(temporary).close()
         try:
             write(temporary)
-            temporary.chmod(0o644)
             temporary.replace(path)
         except BaseException:
             temporary.unlink(missing_ok=True)

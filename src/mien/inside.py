@@ -18,6 +18,7 @@ from mien.errors import UserError
 from mien.system import BINARY, NO_LINK
 
 _MAX_NAME_BYTES = 255
+_OF_SYSTEMS = frozenset({"thumbs.db", "desktop.ini", "__macosx"})
 _NOT_IN_NAMES = frozenset({"Cc", "Cs", "Zl", "Zp"})
 """Unicode categories: control characters, halves of surrogate pairs, line and paragraph separators."""
 
@@ -48,6 +49,17 @@ def inside(folder: Path, name: object) -> Path:
     return folder / str(name)
 
 
+def check_unlinked(*paths: Path) -> None:
+    """Check that no path is a link. Paths may be missing.
+
+    Raises:
+        UserError: one is.
+    """
+    for path in paths:
+        if path.is_symlink():
+            raise UserError(_refusal(path, True))
+
+
 def check_tree(folder: Path) -> None:
     """Check that only files and folders are below a folder. The folder itself may be a link, or missing.
 
@@ -70,6 +82,17 @@ def check_subtrees(folder: Path, *names: str) -> None:
         if path.is_symlink() or (path.exists() and not path.is_dir()):
             raise UserError(_refusal(path, path.is_symlink()))
         check_tree(path)
+
+
+def listed(folder: Path, pattern: str = "*") -> list[Path]:
+    """What matches a pattern in a folder that a user gives, in the order of names, without what systems leave there.
+
+    Names that begin with a dot are left out (macOS has `._clip.mp4` beside `clip.mp4`), and those of `_OF_SYSTEMS`.
+    """
+    found = ((path, path.relative_to(folder).parts) for path in folder.glob(pattern))
+    return sorted(
+        path for path, names in found if not any(n.startswith(".") or n.lower() in _OF_SYSTEMS for n in names)
+    )
 
 
 def open_to_read(path: Path) -> IO[bytes]:
@@ -105,11 +128,13 @@ def open_to_append(path: Path) -> IO[str]:
 def open_new(path: Path) -> IO[bytes]:
     """Create a new, empty file in place of an existing file or link. The target of a link stays as it is.
 
+    The process's umask decides who may read and write it.
+
     Raises:
         OSError: it cannot be written.
     """
     path.unlink(missing_ok=True)
-    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK | BINARY, 0o644), "w+b")
+    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK | BINARY, 0o666), "w+b")
 
 
 def remove_tree(path: Path) -> None:

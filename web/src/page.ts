@@ -6,7 +6,7 @@ import { AvatarError, readPacked } from "./format";
 import { addLife, type Alive } from "./page_life";
 import { addSliders, find } from "./page_sliders";
 import { contextOf } from "./renderer";
-import { readSeries } from "./series";
+import { readSeries, textOf } from "./series";
 import { Viewer } from "./viewer";
 import type { BackendName } from "./webgpu";
 
@@ -58,7 +58,7 @@ function addMotion(viewer: Viewer, moveSliders: () => void, stop: () => void): v
     say("");
     try {
       const notes: string[] = [];
-      viewer.setMotion(readSeries(await given.text(), viewer.avatar, notes));
+      viewer.setMotion(readSeries(textOf(await given.arrayBuffer()), viewer.avatar, notes));
       say(notes.map((note) => `${given.name} ${note}.`).join(" "));
       take();
       toggle();

@@ -26,6 +26,13 @@ export interface Series {
 
 const MAX_GAP = 60, MAX_MOMENTS = 500_000;
 
+/** The text of a file: UTF-16 if it begins with that mark, else UTF-8. */
+export function textOf(content: ArrayBuffer): string {
+  const [first, second] = new Uint8Array(content, 0, Math.min(2, content.byteLength));
+  const kind = first === 0xff && second === 0xfe ? "utf-16le" : first === 0xfe && second === 0xff ? "utf-16be" : "utf-8";
+  return new TextDecoder(kind).decode(content);
+}
+
 /**
  * The motion in a recording, for an avatar. Its errors complete the sentence "NAME ...".
  * @param notes Takes what was assumed or left out: texts that complete this sentence, too.

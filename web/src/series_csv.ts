@@ -1,10 +1,14 @@
-// The csv of Live Link Face, also as spreadsheets save it. It follows src/mien/driving/live_link_face.py and sides.py.
+// Csv of ARKit's blend shapes: of Live Link Face, also as spreadsheets save it, and of other programs. It follows src/mien/driving/live_link_face.py and sides.py.
 
 import { AvatarError } from "./format";
 import { axisAngle, multiplied, rotationMatrix } from "./rigid";
 import type { Row, Series } from "./series";
 
 const DAY = 86_400, RATES = [24, 25, 30, 48, 50, 60, 90, 120, 240];
+/** Columns of times in the file's own clock, and their units in a second. Frame numbers are taken for 30 a second. */
+const UNITS: Record<string, number> = { timestamp_ms: 1000, timestampms: 1000, time: 1, frame: 30 };
+/** Largest yaw and pitch that a camera sees, in radians. */
+const MAX_TURN = 1.7;
 /** Slides have the observer's sides in this file. The table is in docs/conventions.md. */
 const PERFORMERS: Record<string, string> = { jawleft: "jawright", jawright: "jawleft", mouthleft: "mouthright", mouthright: "mouthleft" };
 
@@ -12,22 +16,25 @@ export function readCsv(text: string, notes: string[]): Series {
   const lines = text.replace(/^\ufeff/, "").split(/\r?\n/).map((line, index) => ({ line, number: index + 1 })).filter(({ line }) => line.trim());
   if (/^"?sep=/i.test(lines[0]?.line ?? "")) lines.shift(); // Excel's own hint, before the header.
   const split = splitter(lines[0]?.line ?? "");
-  const header = split(lines[0]?.line ?? "").map((name) => name.trim().toLowerCase());
-  if (!header.includes("timecode") || lines.length < 2) throw new AvatarError("is no csv of Live Link Face");
+  const header = split(lines[0]?.line ?? "").map((name) => name.trim().toLowerCase().replace(/_l$/, "left").replace(/_r$/, "right"));
+  const clock = header.includes("timecode") ? undefined : Object.keys(UNITS).find((name) => header.includes(name));
+  if ((!header.includes("timecode") && !clock) || lines.length < 2) throw new AvatarError("is no csv of Live Link Face");
+  if (clock === "frame") notes.push("has frame numbers and no times, so 30 rows a second are assumed");
   if (!header.includes("tongueout")) notes.push("has no column TongueOut, so the tongue stays in");
   const rows: (Row | null)[] = [], whole: number[] = [], frames: number[] = [];
   let days = 0, last = 0, most = 0;
   for (const { line, number } of lines.slice(1)) {
-    const cells = split(line), [seconds, frame] = timecode(cells[header.indexOf("timecode")] ?? "", number);
-    if (whole.length && seconds - last < -DAY / 2) days += DAY; // Past midnight.
+    const cells = split(line), [seconds, frame] = clock ? [time(cells[header.indexOf(clock)] ?? "", number) / UNITS[clock], 0] : timecode(cells[header.indexOf("timecode")] ?? "", number);
+    if (!clock && whole.length && seconds - last < -DAY / 2) days += DAY; // Past midnight.
     last = seconds;
     whole.push(days + seconds);
     frames.push(frame);
     most = Math.max(most, frame);
     // A lost face has a count of 0.
-    rows.push(cells[header.indexOf("blendshapecount")]?.trim() === "0" ? null : rowOf(header, cells, number));
+    rows.push(cells[header.indexOf("blendshapecount")]?.trim() === "0" ? null : rowOf(header, cells, number, clock ? {} : PERFORMERS));
   }
   if (!rows.some((row) => row)) throw new AvatarError("has no row with a face");
+  if (clock) return { rows, seconds: whole, slack: 0 };
   const rate = whole.some((seconds) => seconds !== whole[0]) ? RATES.find((usual) => usual > most) ?? 1000 : 60;
   return { rows, seconds: whole.map((seconds, i) => seconds + frames[i] / rate), slack: 1 / rate };
 }
@@ -42,15 +49,22 @@ function splitter(header: string): (line: string) => string[] {
 /** The text of a number, with a decimal comma as a point. */
 const withPoint = (text: string) => (text.includes(".") ? text : text.replace(",", "."));
 
-function rowOf(header: string[], cells: string[], line: number): Row {
+function rowOf(header: string[], cells: string[], line: number, sides: Record<string, string>): Row {
   const scores = new Map<string, number>();
   header.forEach((name, column) => {
-    if (name === "timecode" || name === "blendshapecount") return;
+    if (name === "timecode" || name === "blendshapecount" || name in UNITS) return;
     const text = withPoint(cells[column]?.trim() ?? ""), value = Number(text);
     if (!text || !Number.isFinite(value) || Math.abs(value) > Math.PI) throw new AvatarError(`has ${cells[column] || "nothing"} for ${name} in line ${line}`);
-    scores.set(PERFORMERS[name] ?? name, value);
+    if (/^(head|lefteye|righteye)(yaw|pitch)$/.test(name) && Math.abs(value) > MAX_TURN) throw new AvatarError(`has ${text} for ${name} in line ${line}; angles are in radians, so divide degrees by 57.3`);
+    scores.set(sides[name] ?? name, value);
   });
   return { scores, head: turned(scores.get("headyaw") ?? 0, scores.get("headpitch") ?? 0, scores.get("headroll") ?? 0) };
+}
+
+function time(cell: string, line: number): number {
+  const text = withPoint(cell.trim());
+  if (!text || !Number.isFinite(Number(text))) throw new AvatarError(`has the time "${cell}" in line ${line}`);
+  return Number(text);
 }
 
 function timecode(cell: string, line: number): [number, number] {

@@ -13,6 +13,15 @@ interface Frame {
   units: number;
 }
 
+/** ARKit's names in the order of Azure's speech service. The rolls of head and eyes after them are not read. */
+const AZURE = (
+  "eyeBlinkLeft eyeLookDownLeft eyeLookInLeft eyeLookOutLeft eyeLookUpLeft eyeSquintLeft eyeWideLeft eyeBlinkRight eyeLookDownRight " +
+  "eyeLookInRight eyeLookOutRight eyeLookUpRight eyeSquintRight eyeWideRight jawForward jawLeft jawRight jawOpen mouthClose " +
+  "mouthFunnel mouthPucker mouthLeft mouthRight mouthSmileLeft mouthSmileRight mouthFrownLeft mouthFrownRight mouthDimpleLeft " +
+  "mouthDimpleRight mouthStretchLeft mouthStretchRight mouthRollLower mouthRollUpper mouthShrugLower mouthShrugUpper mouthPressLeft " +
+  "mouthPressRight mouthLowerDownLeft mouthLowerDownRight mouthUpperUpLeft mouthUpperUpRight browDownLeft browDownRight browInnerUp " +
+  "browOuterUpLeft browOuterUpRight cheekPuff cheekSquintLeft cheekSquintRight noseSneerLeft noseSneerRight tongueOut"
+).split(" ");
 const SHORTEST = 1 / 500, LONGEST = 3;
 
 export function readJson(text: string, notes: string[]): Series {
@@ -41,7 +50,10 @@ function framesOf(content: any): [Frame[], number | undefined] {
   }
   if (content?.names && Array.isArray(content.frames))
     return [content.frames.map((frame: Json) => ({ scores: named(content.names, frame?.weights), ...timeOf(frame) })), rateOf(content.metadata?.fps)];
-  return [((Array.isArray(content) ? content : [content]) as Json[]).map(oneFrame), undefined];
+  const pieces = (Array.isArray(content) ? content : [content]) as Json[];
+  if (pieces.every((piece) => Array.isArray(piece?.BlendShapes) && Number.isInteger(piece.FrameIndex)))
+    return [pieces.flatMap(({ FrameIndex, BlendShapes }) => BlendShapes.map((row: unknown[], i: number): Frame => ({ scores: named(AZURE, row?.slice(0, AZURE.length)), time: (FrameIndex + i) / 60, units: 1 }))), undefined];
+  return [pieces.map(oneFrame), undefined];
 }
 
 function rateOf(fps: unknown): number | undefined {

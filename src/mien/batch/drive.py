@@ -103,7 +103,7 @@ class Driver:
         if isinstance(outcome, Returned):
             state = outcome.state
             for name, content in outcome.files.items():
-                write_atomically(self.batch.root / name, partial(_write, content))
+                write_atomically(self.batch.place(*name.split("/")), partial(_write, content))
         if isinstance(outcome, Exception):
             before = self.batch.read_state(row.name)
             state = State(row.name, "failed", row.fingerprint, error=" ".join(str(outcome).split())[:500])

@@ -6,7 +6,6 @@ file writes it. DIR/logs/NAME.log has what the row's commands printed, and DIR/r
 
 import hashlib
 import json
-import math
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,7 +16,7 @@ from typing import Any
 from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
 from mien.files import expect_whole, read_json, remove_leftovers, write_atomically, write_json
-from mien.inside import inside, is_plain_name
+from mien.inside import check_unlinked, inside, is_one_line, is_plain_name
 from mien.locks import BeingWrittenError, hold
 
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
@@ -25,6 +24,7 @@ WORKSPACE = "{workspace}"
 """Stands for the row's workspace in the words of its steps."""
 _STATUSES = ("running", "done", "failed")
 _MAX_PLAN_BYTES, _MAX_STATE_BYTES = 256 << 20, 1 << 20
+_MAX_NUMBER = 1e15
 _COMPARED = 50
 """Number of characters by which leftovers are told, before `mien.files` looks at them exactly."""
 _AGAIN = "run `mien batch TABLE --out DIR` again"
@@ -80,15 +80,27 @@ class Batch:
 
     def state_file(self, name: str) -> Path:
         """The file of a row's state. Its lock is the claim on the row."""
-        return inside(self.root, "states") / f"{name}.json"
+        return self.place("states", f"{name}.json")
 
     def log_file(self, name: str) -> Path:
         """The file that holds what the row's commands printed."""
-        return self.root / "logs" / f"{name}.log"
+        return self.place("logs", f"{name}.log")
 
     def workspace(self, name: str) -> Path:
         """The row's workspace."""
-        return self.root / "rows" / name
+        return self.place("rows", name)
+
+    def place(self, *names: str) -> Path:
+        """The path of a folder of the batch, or of something in it. Somebody else may have filled it.
+
+        Raises:
+            UserError: the name leads out of the folder, or the folder or what is there is a link.
+        """
+        path = self.root
+        for name in names:
+            path = inside(path, name)
+            check_unlinked(path)
+        return path
 
     def read_plan(self) -> list[Row]:
         """The rows.
@@ -139,7 +151,10 @@ class Batch:
             if entry.name.endswith(".json") and not entry.name.startswith("."):
                 name = entry.name.removesuffix(".json")
                 try:
-                    content = json.loads(read_bytes(entry.path, _MAX_STATE_BYTES))  # a Path takes as long to make
+                    # a Path takes as long to make
+                    if entry.is_symlink():
+                        raise ValueError("a link")
+                    content = parse_json(read_bytes(entry.path, _MAX_STATE_BYTES).decode())
                     if not isinstance(content, dict) or (content["format"], content["version"]) != STATE:
                         raise ValueError("format or version")
                     content.pop("checksum", None)
@@ -176,9 +191,10 @@ def row_from(content: dict[str, Any]) -> Row:
         ValueError: it has no plain name, or a step is no command of words.
     """
     row = Row(**{**content, "steps": tuple(map(tuple, content["steps"])), "labels": dict(content["labels"])})
-    words = [word for step in row.steps for word in step]
+    words = [*(word for step in row.steps for word in step), *row.labels.values(), row.fingerprint]
     if not is_plain_name(row.name) or not all(isinstance(word, str) for word in words):
-        raise ValueError("name or steps")
+        raise ValueError("name, steps or labels")
+    _check_numbers(row.memory_mb)
     return row
 
 
@@ -193,11 +209,21 @@ def _state_from(content: dict[str, Any]) -> State:
     for name in ("format", "version"):
         content.pop(name, None)
     state = State(**{**content, "runs": tuple(content["runs"])})
-    if state.status not in _STATUSES or not (state.name + state.error + state.host).isprintable():
+    told = (state.name, state.error, state.host, state.fingerprint, state.mien, *state.stages)
+    if state.status not in _STATUSES or not all(map(is_one_line, told)):
         raise ValueError("status, name, error or host")
-    if not all(isinstance(run, dict) for run in state.runs):
-        raise ValueError("runs")
-    for number in (state.tries, state.began, state.seconds, state.peak_mb, *state.stages.values()):
-        if not (isinstance(number, int | float) and math.isfinite(number)):
-            raise ValueError("tries, times or memory")
+    for run in state.runs:
+        if not all(value is None or isinstance(value, str | int | float) for value in run.values()):
+            raise ValueError("runs")
+        _check_numbers(*(value for value in run.values() if isinstance(value, int | float)))
+        if not is_plain_name(run["run"]) or not isinstance(run["method"], str):
+            raise ValueError("runs")
+    _check_numbers(state.tries, state.began, state.seconds, state.peak_mb, *state.stages.values())
     return state
+
+
+def _check_numbers(*numbers: Any) -> None:
+    """Check that all are numbers, and of such a size that sums of them are numbers, too."""
+    for number in numbers:
+        if not (isinstance(number, int | float) and abs(number) < _MAX_NUMBER):
+            raise ValueError("a number")

@@ -48,9 +48,9 @@ def write_results(batch: Batch) -> list[dict[str, Any]]:
     rows = result_rows(batch)
     columns = list(dict.fromkeys(itertools.chain.from_iterable(rows)))
     text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(map(_cell, columns))
+    writer.writerows([_cell(row.get(name, "")) for name in columns] for row in rows)
     content = {"format": "mien.batch-results", "version": 1, "rows": rows, "comparison": paired(rows)}
     for name, whole in (("results.csv", text.getvalue()), ("results.json", json.dumps(content, indent=1))):
         write_atomically(batch.root / name, lambda aside, whole=whole: aside.write_text(whole, encoding="utf-8"))
@@ -59,7 +59,10 @@ def write_results(batch: Batch) -> list[dict[str, Any]]:
 
 def _cell(value: Any) -> Any:
     """A value of a csv. Texts that a spreadsheet would run as a formula begin with an apostrophe."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@") else value
+    return f"'{value}" if isinstance(value, str) and value[:1] in _FORMULAS else value
+
+
+_FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 
 
 def numbers(rows: Iterable[dict[str, Any]], column: str) -> list[float]:

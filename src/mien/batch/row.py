@@ -23,6 +23,7 @@ from typing import IO, Any
 import mien
 from mien.batch.plan import WORKSPACE, Batch, Row, State, row_from
 from mien.errors import CannotWriteError, UserError
+from mien.inside import open_to_append, open_to_read
 from mien.locks import BeingWrittenError, hold
 from mien.stops import orderly_stops
 from mien.system import end_this_process, peak_memory_mb
@@ -103,8 +104,8 @@ def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = dict(os.environ) | ({"MIEN_THREADS": str(threads)} if threads else {})
     started = time.time()
-    with log.open("ab") as out:
-        printed = out.tell()
+    with open_to_append(log) as out:
+        printed = os.fstat(out.fileno()).st_size
         process = subprocess.Popen(
             [*program, str(root)], stdin=subprocess.PIPE, stdout=out, stderr=out, env=environment, close_fds=True
         )
@@ -198,10 +199,10 @@ def last_error(log: Path, since: int = 0) -> str:
 def tail(log: Path, since: int = 0) -> str:
     """The end of a log, without its first `since` bytes."""
     try:
-        with log.open("rb") as file:
+        with open_to_read(log) as file:
             file.seek(max(since, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
             return file.read().decode("utf-8", "replace")
-    except OSError:
+    except (OSError, UserError):
         return ""
 
 

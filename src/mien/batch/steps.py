@@ -31,7 +31,7 @@ def _do(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...],
     workspace = batch.workspace(row.name)
     stages: defaultdict[str, float] = defaultdict(float)
     for step in row.steps:
-        words = [fetched(word.replace(WORKSPACE, str(workspace)), batch.root / "inputs") for word in step]
+        words = [fetched(word.replace(WORKSPACE, str(workspace)), batch.place("inputs")) for word in step]
         ended = threading.Event()
         sampler = threading.Thread(target=_sample, args=(step[0], stages, ended), daemon=True)
         sampler.start()
@@ -75,18 +75,19 @@ def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
         found |= {key: content["training"].get(key) for key in ("gaussians", "steps", "seconds")}
         found["training_seconds"] = found.pop("seconds")
     if (run_dir / "film.mp4").is_file():
-        thumbnail = batch.root / "thumbs" / f"{name}.{run_dir.name}.jpg"
+        thumbnail = batch.place("thumbs", f"{name}.{run_dir.name}.jpg")
         write_atomically(thumbnail, partial(write_strip, run_dir / "film.mp4"))
     return found
 
 
 def write_strip(film: Path, path: Path) -> None:
     """Write pictures of a film side by side."""
-    import av
     from PIL import Image
 
-    with av.open(str(film)) as container:
-        frames = [frame.to_image() for frame in container.decode(video=0)]
+    from mien.capture.video_file import open_video
+
+    with open_video(film) as (container, stream):
+        frames = [frame.to_image() for frame in container.decode(stream)]
     chosen = [frames[index * len(frames) // _VIEWS] for index in range(_VIEWS)]
     strip = Image.new("RGB", (_SIDE * _VIEWS, _SIDE))
     for index, frame in enumerate(chosen):

@@ -10,6 +10,7 @@ from mien.capture.color_correction import ColorCorrection, correction_of_entry
 from mien.capture.lens import Lens, lens_of_entry
 from mien.capture.store import is_file_name
 from mien.errors import UserError
+from mien.inside import listed
 from mien.render.camera_paths import camera_of_entry, read_camera_entries
 
 _MAX_ASPECT_ERROR = 0.01
@@ -87,8 +88,7 @@ def match_sources(sources: list[Path], cameras: list[CalibratedCamera], path: Pa
     """
     if len(sources) == 1 and sources[0].is_dir():
         folder = sources[0]
-        sources = sorted(entry for entry in folder.iterdir() if entry.is_dir() or entry.is_file())
-        sources = [entry for entry in sources if not entry.name.startswith(".") and entry != path]
+        sources = [entry for entry in listed(folder) if (entry.is_dir() or entry.is_file()) and entry != path]
         sources = [entry for entry in sources if entry.is_dir() or entry.suffix.lower() != ".json"]
     ids = {camera.camera_id for camera in cameras}
     by_id: dict[str, Path] = {}

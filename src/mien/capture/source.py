@@ -20,6 +20,7 @@ from mien.capture.picture import decode_picture
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.capture.video_file import VIDEO_SUFFIXES
 from mien.errors import UserError
+from mien.inside import listed
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
 
@@ -185,10 +186,11 @@ def list_images(folder: Path) -> list[Path]:
     Raises:
         UserError: there are no images.
     """
-    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    entries = listed(folder)
+    images = [path for path in entries if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     if not images:
-        videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
-        rig = len(videos) > 1 or any(path.is_dir() for path in folder.iterdir())
+        videos = [path for path in entries if path.suffix.lower() in VIDEO_SUFFIXES]
+        rig = len(videos) > 1 or any(path.is_dir() for path in entries)
         cameras = "; if it holds those of calibrated cameras, add --calibration FILE" if rig else ""
         remedy = f"give {videos[0]} itself" if videos else "give a video or a folder of .png or .jpg files"
         raise UserError(f"{folder}: holds no images; {remedy}{cameras}")

@@ -20,8 +20,9 @@ class Command:
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder of the avatar. For a camera, also a .mien file."""
     by: str
-    """The driver: a workspace (also the avatar's own), a video file (tracked first, and kept in the cache), a .csv of
-    Live Link Face, a .json of blend shapes, a voice (.wav, .mp3, ...), or camera, which opens a viewer (docs/using.md).
+    """The driver: a workspace (also the avatar's own), a video, a picture or a folder of pictures (tracked first, and
+    kept in the cache), a .csv of Live Link Face or of ARKit's names, a .json of blend shapes, a voice (.wav, .mp3,
+    ...), or camera, which opens a viewer (docs/using.md).
     camera:/dev/video0 names the device; camera:clip.mp4 plays a file as a camera."""
     out: Path | None = None
     """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left. Without
@@ -39,7 +40,7 @@ class Command:
     """Show only the avatar, without the driver's pictures beside it."""
     fps: float | None = None
     """Frame rate of the timecode in a .csv, in frames per second (default: the smallest usual rate above its frame
-    numbers)."""
+    numbers). Where its frame field never changes, or there is no timecode: rows per second."""
     neutral: str | None = None
     """The driver's face at rest, from which its motion is measured: first (its first half second), calm (its calmest
     tenth), model (the face model's own neutral), or a video, recording, workspace or sequence folder of the driver at

@@ -27,6 +27,10 @@ else:
 
 NEUTRALS = ("first", "calm", "model")
 """Words that --neutral takes. Anything else is a file."""
+_DRIVERS = (
+    "a workspace, a video, a picture, a folder of pictures, a .csv of Live Link Face or of ARKit's names, a .json of "
+    "blend shapes, or a sound file"
+)
 _MAX_PORT = 65535
 _IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
 """Options that depend on the method. `with_settings` fills them in."""
@@ -304,16 +308,31 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
     """
     suffix = by.suffix.lower() if by.is_file() else ""
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
-        raise UserError(f"--fps {fps:g}: is for the timecode of a .csv; give a number above 0, at most 1000")
+        raise UserError(f"--fps {fps:g}: is for the times of a .csv; give a number above 0, at most 1000")
     if not by.exists():
-        raise UserError(
-            f"{by}: no such file or folder; give a workspace, a video, a csv of Live Link Face, a json, or a sound file"
-        )
+        raise UserError(f"{by}: no such file or folder; give {_DRIVERS}")
     if suffix in (".csv", ".json", *SOUND_ENDINGS) and sequence is not None:
         raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
     if not by.is_file():
-        open_workspace(by).pick_sequence(sequence)
+        if not holds_pictures(by):
+            open_workspace(by).pick_sequence(sequence)
     elif suffix not in (".csv", ".json", *SOUND_ENDINGS):
-        from mien.commands.stages.names import check_videos
+        from mien.capture.video_file import open_video
 
-        check_videos([by])
+        try:
+            with open_video(by):
+                pass
+        except UserError as error:
+            raise UserError(f"{error}; what drives an avatar is {_DRIVERS}") from None
+
+
+def holds_pictures(folder: Path) -> bool:
+    """Whether a folder is one of pictures, and no workspace."""
+    from mien.capture.source import list_images
+
+    if not folder.is_dir() or (folder / "sequences").exists() or (folder / "runs").exists():
+        return False
+    try:
+        return bool(list_images(folder))
+    except UserError:
+        return False

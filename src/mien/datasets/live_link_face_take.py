@@ -9,6 +9,7 @@ from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, sni
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
 from mien.datasets.nersemble import frames_in
 from mien.errors import UserError
+from mien.inside import listed
 
 if TYPE_CHECKING:
     from mien.face import FaceModel
@@ -20,13 +21,13 @@ DRIVER = "driving.csv"
 
 
 def _video(path: Path) -> Path | None:
-    found = sorted(each for each in path.glob("*") if each.suffix.lower() in (".mov", ".mp4"))
+    found = [each for each in listed(path) if each.suffix.lower() in (".mov", ".mp4")]
     return found[0] if len(found) == 1 else None
 
 
 def _table(path: Path) -> Path | None:
     """The csv of coefficients: the calibrated one, or the only one."""
-    tables = [each for each in sorted(path.glob("*.csv")) if b"blendshapecount" in sniff(each)[:4096].lower()]
+    tables = [each for each in listed(path, "*.csv") if b"blendshapecount" in sniff(each)[:4096].lower()]
     for ending in ("_cal.csv", ""):
         chosen = [each for each in tables if each.name.lower().endswith(ending)]
         chosen = chosen if ending else [each for each in chosen if not each.stem.lower().endswith(("_raw", "_neutral"))]

@@ -9,9 +9,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, rotation_part, sniff
+from mien.datasets.content import (
+    REMEDY,
+    check_file_inside,
+    frames_of,
+    inner,
+    numbers,
+    read_object,
+    rotation_part,
+    sniff,
+)
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
+from mien.inside import listed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,7 +92,7 @@ def _survey(path: Path) -> Findings:
 
 
 def _plates(path: Path) -> list[Path]:
-    return sorted(path.glob("bg/*.png"))
+    return listed(path, "bg/*.png")
 
 
 def camera_from_nerface(intrinsics: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
@@ -118,8 +128,8 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.datasets.sequences import filmed_sequence
     from mien.training import OwnSplit
 
-    for name, listed in _clips(path).items():
-        file, frames = _file(path, name), _in_time(path, listed) if name == "train" else listed
+    for name, given in _clips(path).items():
+        file, frames = _file(path, name), _in_time(path, given) if name == "train" else given
         places = [inner(file, path, frame.get("file_path"), _ENDINGS) for frame in frames]
         first = read_picture(places[0])[0]
         size = first.shape[1], first.shape[0]
@@ -131,7 +141,9 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
             return read_picture(places[timestep], size)[0], np.zeros((size[1], size[0]), np.uint8)
 
         images, mattes = collect(len(places), 1, size, read, f"read {name}")
-        plates = _plates(path)
+        plates = _plates(path)[:1]
+        for plate in plates:
+            check_file_inside(path, plate)
         fill_mattes(images, mattes, read_picture(plates[0], size)[0] if plates else None)
         poses = np.stack([rotation_part(file, "transform_matrix", numbers(file, frame, "transform_matrix", (4, 4)))
                           for frame in frames])  # fmt: skip

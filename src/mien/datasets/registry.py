@@ -16,6 +16,7 @@ from mien.datasets.nersemble import NERSEMBLE
 from mien.datasets.nersemble_benchmark import NERSEMBLE_BENCHMARK
 from mien.datasets.vhap import VHAP
 from mien.errors import UserError
+from mien.inside import listed
 from mien.plugins import plugin, warn, with_plugins
 
 _OWN = (
@@ -73,7 +74,7 @@ def recognised(path: Path) -> tuple[Dataset, str]:
 def _people(path: Path) -> list[str]:
     """The names of folders inside a folder that are each a dataset of one person."""
     try:
-        inside = sorted(each for each in path.iterdir() if each.is_dir() and not each.name.startswith("."))
+        inside = [each for each in listed(path) if each.is_dir()]
     except OSError:
         return []
     return [each.name for each in inside[:_MAX_FOLDERS] if any(_told(one, each) is not None for one in datasets())]

@@ -18,25 +18,23 @@ from mien.driving.motion import (
     MAX_COEFFICIENT,
     MIN_COEFFICIENT,
     Motion,
-    check_times,
+    Times,
+    evenly_timed,
     gaze_of,
     open_recording,
-    repeat_lost,
-    resample_evenly,
-    without_repeats,
+    out_of_range,
 )
 from mien.driving.sides import as_performer
 from mien.errors import UserError
 from mien.limits import has_last_row
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
+from mien.tables import text_of
 
 _NO_EXPRESSION = "_neutral"
 _DEFAULT_FPS = 30.0
 _CENTIMETER = 0.01
 _MAX_TIME = 1e15
 """Largest time in a file. In milliseconds it is thirty thousand years, so the zero of any clock is accepted."""
-_SHORTEST, _LONGEST = 1 / 500, 3.0
-"""Bounds of the median time between two frames, in seconds. Beyond them, the times have another unit."""
 
 
 def read_blendshape_json(path: Path) -> Motion:
@@ -48,7 +46,7 @@ def read_blendshape_json(path: Path) -> Motion:
     """
     try:
         with open_recording(path) as file:
-            content = parse_json(file.read().decode("utf-8"), any_size=True, constants=True)
+            content = parse_json(text_of(file.read()), any_size=True, constants=True)
     except (OSError, ValueError, MemoryError) as error:
         raise UserError(f"{path}: cannot be read as json ({error}); give frames of blend shapes") from None
     read = recorded(content, path)
@@ -61,18 +59,11 @@ def read_blendshape_json(path: Path) -> Motion:
     if not found.any():
         raise UserError(f"{path}: no frame has a face; record it again")
     seconds, assumed = _seconds(read, path)
-
-    def where(index: int) -> str:
-        return f"{path}, frame {index}"
-
-    kept, repeats = without_repeats(seconds, where, read.time_key, "")
-    _check_unit(seconds[kept], read, path)
-    check_times(seconds[kept], lambda index: where(int(kept[index])))
-    fps, rows = resample_evenly(seconds[kept], repeat_lost(rows, found)[kept])
+    times = Times(read.time_key, lambda index: f"{path}, frame {index}", read.units)
+    fps, rows, lost, said = evenly_timed(path, times, seconds, rows, found)
     coefficients = as_performer(rows[:, :52].astype(np.float32), read.sides)
     head = rows[:, 52:].astype(np.float32)
-    notes = (*read.notes, *turned, *assumed, *repeats)
-    lost = int((~found[kept]).sum())
+    notes = (*read.notes, *turned, *assumed, *said)
     return Motion(fps, coefficients, gaze_of(coefficients), head[:, :3], head[:, 3:], lost, notes)
 
 
@@ -88,7 +79,8 @@ def _row(scores: Scores, where: str) -> Float[np.ndarray, " 52"]:
             raise UserError(f"{where}: there is no blend shape {short(name)}{hint}")
         is_number = isinstance(score, (int, float)) and not isinstance(score, bool)
         if not is_number or not MIN_COEFFICIENT <= score <= MAX_COEFFICIENT:
-            raise UserError(f"{where}: {name} is {short(score)}; scores go from 0 to 1")
+            remedy = out_of_range(score) if is_number else "give a number from 0 to 1"
+            raise UserError(f"{where}: {name} is {short(score)}; {remedy}")
         row[place] = score
     return row
 
@@ -128,17 +120,3 @@ def _seconds(read: Recorded, path: Path) -> tuple[Float[np.ndarray, " t"], tuple
         if isinstance(time, bool) or not isinstance(time, (int, float)) or not abs(time) < _MAX_TIME:
             raise UserError(f"{path}, frame {index}: {read.time_key} is {short(time)}; give every frame a number")
     return np.array(read.times, dtype=np.float64) / read.units, ()
-
-
-def _check_unit(seconds: Float[np.ndarray, " t"], read: Recorded, path: Path) -> None:
-    """Refuse times whose unit is another one than their name says."""
-    if len(seconds) < 2:
-        return
-    step = float(np.median(np.diff(seconds)))
-    told = f"{path}: {read.time_key} goes up by {read.units * step:.4g} a frame, so "
-    if step < _SHORTEST:
-        hint = 'give milliseconds, or call seconds "time"' if read.units > 1 else "give seconds"
-        raise UserError(f"{told}there would be {1 / step:,.0f} frames in a second; {hint}")
-    if step > _LONGEST:
-        hint = "give milliseconds" if read.units > 1 else 'give seconds, or call milliseconds "timestamp_ms"'
-        raise UserError(f"{told}a frame would last {step:,.0f} s; {hint}")

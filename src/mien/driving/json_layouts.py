@@ -10,6 +10,9 @@ numbers, column by column]}]}, and Python {"face_blendshapes": [[{"category_name
 BEAT and LAM write {"names": [..], "frames": [{"weights": [..], "time": seconds}]}.
 
 Audio2Face writes {"exportFps": 60, "facsNames": [..], "weightMat": [[..], ..]}.
+
+Azure's speech service sends pieces of a film with 60 frames a second, {"FrameIndex": 30, "BlendShapes": [[55 numbers],
+..]}: ARKit's 52 with left before right, then the rolls of the head and of both eyes, whose unit is not documented.
 """
 
 from collections.abc import Iterable
@@ -20,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from mien.driving.motion import ARKIT_NAMES, shorten
-from mien.driving.sides import AUDIO2FACE, FACE_LANDMARKER, NAMED_WEIGHTS, PLAIN, Sides
+from mien.driving.sides import AUDIO2FACE, AZURE_SPEECH, FACE_LANDMARKER, NAMED_WEIGHTS, PLAIN, Sides
 from mien.errors import UserError
 
 Scores = dict[str, Any]
@@ -31,6 +34,13 @@ _CATEGORY = ("categoryName", "category_name")
 _MAX_MATRIX_ENTRY = 1e6
 """Largest number in a transformation matrix (translations are in centimetres)."""
 _MIN_FPS, _MAX_FPS = 1.0, 500.0
+_AZURE_FPS, _AZURE_ROLLS = 60.0, 3
+_AZURE_NAMES = tuple(
+    {"jawRight": "jawLeft", "jawLeft": "jawRight", "mouthRight": "mouthLeft", "mouthLeft": "mouthRight"}.get(name, name)
+    for name in ARKIT_NAMES
+)
+_MAX_FRAMES = 10 * 60 * 60 * 60
+"""Most frames of Azure's pieces: ten hours."""
 _LEAST_KNOWN = 0.5
 """Least share of ARKit's names among the names of a file whose other names are left out."""
 
@@ -72,6 +82,8 @@ def recorded(content: Any, path: Path) -> Recorded:
         raise UserError(
             f'{path}: is not a list of frames; give [{{"timestamp_ms": .., "blendshapes": {{name: score}}}}, ...]'
         )
+    if all("BlendShapes" in frame and "FrameIndex" in frame for frame in frames):
+        return _azure_speech(frames, path)
     scores, matrices, landmarker = [], [], False
     for index, frame in enumerate(frames):
         where = f"{path}, frame {index}"
@@ -154,6 +166,28 @@ def _audio2face(content: dict[str, Any], path: Path) -> Recorded:
     scores = [_by_name(names, row, f"{path}, frame {index}") for index, row in enumerate(rows)]
     fps, nothing = _rate(content.get("exportFps"), "exportFps", path), [None] * len(rows)
     return Recorded(scores, list(nothing), nothing, _SECOND_KEYS[0], 1.0, fps, AUDIO2FACE, notes)
+
+
+def _azure_speech(pieces: list[dict[str, Any]], path: Path) -> Recorded:
+    scores: list[Scores | None] = []
+    times: list[Any] = []
+    rolls = False
+    for number, piece in enumerate(pieces):
+        first, rows = piece["FrameIndex"], piece["BlendShapes"]
+        if isinstance(first, bool) or not isinstance(first, int) or not 0 <= first <= _MAX_FRAMES:
+            raise UserError(f"{path}, piece {number}: FrameIndex is {short(first)}; give the number of its first frame")
+        if not isinstance(rows, list):
+            raise UserError(f'{path}, piece {number}: "BlendShapes" is not a list of frames; save it again')
+        for index, row in enumerate(rows, first):
+            if not isinstance(row, list) or len(row) not in (len(_AZURE_NAMES), len(_AZURE_NAMES) + _AZURE_ROLLS):
+                raise UserError(f"{path}, frame {index}: is not a list of 55 numbers; correct or delete it")
+            scores.append(dict(zip(_AZURE_NAMES, row, strict=False)))
+            times.append(index / _AZURE_FPS)
+            rolls |= any(row[len(_AZURE_NAMES) :])
+    if not scores:
+        raise UserError(f'{path}: its "BlendShapes" have no frames; save the events of blend shapes')
+    notes = (f"{path}: the rolls of head and eyes are not read, so the head keeps still",) if rolls else ()
+    return Recorded(scores, [None] * len(scores), times, "FrameIndex", 1.0, None, AZURE_SPEECH, notes)
 
 
 def _rate(value: Any, key: str, path: Path) -> float | None:

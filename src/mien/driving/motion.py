@@ -32,6 +32,10 @@ MAX_MOMENTS = 500_000
 """Largest number of moments in a recording: about two hours at 60 per second."""
 MAX_FILE_BYTES = 128 << 20
 """Largest recording that is read, in bytes. An hour of Live Link Face has about this size."""
+_SLOWEST = 5.0
+"""Least number of moments a second of a recording of a face."""
+_SHORTEST, _LONGEST = 1 / 500, 3.0
+"""Bounds of the median time between two moments, in seconds. Beyond them, the times have another unit."""
 _MAX_SHOWN = 80
 """Largest number of characters of a value that a message shows."""
 MIN_COEFFICIENT, MAX_COEFFICIENT = -0.5, 1.5
@@ -89,6 +93,74 @@ def resample_evenly(
     return 1 / step, np.stack([np.interp(even, seconds, column) for column in rows.T], axis=1)
 
 
+@dataclass(frozen=True)
+class Times:
+    """What a file calls its times, and how messages name them."""
+
+    name: str
+    """Name of the times."""
+    where: Callable[[int], str]
+    """Returns the name of a row's place in the file."""
+    units: float | None = None
+    """Units of the times in a second. None for times that cannot have another unit, such as a timecode."""
+    slack: float = 0.0
+    """How far a time may go back to count as a repeat, in seconds."""
+    remedy: str = ""
+    """End of the message for times that go back."""
+    faster: str = "correct its times"
+    """What to do if there are too few rows a second."""
+
+
+def evenly_timed(
+    path: Path, times: Times, seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"], found: np.ndarray
+) -> tuple[float, Float[np.ndarray, "t c"], int, tuple[str, ...]]:
+    """Return frames per second, rows at evenly spaced times, the number of rows without a face, and lines for the user.
+
+    Rows that repeat a time are left out. Rows without a face repeat the row before.
+
+    Args:
+        path: The file.
+        times: What it calls its times.
+        seconds: The time of each row.
+        rows: The rows.
+        found: Whether each row has a face. At least one has.
+
+    Raises:
+        UserError: Times go back, have another unit, or leave a gap that is too long (`check_times`).
+    """
+    kept, notes = without_repeats(seconds, times)
+    if times.units is not None:
+        _check_unit(path, times.name, times.units, seconds[kept])
+    check_times(seconds[kept], lambda index: times.where(int(kept[index])))
+    fps, even = resample_evenly(seconds[kept], repeat_lost(rows, found)[kept])
+    if len(kept) > 1 and fps < _SLOWEST:
+        line = (
+            f"{path}: has {fps:.2g} rows a second, and recordings of faces have at least {_SLOWEST:g}; {times.faster}"
+        )
+        notes = (*notes, line)
+    return fps, even, int((~found[kept]).sum()), notes
+
+
+def _check_unit(path: Path, name: str, units: float, seconds: Float[np.ndarray, " r"]) -> None:
+    """Refuse times whose unit is another one than their name says."""
+    if len(seconds) < 2:
+        return
+    step = float(np.median(np.diff(seconds)))
+    told = f"{path}: {name} goes up by {units * step:.4g} a frame, so "
+    if step < _SHORTEST:
+        hint = 'give milliseconds, or call seconds "time"' if units > 1 else "give seconds"
+        raise UserError(f"{told}there would be {1 / step:,.0f} frames in a second; {hint}")
+    if step > _LONGEST:
+        hint = "give milliseconds" if units > 1 else 'give seconds, or call milliseconds "timestamp_ms"'
+        raise UserError(f"{told}a frame would last {step:,.0f} s; {hint}")
+
+
+def out_of_range(value: float | int) -> str:
+    """What is wrong with a coefficient beyond `MIN_COEFFICIENT` and `MAX_COEFFICIENT`, and what to do."""
+    is_percent = 0 <= value <= 100 * MAX_COEFFICIENT
+    return "coefficients go from 0 to 1; " + ("divide percent by 100" if is_percent else "correct or delete the row")
+
+
 def shorten(text: str) -> str:
     """The text as messages show it, cut to `_MAX_SHOWN` characters."""
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
@@ -136,17 +208,8 @@ def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -
         )
 
 
-def without_repeats(
-    seconds: Float[np.ndarray, " r"], where: Callable[[int], str], what: str, remedy: str, slack: float = 0.0
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def without_repeats(seconds: Float[np.ndarray, " r"], times: Times) -> tuple[np.ndarray, tuple[str, ...]]:
     """Find the rows whose time comes after all before. Rows that repeat a time are left out.
-
-    Args:
-        seconds: The times.
-        where: Returns the name of a row's place in its file.
-        what: What the file calls a time.
-        remedy: End of the message for times that go back.
-        slack: How far a time may go back to count as a repeat, in seconds.
 
     Returns:
         the indices of these rows, and a line for the user if others are left out.
@@ -156,13 +219,14 @@ def without_repeats(
     """
     latest = np.maximum.accumulate(seconds)
     late = np.concatenate([[False], seconds[1:] <= latest[:-1]])
-    back = np.concatenate([[False], seconds[1:] < latest[:-1] - slack])
+    back = np.concatenate([[False], seconds[1:] < latest[:-1] - times.slack])
     if late[1:].any() and late[1:].all():
         back[1] = True
     if back.any():
-        raise UserError(f"{where(int(np.argmax(back)))}: its {what} does not come after the one before{remedy}")
+        place = times.where(int(np.argmax(back)))
+        raise UserError(f"{place}: its {times.name} does not come after the one before{times.remedy}")
     count = int(late.sum())
-    line = f"{where(int(np.argmax(late)))}: has the time of a row before it and is left out; {count} in all"
+    line = f"{times.where(int(np.argmax(late)))}: has the time of a row before it and is left out; {count} in all"
     return np.flatnonzero(~late), (line,) if count else ()
 
 

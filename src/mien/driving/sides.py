@@ -50,13 +50,15 @@ class Sides:
 
 _NAMED = Sides(Side.PERFORMER, Side.PERFORMER, Side.PERFORMER)
 LIVE_LINK_FACE = Sides(Side.PERFORMER, Side.OBSERVER, Side.OBSERVER)
-PLAIN = FACE_LANDMARKER = NAMED_WEIGHTS = AUDIO2FACE = _NAMED
+PLAIN = FACE_LANDMARKER = NAMED_WEIGHTS = AUDIO2FACE = AZURE_SPEECH = _NAMED
 SOURCES = {
     "Live Link Face (.csv)": LIVE_LINK_FACE,
+    "table without a timecode (.csv)": PLAIN,
     "plain list (.json)": PLAIN,
     "MediaPipe's FaceLandmarker (.json)": FACE_LANDMARKER,
     "BEAT, LAM (.json)": NAMED_WEIGHTS,
     "Audio2Face (.json)": AUDIO2FACE,
+    "Azure speech (.json)": AZURE_SPEECH,
 }
 """The table: sides by source."""
 PAIRS = tuple((name, name[:-4] + "Right") for name in ARKIT_NAMES if name.endswith("Left"))

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from mien.capture.picture import decode_picture
 from mien.capture.video import read_video_frames
 from mien.errors import UserError
+from mien.inside import listed
 from mien.progress import say
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -55,8 +56,8 @@ def open_pictures(path: Path) -> PictureSource:
     if not path.is_dir():
         raise UserError(f"{path}: no such folder; name a folder of pictures, or a video")
     files: dict[str, Path] = {}
-    for file in sorted(path.iterdir()):
-        if file.suffix.lower() not in ENDINGS or file.name.startswith("."):
+    for file in listed(path):
+        if file.suffix.lower() not in ENDINGS:
             continue
         if file.stem in files:
             raise UserError(

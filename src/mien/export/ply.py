@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import IO
@@ -31,6 +32,10 @@ _TYPES = {
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
 """numpy's type by the name of a type in the header."""
+_FIRST_LINE = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
+_READ = re.compile(r"[xyz]|opacity|f_(dc|rest)_[0-9]+|scale_[0-9]+|rot_[0-9]+")
+"""Names of the properties that are read, which have one of these types."""
+_FLOATS = ("float", "float32", "double", "float64")
 BINDING = "binding_0"
 """Property of GaussianAvatars' files: the index of the triangle in whose frame a Gaussian is given."""
 _LOCAL_COMMENT = "mien frame: local"
@@ -112,7 +117,7 @@ def read_ply(path: Path) -> Gaussians:
 def read_columns(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     """The columns of a 3D Gaussian .ply by name, and the lines of its header.
 
-    All columns are float32, except `BINDING`, which keeps its type.
+    Columns have the types of the file.
 
     Raises:
         UserError: the file is missing, truncated, not a ply, ASCII or big-endian, or holds no 3D Gaussians.
@@ -149,7 +154,8 @@ def stacked(columns: dict[str, np.ndarray], names: list[str], path: Path) -> Ten
     missing = [name for name in names if name not in columns]
     if missing:
         raise UserError(f"{path}: lacks {missing[0]}; give a .ply with 3D Gaussians")
-    return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32, copy=False))
+    with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, which callers refuse
+        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32, copy=False))
 
 
 def stacked_sh(columns: dict[str, np.ndarray], path: Path) -> Tensor:
@@ -179,11 +185,14 @@ def _read_header(path: Path, file: IO[bytes]) -> list[str]:
         UserError: it is no .ply.
     """
     content = file.read(_MAX_HEADER_BYTES)
-    end = content.find(b"end_header\n")
-    if not content.startswith(b"ply") or end < 0:
+    # Vertices may begin with any byte, so the first line decides how lines end.
+    first = _FIRST_LINE.match(content)
+    last = None if first is None else re.compile(rb"end_header[ \t]*" + first[1]).search(content)
+    if last is None:
         raise UserError(f"{path}: is not a .ply file; give one with 3D Gaussians, as `mien export` writes")
-    file.seek(end + len(b"end_header\n"))
-    return content[:end].decode("ascii", errors="replace").splitlines()
+    file.seek(last.end())
+    lines = content[: last.start()].decode("ascii", errors="replace").splitlines()
+    return [" ".join(line.split()) for line in lines]
 
 
 def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
@@ -203,11 +212,13 @@ def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
 
 
 def _parse_header(path: Path, lines: list[str]) -> tuple[int, np.dtype]:
-    """The number of vertices and the layout of one. All properties but `BINDING` must be float32."""
+    """The number of vertices and the layout of one. Those of `_READ` must be floats, others any number."""
     if "format binary_little_endian 1.0" not in lines:
         found = next((line for line in lines if line.startswith("format")), "no format line")
         raise UserError(f"{path}: {found!r} is not supported; save it as binary_little_endian 1.0")
     elements = [line.split() for line in lines if line.startswith("element")]
+    if any("packed_position" in line for line in lines):
+        raise UserError(f"{path}: is a compressed .ply, as PlayCanvas' tools write; save it uncompressed, or as .sog")
     if not elements or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3 or not elements[0][2].isdigit():
         raise UserError(f"{path}: its first element is not `vertex` and a number; give a .ply with 3D Gaussians")
     start = next(i for i, line in enumerate(lines) if line.startswith("element")) + 1
@@ -235,7 +246,7 @@ def _is_known_type(entry: list[str]) -> bool:
     """Whether a property line, split into words, is of a type that its name may have."""
     if len(entry) != 3:
         return False
-    return entry[1] in (_TYPES if entry[2] == BINDING else ("float", "float32"))
+    return entry[1] in (_FLOATS if _READ.fullmatch(entry[2]) else _TYPES)
 
 
 def _pose_of(path: Path, lines: list[str]) -> Tensor | None:

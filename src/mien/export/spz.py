@@ -22,7 +22,8 @@ from mien.files import write_atomically
 from mien.gaussians import Gaussians
 
 VERSIONS = (3, 4)
-"""Versions that are read and written. Version 4 is the current one; some programs read only 3."""
+"""Versions that are written. Version 4 is the current one; some programs read only 3. Version 2 is read as well: its
+quaternions have three bytes."""
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
 """Magic number, version, count, degree, bits behind the point, flags, and in version 4 the number of columns."""
@@ -42,7 +43,7 @@ _QUAT_STEPS = 511
 _DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 """Degree of the spherical harmonics by the number of coefficients."""
 _MAX_BYTES, _MAX_GAUSSIANS = 1 << 28, 2_000_000
-_REMEDY = "give a .spz of version 3 or 4, as `mien export` writes"
+_REMEDY = "give a .spz of version 2, 3 or 4; `mien export` writes 4"
 
 
 def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> None:
@@ -86,14 +87,14 @@ def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> 
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read a .spz file of version 3 or 4.
+    """Read a .spz file of version 2, 3 or 4.
 
     Raises:
         UserError: the file is missing, damaged, of another version, or too large.
     """
     try:
         packed = read_bytes(path, _MAX_BYTES)
-        read = _read_version_4 if packed[:4] == struct.pack("<I", _MAGIC) else _read_version_3
+        read = _read_version_4 if packed[:4] == struct.pack("<I", _MAGIC) else _read_gzip
         fraction, columns = read(packed)
     except (OSError, EOFError, ValueError, struct.error, zlib.error, zstandard.ZstdError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -109,7 +110,7 @@ def read_spz(path: Path) -> Gaussians:
     sh = np.concatenate([first[:, None], higher], axis=1)
     arrays = (
         means,
-        _unpacked_quats(quats),
+        _unpacked_quats(quats) if quats.shape[1] == 4 else _unpacked_first_three(quats),
         np.exp(scales.astype(np.float64) / _LOG_SCALE_STEPS - _LOG_SCALE_OFFSET),
         opacities / 255,
         sh,
@@ -126,7 +127,7 @@ def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
     return b"".join([header.ljust(_TABLE_AT, b"\0"), table, *packed])
 
 
-def _shapes(count: int, degree: int) -> list[tuple[int, ...]]:
+def _shapes(count: int, degree: int, quat_bytes: int = 4) -> list[tuple[int, ...]]:
     """The shapes of all columns.
 
     Raises:
@@ -134,24 +135,31 @@ def _shapes(count: int, degree: int) -> list[tuple[int, ...]]:
     """
     if count > _MAX_GAUSSIANS:
         raise ValueError(f"it has {count:,} Gaussians, and at most {_MAX_GAUSSIANS:,} are read")
-    return [(count, 3, 3), (count,), (count, 3), (count, 3), (count, 4), (count, (degree + 1) ** 2 - 1, 3)]
+    return [(count, 3, 3), (count,), (count, 3), (count, 3), (count, quat_bytes), (count, (degree + 1) ** 2 - 1, 3)]
 
 
-def _read_version_3(packed: bytes) -> tuple[int, list[np.ndarray]]:
-    """The number of bits behind the point, and all columns, of a file of version 3."""
+def _read_gzip(packed: bytes) -> tuple[int, list[np.ndarray]]:
+    """The number of bits behind the point, and all columns, of a file of version 2 or 3."""
     with gzip.GzipFile(fileobj=io.BytesIO(packed)) as file:
         magic, version, count, degree, fraction, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-        if (magic, version) != (_MAGIC, 3) or degree > 3 or fraction > _FIXED_BITS:
-            raise ValueError("it is of another version")
-        return fraction, [_column(file, shape) for shape in _shapes(count, degree)]
+        if magic != _MAGIC:
+            raise ValueError("it has another beginning")
+        _check_header(version, (2, 3), degree, fraction)
+        return fraction, [_column(file, shape) for shape in _shapes(count, degree, 3 if version == 2 else 4)]
+
+
+def _check_header(version: int, known: tuple[int, ...], degree: int, fraction: int) -> None:
+    if version not in known:
+        raise ValueError(f"it is of version {version}")
+    if degree > 3 or fraction > _FIXED_BITS:
+        raise ValueError("its header is damaged")
 
 
 def _read_version_4(packed: bytes) -> tuple[int, list[np.ndarray]]:
     """The number of bits behind the point, and all columns, of a file of version 4."""
     _, version, count, degree, fraction, _, streams = _HEADER.unpack_from(packed)
     (table,) = struct.unpack_from("<I", packed, _HEADER.size)
-    if version != 4 or degree > 3 or fraction > _FIXED_BITS:
-        raise ValueError("it is of another version")
+    _check_header(version, (4,), degree, fraction)
     shapes, columns = _shapes(count, degree), []
     if streams != sum(bool(np.prod(shape)) for shape in shapes) or table < _TABLE_AT:
         raise ValueError("its table is damaged")
@@ -197,6 +205,12 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     for component in range(4):
         word = np.where(largest == component, word, (word << 10) | fields[:, component])
     return word.astype("<u4").view(np.uint8).reshape(-1, 4)
+
+
+def _unpacked_first_three(packed: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz of version 2, which has x, y and z of those whose w is not negative."""
+    xyz = packed / 127.5 - 1
+    return np.concatenate([np.sqrt(np.maximum(1 - (xyz**2).sum(1, keepdims=True), 0)), xyz], axis=1)
 
 
 def _unpacked_quats(packed: np.ndarray) -> np.ndarray:

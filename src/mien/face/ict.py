@@ -21,6 +21,7 @@ from mien.face.constants import FACE
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.face.npz import read_npz
 from mien.face.obj_files import read_obj, read_obj_positions
+from mien.inside import listed
 
 VERTICES, QUADS = 26719, 26384
 """Vertices and faces of the model. Faces are quads; a triangle has -1 as its last corner."""
@@ -193,7 +194,7 @@ def _read_folder(path: Path) -> IctFile:
         identity.append(read_obj_positions(path / f"identity{len(identity):03d}.obj", len(template)) - template)
     expression = {
         file.stem: (read_obj_positions(file, len(template)) - template).astype(np.float32)
-        for file in sorted(path.glob("*.obj"))
+        for file in listed(path, "*.obj")
         if file.name != NEUTRAL and not file.stem.startswith("identity")
     }
     shape = (0, *template.shape)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.bounded import parse_json, read_bytes
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.limits import camera_fault
@@ -20,6 +21,7 @@ from mien.storage import read_json, write_json
 FORMAT, VERSION = "mien.cameras", 1
 _MAX_CAMERAS = 50_000
 """Most cameras of a file: half an hour at 30 frames a second."""
+_MAX_FOREIGN_BYTES = 32 << 20
 _WORLD_UP = (0.0, 1.0, 0.0)
 _DISTORTION = re.compile(
     r"dist(?!ance)|fisheye|radial|tangential|coef|^([kp][1-6]|s[1-4]|tau[xy12]|d|kc|xi|rd)$", re.IGNORECASE
@@ -124,7 +126,12 @@ def read_camera_entries(path: Path, remedy: str) -> list[Any]:
         content = read_json(path, FORMAT, VERSION)
     except UserError as error:
         # The user wrote this file, so there is no stage to run again.
-        raise UserError(f"{str(error).split('; ')[0]}; write it as described in docs/using.md") from None
+        remedy = "write it as described in docs/using.md"
+        told = str(error).split("; ")[0]
+        if _is_nerfstudio(path):
+            told = f"{path}: is nerfstudio's transforms.json, of another format"
+            remedy = "write each frame's camera as described in docs/using.md (its matrices are camera-to-world)"
+        raise UserError(f"{told}; {remedy}") from None
     names, listed = names_of_distortion(content), content.get("cameras")
     if names:
         raise UserError(f"{path}: has {names[0]} for all cameras together; write it into the entry of each camera")
@@ -133,6 +140,16 @@ def read_camera_entries(path: Path, remedy: str) -> list[Any]:
     if len(listed) > _MAX_CAMERAS:
         raise UserError(f"{path}: has {len(listed):,} cameras, and at most {_MAX_CAMERAS:,} are read; split the file")
     return listed
+
+
+def _is_nerfstudio(path: Path) -> bool:
+    """Whether a json file lists frames with camera-to-world matrices, as nerfstudio and NeRF's datasets do."""
+    try:
+        content = parse_json(read_bytes(path, _MAX_FOREIGN_BYTES).decode("utf-8-sig"), any_size=True)
+    except (OSError, ValueError):
+        return False
+    frames = content.get("frames") if isinstance(content, dict) else None
+    return isinstance(frames, list) and any(isinstance(each, dict) and "transform_matrix" in each for each in frames)
 
 
 def names_of_distortion(entry: Any) -> list[str]:

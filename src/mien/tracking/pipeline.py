@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import torch
 
 from mien.capture.backend import detector_of
@@ -93,7 +94,7 @@ def track_subject(
     begun = keep is not None and keep.is_dir()
     try:
         return track_once(captures, face_model, settings, keep, preview, held_out)
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError):
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError, cv2.error):
         if keep is None or not begun:
             raise
     say("The stored pieces of an interrupted tracking cannot be used, so tracking starts again")

@@ -1,7 +1,7 @@
 """The scoring mask on disk: scoring.json, crops.safetensors, masks/CAMERA/000000.png. It is written once."""
 
 import hashlib
-import tempfile
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -44,10 +44,10 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str) -> None:
     if scoring_exists(path, capture_hash):
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}"
+    temporary.mkdir()
     try:
         _write_into(temporary, scoring, capture_hash)
-        temporary.chmod(0o755)
         replace_folder(path, temporary)
     except BaseException:
         remove_tree(temporary)

@@ -88,8 +88,9 @@ def _submit(work: Work, rows: Sequence[Row], options: EngineOptions, size: int) 
     import submitit  # pyright: ignore[reportMissingImports]
     from submitit.core.utils import FailedJobError, FailedSubmissionError  # pyright: ignore[reportMissingImports]
 
-    (options.root / "slurm").mkdir(parents=True, exist_ok=True)
-    executor = submitit.SlurmExecutor(options.root / "slurm", max_num_timeout=10)
+    folder = Batch(options.root).place("slurm")
+    folder.mkdir(parents=True, exist_ok=True)
+    executor = submitit.SlurmExecutor(folder, max_num_timeout=10)
     executor.update_parameters(
         job_name="mien-batch",
         time=(options.minutes or _minutes(Batch(options.root))) * size,

@@ -5,6 +5,7 @@ import csv
 import difflib
 import io
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -18,7 +19,8 @@ from mien.commands import create
 from mien.commands.complaints import complaint_of
 from mien.commands.options import TrainOptions, check_method, with_settings
 from mien.errors import UserError
-from mien.inside import is_plain_name
+from mien.inside import is_plain_name, listed
+from mien.tables import table_rows, text_of, with_point
 from mien.tracking import ScoringSettings, TrackingSettings
 from mien.training import AlignmentSettings, TrainSettings
 
@@ -50,6 +52,9 @@ _SETTINGS = {
     )
 }
 """Group of options -> names of its settings."""
+_NUMBER = re.compile(r"-[0-9.]+(e[+-]?[0-9]+)?", re.IGNORECASE)
+_DECIMAL = re.compile(r"-?[0-9]+,[0-9]+")
+"""A number with a decimal comma."""
 _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 """Memory of a row in megabytes: at least, and for each frame. 10 minutes of video take less than 3 GiB."""
 
@@ -76,19 +81,19 @@ def read_table(path: Path) -> list[Row]:
 
 def _entries(path: Path) -> Iterator[dict[str, Any]]:
     if path.is_dir():
-        for video in sorted(each for each in path.iterdir() if each.suffix.lower() in _VIDEOS):
+        for video in (each for each in listed(path) if each.suffix.lower() in _VIDEOS):
             yield {"video": video.name}
         return
     try:
-        text = read_bytes(path, _MAX_TABLE_BYTES).decode("utf-8-sig")
-        content = parse_json(text, unique_names=True) if path.suffix.lower() == ".json" else _lines(text, path)
+        text = read_bytes(path, _MAX_TABLE_BYTES)
+        is_json = path.suffix.lower() == ".json"
+        content = parse_json(text_of(text), unique_names=True) if is_json else _lines(text, path)
     except FileNotFoundError:
         raise UserError(
             f"{path}: no such file or folder; give a csv or json of captures, or a folder of videos"
         ) from None
     except (OSError, ValueError, csv.Error) as error:
-        remedy = "save it as UTF-8" if isinstance(error, UnicodeDecodeError) else "correct it"
-        raise UserError(f"{path}: cannot be read as a csv or a json list of objects ({error}); {remedy}") from None
+        raise UserError(f"{path}: cannot be read as a csv or a json list of objects ({error}); correct it") from None
     if isinstance(content, dict):
         content = content.get("rows")
     if not isinstance(content, list) or not all(isinstance(each, dict) for each in content):
@@ -96,11 +101,15 @@ def _entries(path: Path) -> Iterator[dict[str, Any]]:
     yield from content
 
 
-def _lines(text: str, path: Path) -> list[dict[str, Any]]:
-    """The lines of a csv. Its reader would keep only the last of two columns with one name."""
-    reader = csv.DictReader(io.StringIO(text))
-    _check_names(reader.fieldnames or (), str(path))
-    return list(reader)
+def _lines(text: bytes, path: Path) -> list[dict[Any, Any]]:
+    """The lines of a csv by column. Cells beyond the heading have the name None."""
+    rows = [row for _, row in table_rows(io.BytesIO(text))]
+    heading = rows[0] if rows else []
+    _check_names(heading, str(path))
+    return [
+        dict(zip(heading, row, strict=False)) | ({None: row[len(heading) :]} if len(row) > len(heading) else {})
+        for row in rows[1:]
+    ]
 
 
 def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Row:
@@ -131,7 +140,9 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Ro
     for key, words in cells.items():
         if key in _OWN:
             continue
+        words = [with_point(word) if _DECIMAL.fullmatch(word) else word for word in words]
         if key in known or key.partition(".")[0] in _GROUPS and "." in key:
+            _check_words(words, original[key], where)
             options[key] = [
                 _input(folder, word, where) if key in _PATHS and _must_exist(folder, key, word) else word
                 for word in words
@@ -172,6 +183,15 @@ def _words(value: Any, name: object, where: str) -> list[str]:
         raise UserError(f"{where}: column {name!r} holds an object; write a setting as a column, such as capture.size")
     each = value if isinstance(value, list) else str("" if value is None else value).split(";")
     return [text for one in each if (text := str(one).strip())]
+
+
+def _check_words(words: Iterable[str], name: str, where: str) -> None:
+    """Check that no word of an option is an option itself."""
+    option = next((word for word in words if word.startswith("-") and not _NUMBER.fullmatch(word)), None)
+    if option is not None:
+        raise UserError(
+            f"{where}: column {name!r} holds {option!r:.80}, which would be an option; give each option a column"
+        )
 
 
 def _must_exist(folder: Path, key: str, word: str) -> bool:

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -10,9 +11,11 @@ import numpy as np
 from mien.avatar import load_avatar
 from mien.capture import CaptureSettings
 from mien.capture.sound_endings import SOUND_ENDINGS
-from mien.commands.options import NEUTRALS, check_driver, check_neutral, is_tracked_sequence
+from mien.capture.source import FrameSelection, list_images, open_source
+from mien.commands.options import NEUTRALS, check_driver, check_neutral, holds_pictures, is_tracked_sequence
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.capturing import run_capture_stage
+from mien.commands.stages.names import is_picture
 from mien.commands.stages.pictures import draw, posed_softly, view, warn_of_white
 from mien.commands.stages.tracking import run_tracking_stage
 from mien.driving import (
@@ -31,7 +34,7 @@ from mien.face import FaceModel
 from mien.face.cache import cache_folder, cache_is_kept
 from mien.pictures import side_by_side
 from mien.progress import say, track_progress
-from mien.storage import file_digest
+from mien.storage import file_digest, write_atomically
 from mien.tracking import TrackingSettings
 from mien.training.run import filmed_range, run_camera
 from mien.workspace import Workspace, open_workspace
@@ -40,7 +43,9 @@ from mien.workspace import Workspace, open_workspace
 def open_driver(
     by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None, neutral: str | None = None
 ) -> Driver:
-    """Open a driver: a workspace, a video (captured, tracked and kept in the cache), a csv, a json, or a voice.
+    """Open a driver: a workspace, a recording (csv, json, voice), or a film.
+
+    A film is a video, a picture or a folder of pictures. It is captured, tracked and kept in the cache.
 
     Args:
         by: The workspace or file.
@@ -55,16 +60,22 @@ def open_driver(
     check_driver(by, sequence, fps)
     check_neutral(neutral)
     driver = _open(by, sequence, face_model, fps)
+    if neutral is None and by.is_file() and _is_film(by) and is_picture(by):
+        say(f"{by}: is one picture, so its motion is measured from the face model's neutral")
+        neutral = "model"
     other = None if neutral is None or neutral in NEUTRALS else _open(Path(neutral), None, face_model)
     return with_neutral(driver, face_model, neutral, str(by), other)
 
 
+def _is_film(by: Path) -> bool:
+    return by.suffix.lower() not in (".csv", ".json", *SOUND_ENDINGS)
+
+
 def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
-    suffix = by.suffix.lower() if by.is_file() else ""
-    if suffix in (".csv", ".json", *SOUND_ENDINGS):
+    if by.is_file() and not _is_film(by):
         return read_recording(by, face_model, fps)
-    if by.is_file():
-        workspace, names = tracked_video(by, face_model.name)
+    if by.is_file() or holds_pictures(by):
+        workspace, names = tracked_film(by, face_model.name)
         names = names if sequence is None else [workspace.pick_sequence(sequence)]
     elif is_tracked_sequence(by):
         return read_tracked_driver([by], face_model)
@@ -74,15 +85,34 @@ def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | No
     return read_tracked_driver([workspace.sequence_dir(name) for name in names], face_model)
 
 
-def tracked_video(video: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
-    """The workspace of a video in this user's cache, and its sequences. They are captured and tracked if needed."""
-    workspace = Workspace(cache_folder() / "drivers" / f"{video.stem}-{file_digest(video)[:12]}")
-    run_capture_stage(workspace, video, None, CaptureSettings())
+_FEWEST = 3
+"""Least number of frames that are tracked. Fewer pictures are repeated."""
+
+
+def _write(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
+
+
+def tracked_film(film: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
+    """The workspace of a video, a picture or a folder of pictures in this user's cache, and its sequences.
+
+    They are captured and tracked if needed.
+    """
+    pictures = list_images(film) if film.is_dir() else [film] if is_picture(film) else []
+    digest = open_source(film, FrameSelection(), 1.0).content_hash if film.is_dir() else file_digest(film)
+    workspace = Workspace(cache_folder() / "drivers" / f"{film.resolve().stem}-{digest[:12]}")
+    source = film
+    if 0 < len(pictures) < _FEWEST:
+        source = workspace.root / film.resolve().stem
+        for index, picture in enumerate(each for each in pictures for _ in range(_FEWEST)):
+            content = picture.read_bytes()
+            write_atomically(source / f"{index}{picture.suffix}", partial(_write, content))
+    run_capture_stage(workspace, source, None, CaptureSettings())
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
     tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
     names = sorted(tracked, key=lambda name: (len(name), name))
     kept = "kept for the next time" if cache_is_kept() else "for this command only; set MIEN_CACHE to keep it"
-    say(f"{video}: tracked in {workspace.root}, {kept}")
+    say(f"{film}: tracked in {workspace.root}, {kept}")
     return workspace, names
 
 

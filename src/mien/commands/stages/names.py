@@ -80,14 +80,21 @@ def check_videos(videos: Sequence[Path]) -> None:
     Raises:
         UserError: a file is no video, or one that cannot be opened, or a picture.
     """
+    for video in videos:
+        if video.is_file() and is_picture(video):
+            raise UserError(f"{video}: is a picture; give a video, or the folder of a video's pictures")
+
+
+def is_picture(file: Path) -> bool:
+    """Whether a file is a single picture.
+
+    Raises:
+        UserError: it is neither a picture nor a video, or cannot be opened.
+    """
     from mien.capture.video_file import open_video
 
-    for video in videos:
-        if video.is_file():
-            with open_video(video) as (container, _):
-                # FFmpeg's names of pictures: png_pipe, jpeg_pipe.
-                if container.format.name.endswith("_pipe"):
-                    raise UserError(f"{video}: is a picture; give a video, or the folder of a video's pictures")
+    with open_video(file) as (container, _):
+        return container.format.name.endswith("_pipe")  # FFmpeg's names of pictures: png_pipe, jpeg_pipe.
 
 
 def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:

@@ -44,13 +44,16 @@ class StageCache:
             self.last = time.monotonic()
 
     def read(self, name: str) -> dict[str, Tensor] | None:
-        """The kept piece, or None if there is none or it cannot be read."""
+        """The kept piece, or None if there is none, or it cannot be read, or holds numbers that are not finite."""
         path = self._path(name)
         if path is None or not path.is_file():
             return None
         try:
             tensors = read_tensors(path)
+            is_whole = all(bool(tensor.isfinite().all()) for tensor in tensors.values())
         except UserError:
+            tensors, is_whole = {}, False
+        if not is_whole:
             say(f"{path.name}: is damaged, so this part of tracking runs again")
             return None
         if not self.resumed:

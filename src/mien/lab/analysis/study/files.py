@@ -9,7 +9,7 @@ from typing import Any
 from mien.bounded import parse_json, read_bytes
 from mien.errors import UserError
 from mien.files import expect_whole, read_json, write_json
-from mien.inside import is_one_line
+from mien.inside import is_one_line, listed
 from mien.lab.analysis.study.shuffling import shuffled
 from mien.limits import checked_whole
 
@@ -155,7 +155,7 @@ def _answer_files(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        inner = sorted(one for one in path.glob("*.json") if not one.name.endswith(".key.json"))
+        inner = [one for one in listed(path, "*.json") if not one.name.endswith(".key.json")]
         if not inner:
             raise UserError(f"{path}: has no answer file (.json); put the participants' files there")
         found += inner

@@ -1,0 +1,154 @@
+"""Recordings whose units, encodings, times and layouts are not those of Live Link Face."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mien.driving import ARKIT_NAMES, Motion, read_blendshape_json, read_live_link_face
+from mien.errors import UserError
+from recordings import row, write_csv, write_json
+
+
+def jaw(motion: Motion) -> list[float]:
+    return np.round(motion.coefficients[:, ARKIT_NAMES.index("jawOpen")], 6).tolist()
+
+
+def opening(*seconds: str) -> list[list[str]]:
+    """Rows with these timecodes, whose jaw opens by a tenth from one to the next."""
+    return [row(timecode, JawOpen=index / 10) for index, timecode in enumerate(seconds)]
+
+
+def turning(*yaws: float, times: str = "0:00:00:{:02d}.0", **others: float) -> list[list[str]]:
+    """Rows of a head that turns, two frames of a timecode apart."""
+    return [row(times.format(2 * index), HeadYaw=yaw, **others) for index, yaw in enumerate(yaws)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (turning(0, 1.69, 2.9), "line 4: HeadYaw is 2.9; angles are in radians, .* beyond 1.7; divide degrees by 57.3"),
+        (turning(0, LeftEyePitch=-14), "line 2: LeftEyePitch is -14; angles are in radians"),
+        (turning(0, HeadRoll=3.2), "line 2: HeadRoll is 3.2; .* beyond 3.14; divide"),
+        (
+            turning(0, 0.1, 1.2),
+            r"line 4: HeadYaw goes from 0.1 to 1.2 in 0.033 s; .* more than 20 a second; divide deg",
+        ),
+        (turning(0, JawOpen=45), "line 2: JawOpen is 45; coefficients go from 0 to 1; divide percent by 100"),
+        (turning(0, JawOpen=-45), "line 2: JawOpen is -45; .* correct or delete the row"),
+    ],
+)
+def test_units_that_cannot_be_are_named(tmp_path: Path, rows: list[list[str]], words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
+
+
+def test_percent_in_json_are_named(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "a.json", [{"time": 0, "blendshapes": {"jawOpen": 60}}])
+    with pytest.raises(UserError, match="frame 0: jawOpen is 60; coefficients go from 0 to 1; divide percent by 100"):
+        read_blendshape_json(path)
+
+
+def test_fast_heads_that_are_no_degrees_are_read(tmp_path: Path) -> None:
+    """A phone on its side, a face that is lost and found elsewhere, and a timecode with a hiccup are no degrees."""
+    side = turning(0.3, 0.4, HeadRoll=1.8)
+    lost = [*turning(0.0), ["0:00:00:02.0", "0"], *(row(f"0:00:00:{at:02d}.0", HeadYaw=1.2) for at in (4, 6))]
+    hiccup = [
+        row(f"0:00:00:{code}", HeadYaw=yaw) for code, yaw in (("02.0", 0), ("04.0", 0.1), ("04.1", 0.2), ("06.0", 0.3))
+    ]
+    for rows in (side, lost, hiccup):
+        read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
+
+
+def test_fewer_than_five_rows_a_second_are_said(tmp_path: Path) -> None:
+    """The frame field of the timecode never changes, so --fps is the number of rows a second."""
+    path = write_csv(tmp_path / "a.csv", *(row(f"0:00:{second:02d}:00.0") for second in range(10)))
+    motion = read_live_link_face(path)
+    assert motion.fps == pytest.approx(1)
+    assert "has 1 rows a second, and recordings of faces have at least 5; `mien drive --fps 60`" in motion.notes[0]
+    motion = read_live_link_face(path, 60.0)
+    assert (len(motion), motion.fps, motion.notes) == (10, pytest.approx(60), ())
+    json_path = write_json(tmp_path / "a.json", [{"time": second, "blendshapes": {}} for second in range(4)])
+    assert "has 1 rows a second" in read_blendshape_json(json_path).notes[0]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])
+def test_encodings_of_spreadsheets_are_read(tmp_path: Path, encoding: str) -> None:
+    take = write_csv(tmp_path / "a.csv", *opening("0:0:0:0", "0:0:0:2"))
+    plain = write_json(tmp_path / "a.json", [{"time": 0, "blendshapes": {"jawOpen": 0.5}}])
+    for path in (take, plain):
+        path.write_bytes(path.read_text().encode(encoding))
+    assert jaw(read_live_link_face(take)) == [0, 0.1]
+    assert jaw(read_blendshape_json(plain)) == [0.5]
+    take.write_bytes("Timecode,JawOpen,\u00fc\n0:0:0:0,1\n".encode("latin-1"))
+    with pytest.raises(UserError, match="it is no text in UTF-8 or UTF-16; save it as UTF-8"):
+        read_live_link_face(take)
+
+
+def table(path: Path, *columns: str, rows: int = 4, step: float = 1.0) -> Path:
+    """A csv whose first column counts, and whose others rise by a tenth."""
+    cells = [[f"{step * at:g}", *([str(at / 10)] * (len(columns) - 1))] for at in range(rows)]
+    return write_csv(path, *cells, columns=list(columns))
+
+
+@pytest.mark.parametrize(
+    ("key", "step", "fps", "rate"),
+    [
+        ("frame", 1, None, 30), ("frame", 1, 24.0, 24), ("Frame", 2, 60.0, 30),
+        ("timestamp_ms", 40, None, 25), ("time", 0.02, None, 50), ("time", 0.02, 25.0, 25),
+    ],
+)  # fmt: skip
+def test_tables_of_other_programs(tmp_path: Path, key: str, step: float, fps: float | None, rate: float) -> None:
+    motion = read_live_link_face(
+        table(tmp_path / "a.csv", key, "jawOpen", "MouthSmile_L", "confidence", step=step), fps
+    )
+    assert motion.fps == pytest.approx(rate)
+    assert jaw(motion) == [0, 0.1, 0.2, 0.3]
+    assert motion.coefficients[3, ARKIT_NAMES.index("mouthSmileLeft")] == pytest.approx(0.3)
+    assert "has no columns EyeBlinkLeft, " in motion.notes[0]
+    assert "(50 in all), so they stay 0" in motion.notes[0]
+    assumed = ["so 30 rows a second are assumed; --fps sets it" in note for note in motion.notes[1:]]
+    assert assumed == [True] * (key == "frame" and fps is None)
+
+
+@pytest.mark.parametrize(
+    ("columns", "step", "words"),
+    [
+        (("frame", "AU01_r"), 1, "lacks ARKit's names, or a column Timecode, timestamp_ms, time or frame; give"),
+        (("row", "jawOpen"), 1, "lacks ARKit's names, or a column Timecode"),
+        (("timestamp_ms", "jawOpen"), 0.0333, "there would be 30,030 frames in a second; give milliseconds"),
+        (("time", "jawOpen"), 33.3, 'a frame would last 33 s; give seconds, or call milliseconds "timestamp_ms"'),
+        (("time", "jawOpen"), float("nan"), "line 2: time is 'nan'; give every row a number"),
+    ],
+)
+def test_tables_that_cannot_be_read(tmp_path: Path, columns: tuple[str, ...], step: float, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        read_live_link_face(table(tmp_path / "a.csv", *columns, step=step))
+
+
+def piece(first: Any, *rows: Any) -> dict[str, Any]:
+    return {"FrameIndex": first, "BlendShapes": list(rows)}
+
+
+def test_pieces_of_azures_speech(tmp_path: Path) -> None:
+    """Pieces follow each other at 60 frames a second. The 18th number is the open jaw, and rolls are left out."""
+    rows = [[0.0] * 17 + [at / 10] + [0.0] * 37 for at in range(6)]
+    path = write_json(tmp_path / "a.json", [piece(0, *rows[:4]), piece(4, *rows[4:])])
+    motion = read_blendshape_json(path)
+    assert (motion.fps, motion.notes) == (pytest.approx(60), ())
+    assert jaw(motion) == [0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    rows[0][52] = 0.1
+    motion = read_blendshape_json(write_json(path, piece(0, *rows)))
+    assert motion.notes == (f"{path}: the rolls of head and eyes are not read, so the head keeps still",)
+    for content, words in (
+        (piece(0, rows[0][:54]), "frame 0: is not a list of 55 numbers"),
+        (piece(7, 3), "frame 7: is not a list of 55 numbers"),
+        (piece(-1, rows[0]), "piece 0: FrameIndex is -1"),
+        (piece(10**12, rows[0]), "piece 0: FrameIndex is 10"),
+        ([piece(0)], 'its "BlendShapes" have no frames'),
+        ({"FrameIndex": 0, "BlendShapes": 3}, 'piece 0: "BlendShapes" is not a list of frames'),
+        ([piece(0, rows[0]), piece(9, ["wide", *rows[0][1:]])], "frame 1: eyeBlinkLeft is 'wide'"),
+    ):
+        with pytest.raises(UserError, match=words):
+            read_blendshape_json(write_json(path, content))
