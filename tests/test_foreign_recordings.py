@@ -12,7 +12,7 @@ from recordings import row, write_csv, write_json
 
 
 def jaw(motion: Motion) -> list[float]:
-    return np.round(motion.coefficients[:, ARKIT_NAMES.index("jawOpen")], 6).tolist()
+    return np.round(motion.coefficients[:, ARKIT_NAMES.index("jawOpen")].astype(float), 6).tolist()
 
 
 def opening(*seconds: str) -> list[list[str]]:
