@@ -328,10 +328,10 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
 
 def holds_pictures(folder: Path) -> bool:
     """Whether a folder is one of pictures, and no workspace."""
-    from mien.capture.source import list_images
-
     if not folder.is_dir() or (folder / "sequences").exists() or (folder / "runs").exists():
         return False
+    from mien.capture.source import list_images
+
     try:
         return bool(list_images(folder))
     except UserError:

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mien.capture import CaptureSettings
-from mien.capture.source import list_images
 from mien.capture.video import probe_video
 from mien.errors import UserError
+from mien.inside import listed
 from mien.overall import Piece
 from mien.tracking import TrackingSettings
 from mien.training import AlignmentSettings, TrainSettings
@@ -26,7 +26,7 @@ def count_captured(source: Path, settings: CaptureSettings) -> int:
     """About how many frames of a video or a folder of pictures will be captured; 0 if that cannot be told."""
     try:
         if source.is_dir():
-            fps, frames = settings.fps, len(list_images(source))
+            fps, frames = settings.fps, len(listed(source))
         else:
             info = probe_video(source)
             fps, frames = info.fps, info.frames
