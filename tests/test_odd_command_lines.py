@@ -78,7 +78,7 @@ ODD = [
     ("drive W --by empty.mp4 --out a.mp4", "empty.mp4: is empty"),
     ("drive W --by text.txt --out a.mp4", "text.txt: cannot be read as a video"),
     ("drive W --by W --out a.png", "one picture"),
-    ("drive W --by W --out a.mp4 --fps 30", "--fps 30: is for the timecode of a .csv"),
+    ("drive W --by W --out a.mp4 --fps 30", "--fps 30: is for the times of a .csv"),
     ("drive W --by empty.csv --out a.mp4 --fps 0", "--fps 0"),
     ("drive W --by list.json --out a.mp4 --sequence clip", "--sequence clip"),
     ("view none", "none: no such folder"),

@@ -52,7 +52,7 @@ def plain_recording(folder: Path) -> Path:
 
 
 def turned_rows() -> list[list[str]]:
-    turns = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 3))
+    turns = np.random.default_rng(0).uniform(-0.3, 0.3, (6, 3))
     return [
         row(f"0:00:00:{2 * at:02d}.0", JawOpen=at / 8, EyeBlinkLeft=0.5, EyeLookOutLeft=0.4, EyeLookInRight=0.4,
             EyeLookUpLeft=0.2, HeadYaw=yaw, HeadPitch=pitch, HeadRoll=roll)
