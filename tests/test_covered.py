@@ -79,6 +79,23 @@ def with_covered(truth: Tracking, frames: list[int]) -> Tracking:
 
 
 @pytest.mark.unchecked
+@pytest.mark.parametrize(
+    ("stride", "odd", "turn"), [(4, [20], 0.0), (1, [20, 21, 22, 23], 0.35)], ids=["rare", "turned"]
+)
+def test_what_few_pictures_show_is_no_hand(drawn, stride, odd, turn):
+    """A grimace in one of a few pictures looks odd, and so does a side that no other picture shows."""
+    capture, truth, model = drawn
+    rotation = truth.face.head_rotation.clone()
+    rotation[odd] += torch.tensor([turn, 0.0, 0.0])
+    rare, shown = slice(None, None, stride), with_hand(capture, odd)
+    face = replace(truth.face, head_rotation=rotation)
+    tracking = replace(truth, valid=truth.valid[rare], face=face[rare])
+    pictures = {name: getattr(shown, name)[rare] for name in ("timestamps", "images", "mattes", "landmarks", "valid")}
+    few = replace(shown, fps=shown.fps / stride, **pictures)
+    assert not covered_parts(few, tracking, model).any()
+
+
+@pytest.mark.unchecked
 def test_what_is_covered_is_kept_and_told(drawn, tmp_path):
     capture, truth, face_model = drawn
     write_tracking(tmp_path / "none", truth)

@@ -107,6 +107,13 @@ class CoveredConstants:
     leaves out."""
     lasting: float = 0.05
     """Half of the least time that something covers a part, in seconds. A grimace is shorter than a hand."""
+    least_lasting: int = 3
+    """Fewest pictures in a row that something covers. At 25 frames a second it is what `lasting` says; with fewer, one
+    grimace or one turn of the head was taken for a hand."""
+    similar_turn: float = 15.0
+    """Angle in degrees between the turns of a head up to which its pictures are compared. Not varied."""
+    least_similar: int = 5
+    """Fewest usual pictures of a similar turn without which a picture is not judged. Not varied."""
     alike: float = 0.5
     """Correlation with the usual look above which a frame has a part in it."""
     flat: float = 0.05

@@ -17,6 +17,7 @@ from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
+from mien.rotation import matrix_from_axis_angle
 from mien.tracking.constants import TRACKING
 from mien.tracking.fitting import HIDING_REGIONS, batch_of
 from mien.tracking.landmarks import BROWS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
@@ -53,9 +54,10 @@ def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -
             first = timesteps
             looks = _looks(pictures, tracking, face_model, places, camera, first)
             odd = [_unlike(look, *part) for look, part in zip(usual, looks, strict=True)]
-        found[first, camera] = torch.from_numpy(
-            _lasting(np.stack(odd, axis=1), 2 * int(known.lasting * capture.fps) + 1)
-        )
+        turns = matrix_from_axis_angle(tracking.face.head_rotation[first]).reshape(-1, 9).numpy()
+        odd = [_compared(part, weights, turns) for part, (_, weights) in zip(odd, looks, strict=True)]
+        least = max(2 * int(known.lasting * capture.fps) + 1, known.least_lasting)
+        found[first, camera] = torch.from_numpy(_lasting(np.stack(odd, axis=1), least))
     return found
 
 
@@ -125,6 +127,27 @@ def _unlike(
         return np.zeros(len(values), bool)
     known = TRACKING.covered
     return (_likeness(look, values, weights) < known.least_likeness) & (weights.mean(1) >= known.least_seen)
+
+
+def _compared(
+    odd: Bool[np.ndarray, " n"], weights: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "n 9"]
+) -> Bool[np.ndarray, " n"]:
+    """The odd pictures of a part for which enough usual ones show the head from nearly the same side.
+
+    Seen from another side, a part may look odd without anything before it.
+
+    Args:
+        odd: The odd pictures.
+        weights: 1 where a picture shows a point of the part.
+        turns: The head's rotation in each picture, row by row.
+    """
+    known = TRACKING.covered
+    usual = ~odd & (weights.mean(1) >= known.least_seen)
+    # The trace of R^T S is 1 + 2 cos of the angle between the rotations R and S.
+    near = turns[odd] @ turns[usual].T >= 1 + 2 * np.cos(np.radians(known.similar_turn))
+    compared = odd.copy()
+    compared[odd] = near.sum(1) >= known.least_similar
+    return compared
 
 
 def _lasting(odd: Bool[np.ndarray, "n p"], frames: int) -> Bool[np.ndarray, "n p"]:
