@@ -197,8 +197,8 @@ def survey_of(frames: list[list[tuple[float, float, float, float]]]) -> Survey:
             looks[frame, place] = color
     numbers = np.arange(count, dtype=np.int64)
     thumbnails = np.zeros((count, 18, 32, 3), np.uint8)
-    plain = np.zeros(count, bool), np.full(count, np.nan)
-    return Survey(numbers, numbers / 25, boxes, looks, thumbnails, *plain, np.array([640, 360], np.int64))
+    plain = np.zeros(count, bool), np.full(count, np.nan), np.zeros(count, bool)
+    return Survey(numbers, numbers / 25, boxes, looks, thumbnails, *plain, np.full((len(numbers), 2), (640, 360)))
 
 
 ANN, BOB = (0.3, 0.5, 0.3, 0.7), (0.75, 0.5, 0.2, 0.4)

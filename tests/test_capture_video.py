@@ -12,7 +12,7 @@ from capture_helpers import BT2020, encode, hdr_signal, light_of, to_planes, wri
 from mien.capture.camera_names import CameraName
 from mien.capture.colors import Colors
 from mien.capture.live_camera import LiveCamera
-from mien.capture.tone import HLG, PQ, roll_off
+from mien.capture.tone import HLG, PQ, roll_off, srgb_signal
 from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
 from mien.errors import UserError
 
@@ -252,6 +252,28 @@ def test_zeros_in_the_header_of_prores_are_unknown(tmp_path):
         data = data[:at] + bytes(3) + data[at + 3 :]
     path.write_bytes(data)
     assert error_of(path) <= 4
+
+
+BT2020_OF_BT709 = [[0.627404, 0.329283, 0.043313], [0.069097, 0.919540, 0.011362], [0.016391, 0.088013, 0.895595]]
+P3_OF_BT709 = [[0.822462, 0.177538, 0.0], [0.033194, 0.966806, 0.0], [0.017083, 0.072397, 0.910520]]
+
+
+@pytest.mark.parametrize("kind", ["h264.mp4", "prores.mov", "vp9.webm"])
+@pytest.mark.parametrize(
+    ("primaries", "matrix", "transfer", "convert"),
+    [(9, 9, 14, BT2020_OF_BT709), (9, 1, 1, BT2020_OF_BT709), (12, 1, 13, P3_OF_BT709), (1, 1, 1, np.eye(3))],
+    ids=["BT.2020", "BT.2020 with another matrix", "P3", "BT.709"],
+)
+def test_wide_primaries_are_converted(kind, primaries, matrix, transfer, convert, tmp_path):
+    """Cameras and screen recorders write them without HDR. Skin is pale and greenish without conversion."""
+    codec, pixels, options = KINDS[kind]
+    wide = srgb_signal(np.maximum(light_of(COLOR) @ np.array(convert).T, 0))
+    bits = 10 if pixels.endswith("10le") else 8
+    y, blue, red = to_planes(np.broadcast_to(wide, (96, 96, 3)), (WEIGHTS[matrix][0], WEIGHTS[matrix][1]), bits)
+    step = 2 if "420" in pixels else 1
+    planes = [y, blue[::step, ::2], red[::step, ::2]]
+    encode(tmp_path / kind, [planes] * 3, codec, pixels, options=options, colors=(matrix, primaries, transfer, LIMITED))
+    assert error_of(tmp_path / kind) <= 4
 
 
 def test_a_file_that_plays_as_a_camera_has_the_same_colors(tmp_path):

@@ -4,7 +4,8 @@
 
 1. `source` opens a video file or a folder of pictures and selects its frames. Helpers: `video` reads and writes frames,
    `video_file` opens video files safely, `display` and `tone` convert their pictures to sRGB, `picture` reads picture
-   files safely, and `given` reads what the user gives besides (clean plate, mattes, landmarks).
+   files safely, `alpha` takes the alpha of a source as its mattes, and `given` reads what the user gives besides (clean
+   plate, mattes, landmarks).
 2. `survey` is the first pass: it finds all faces in every frame (`faces`, MediaPipe) and checks that they are upright.
 3. `parts` splits the video at cuts, and chooses for each part the person to follow (`people`) and one crop (`crop`).
 4. `process` is the second pass: it crops each frame, finds the person's landmarks, makes the matte (`matte`, `plate`),

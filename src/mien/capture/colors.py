@@ -9,8 +9,8 @@ the only module that chooses, for the report and for the pictures alike:
 3. Without either, HDR has the matrix of BT.2020, and other pictures BT.709 from 720 lines up and BT.601 below.
 
 The range needs care: decoders report limited range when the header says nothing. So full range in the container counts
-if the header leaves the matrix unspecified. Primaries follow from the transfer function: HDR is taken as BT.2020 and
-converted (`mien.capture.tone`), other pictures are shown as BT.709.
+if the header leaves the matrix unspecified. HDR is taken as BT.2020. Its primaries, and those of other pictures that
+state BT.2020 or P3, are converted to BT.709 (`mien.capture.tone`). All other primaries are shown as BT.709.
 """
 
 from typing import NamedTuple
@@ -34,6 +34,7 @@ class Colors(NamedTuple):
     transfer: int = _UNSPECIFIED
     matrix: int = _UNSPECIFIED
     range: int = ColorRange.UNSPECIFIED
+    primaries: int = _UNSPECIFIED
 
     @property
     def hdr(self) -> str:
@@ -46,7 +47,7 @@ UNSPECIFIED = Colors()
 
 def stated_colors(tagged: av.VideoFrame | VideoCodecContext) -> Colors:
     """Return the tags of a frame or of a codec context."""
-    return Colors(int(tagged.color_trc), int(tagged.colorspace), int(tagged.color_range))
+    return Colors(int(tagged.color_trc), int(tagged.colorspace), int(tagged.color_range), int(tagged.color_primaries))
 
 
 def colors_of(frame: av.VideoFrame, container: Colors) -> Colors:
@@ -60,6 +61,7 @@ def colors_of(frame: av.VideoFrame, container: Colors) -> Colors:
         transfer=container.transfer if header.transfer in _UNKNOWN else header.transfer,
         matrix=container.matrix if is_silent else header.matrix,
         range=container.range if takes_range else header.range,
+        primaries=container.primaries if header.primaries in _UNKNOWN else header.primaries,
     )
     return known._replace(matrix=_guessed_matrix(known, frame.height)) if known.matrix in _UNKNOWN else known
 

@@ -82,7 +82,8 @@ class CaptureConstants:
     cut_least_contrast: float = 3.0
     """Factor by which the change at a cut exceeds the changes beside it."""
     cut_blocks: tuple[int, int] = (3, 4)
-    """Rows and columns of blocks. The change is that of the quarter that changes most, as the head may be small."""
+    """Rows and columns of blocks. The change is that of half of the blocks, or of the face's place if that is larger.
+    The quarter that changes most also has captions in it, which cost 47 to 67 % of the frames of such videos."""
     cut_thumbnail: tuple[int, int] = (32, 18)
     """Width and height in pixels of the thumbnails that are compared, whatever the picture's shape. Not varied."""
 

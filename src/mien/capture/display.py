@@ -3,24 +3,26 @@
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 from av.sidedata.sidedata import Type as SideDataType
 from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
+from mien.capture.alpha import as_matte, over_ground
 from mien.capture.colors import UNSPECIFIED, Colors, colors_of
-from mien.capture.tone import ToneMapper
+from mien.capture.tone import ToneMapper, is_wide, narrowed
 from mien.capture.video_file import MAX_FRAME_PIXELS, TOO_MANY_PIXELS
 from mien.errors import UserError
 
 ACCURATE = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
 """Without accurate rounding swscale is five times faster, but it darkens pictures by a whole level."""
-_SHRINKING = Interpolation.AREA | Interpolation.ACCURATE_RND
 _ASPECT_TOLERANCE = 0.01
+_SHRINKING = Interpolation.AREA | Interpolation.ACCURATE_RND
 
 
 class Display:
-    """Converts the frames of one clip to one size, which the first frame decides."""
+    """Converts the frames of one clip. Each frame keeps its own size and shape, as recordings of calls change both."""
 
     def __init__(
         self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0, container: Colors = UNSPECIFIED
@@ -39,24 +41,52 @@ class Display:
         self._container = container
         self._reformatter = VideoReformatter()
         self._tone_mappers: dict[int, ToneMapper] = {}
-        self._matrix: list[int] = []
-        self._stored_size = (0, 0)
-        self._size = (0, 0)
+        self._matrix: list[int] | None = None
+
+    def size_of(self, frame: av.VideoFrame) -> tuple[int, int]:
+        """Return the width and height in pixels in which the frame is shown if it is not shrunk.
+
+        Raises:
+            UserError: these are too many pixels.
+        """
+        width, height = self._shown_size(frame, 0)
+        return (height, width) if _swaps_sides(self._display_matrix(frame)) else (width, height)
 
     def show(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Return the frame as an sRGB picture.
 
         Raises:
-            UserError: the aspect ratio differs from that of earlier frames, or the converted frame has too many pixels.
+            UserError: the converted frame has too many pixels.
         """
-        self._fit(frame)
+        if _has_alpha(frame):
+            return self._show_over_ground(frame)
+        return self._turned(frame, self._converted(frame, *self._shown_size(frame, self._longest_side)))
+
+    def alpha(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w"] | None:
+        """Return the alpha of a frame in its size as shown, or None if it has none or is opaque."""
+        if not _has_alpha(frame):
+            return None
+        return as_matte(self._turned(frame, self._alpha(frame, *self._shown_size(frame, 0))))
+
+    def _show_over_ground(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
+        size = self._shown_size(frame, 0)
+        shown = over_ground(self._converted(frame, *size), self._alpha(frame, *size))
+        return self._turned(frame, brought_to(shown, self._shown_size(frame, self._longest_side)))
+
+    def _alpha(self, frame: av.VideoFrame, width: int, height: int) -> UInt8[np.ndarray, "h w"]:
+        with_alpha = self._reformatter.reformat(
+            frame, width=width, height=height, format="rgba", interpolation=ACCURATE
+        )
+        return with_alpha.to_ndarray()[..., 3]
+
+    def _converted(self, frame: av.VideoFrame, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
         colors = colors_of(frame, self._container)
-        same_size = self._size == (frame.width, frame.height)
-        shrinks = self._size[0] < frame.width or self._size[1] < frame.height
+        same_size = (width, height) == (frame.width, frame.height)
+        shrinks = width < frame.width or height < frame.height
         converted = self._reformatter.reformat(
             frame,
-            width=self._size[0],
-            height=self._size[1],
+            width=width,
+            height=height,
             format="rgb48le" if colors.hdr else "rgb24",
             src_colorspace=colors.matrix,
             src_color_range=colors.range,
@@ -64,27 +94,49 @@ class Display:
         ).to_ndarray()
         if colors.hdr:
             mapper = self._tone_mappers.setdefault(colors.transfer, ToneMapper(colors.transfer))
-            converted = mapper.to_srgb(converted)
-        return _turn(converted, self._matrix) if self._matrix else converted
+            return mapper.to_srgb(converted)
+        return narrowed(converted, colors.primaries) if is_wide(colors.primaries) else converted
 
-    def _fit(self, frame: av.VideoFrame) -> None:
-        """Choose the size at the first frame. Later frames may have another resolution, but no other aspect ratio."""
-        stored = (frame.width, frame.height)
-        if stored == self._stored_size:
-            return
-        if self._stored_size == (0, 0):
-            self._stored_size = stored
+    def _turned(self, frame: av.VideoFrame, converted: np.ndarray) -> np.ndarray:
+        matrix = self._display_matrix(frame)
+        return _turn(converted, matrix) if matrix else converted
+
+    def _shown_size(self, frame: av.VideoFrame, longest_side: int) -> tuple[int, int]:
+        """Return the size before the frame is turned."""
+        width, height = _display_size(frame.width, frame.height, self._pixel_aspect, longest_side)
+        if width * height > MAX_FRAME_PIXELS:
+            raise UserError(f"{self._name}: is shown with {width}x{height} pixels, {TOO_MANY_PIXELS}; make it smaller")
+        return width, height
+
+    def _display_matrix(self, frame: av.VideoFrame) -> list[int]:
+        if self._matrix is None:
             self._matrix = _display_matrix(frame)
-            self._size = _display_size(*stored, self._pixel_aspect, self._longest_side)
-            if self._size[0] * self._size[1] > MAX_FRAME_PIXELS:
-                shown = f"{self._size[0]}x{self._size[1]}"
-                raise UserError(f"{self._name}: is shown with {shown} pixels, {TOO_MANY_PIXELS}; make it smaller")
-        elif abs(stored[0] / stored[1] / (self._stored_size[0] / self._stored_size[1]) - 1) > _ASPECT_TOLERANCE:
-            before = f"{self._stored_size[0]}x{self._stored_size[1]}"
-            raise UserError(
-                f"{self._name}: the picture changes from {before} to {stored[0]}x{stored[1]}; "
-                "cut the video there and capture each piece"
-            )
+        return self._matrix
+
+
+def _has_alpha(frame: av.VideoFrame) -> bool:
+    return any(component.is_alpha for component in frame.format.components)
+
+
+def has_shape(picture: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int]) -> bool:
+    """Whether a picture has the aspect ratio of a width and height."""
+    return same_shape((picture.shape[1], picture.shape[0]), size)
+
+
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes have the same aspect ratio, up to the rounding of their sides."""
+    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= _ASPECT_TOLERANCE
+
+
+def brought_to(
+    picture: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int]
+) -> UInt8[np.ndarray, "h2 w2 *channels"]:
+    """Return a picture at a width and height: as it is, shrunk by areas, or enlarged."""
+    if (picture.shape[1], picture.shape[0]) == size:
+        return picture
+    shrinks = picture.shape[1] > size[0]
+    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    return resized.astype(np.uint8, copy=False)
 
 
 def _display_size(width: int, height: int, pixel_aspect: float, longest_side: int) -> tuple[int, int]:
@@ -104,10 +156,14 @@ def _display_matrix(frame: av.VideoFrame) -> list[int]:
     return [] if data is None else np.frombuffer(bytes(data), np.int32)[:5].tolist()
 
 
+def _swaps_sides(matrix: list[int]) -> bool:
+    return bool(matrix) and abs(matrix[1]) > abs(matrix[0])
+
+
 def _turn(image: np.ndarray, matrix: list[int]) -> np.ndarray:
     """Rotate and mirror by the display matrix: x' = a x + c y, y' = b x + d y with entries -1, 0 and 1."""
     a, b, _, c, d = matrix
-    if abs(b) > abs(a):
+    if _swaps_sides(matrix):
         image = image.swapaxes(0, 1)
         flip_x, flip_y = c < 0, b < 0
     else:

@@ -28,10 +28,10 @@ from mien.capture.from_video import (
     prepare,
     read_finished,
 )
-from mien.capture.given import read_given
+from mien.capture.given import read_given, with_own_alpha
 from mien.capture.head_path import HeadPath, choose_crops, disagreeing, find_head_path
 from mien.capture.pace import frame_rate, tell_pauses
-from mien.capture.parts import Part
+from mien.capture.parts import Part, check_one_size
 from mien.capture.people import Person, choose_person
 from mien.capture.process import Chunk, Reel, process_part
 from mien.capture.quality import MEASURES, FrameQuality, quality_report, relative_quality, skin_colors
@@ -207,6 +207,7 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
         landmarks = read_given(job.settings, job.frames).landmarks
         tell_kind(job.frames)
         survey = survey_source(job.frames, folder / camera.camera_id, landmarks, job.detector)
+        check_one_size(survey, job.frames.path)
         tell_fields(job.frames, survey)
         fitted = camera.for_pictures(*(int(side) for side in survey.picture_size))
         views.append(_View(camera.camera_id, job, survey, choose_person(survey), fitted, camera))
@@ -237,7 +238,7 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
         process_part(
             Reel(view.job.frames),
             Part(f"{whole.name}, camera {view.camera_id}", 0, view.survey, _agreed(view.person, path, index), crop),
-            read_given(view.job.settings, view.job.frames),
+            with_own_alpha(read_given(view.job.settings, view.job.frames), view.job.frames, view.survey.transparent),
             layout,
             work / _chunks_of(view.camera_id),
             index,

@@ -16,9 +16,9 @@ import cv2
 from mien.capture.backend import Detector, choose_detector, detector_entry
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FrameLayout
-from mien.capture.given import GivenInputs, read_given
+from mien.capture.given import GivenInputs, read_given, with_own_alpha
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
-from mien.capture.parts import Part, find_parts, whole_part
+from mien.capture.parts import Part, check_one_size, find_parts, whole_part
 from mien.capture.process import Reel, process_part
 from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
@@ -33,7 +33,7 @@ from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
 from mien.terminal import plain_name
 
-RECIPE = 5
+RECIPE = 6
 """Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
 STATE, _CHUNKS = "state.json", "chunks"
 
@@ -86,7 +86,7 @@ def _capture_whole(out: Path, job: CaptureJob) -> Capture:
     scratch = partial_folder(out).with_suffix(".survey")
     with cleaning_up(out, scratch) as survey_folder:
         given = read_given(job.settings, job.frames)
-        survey = _run_survey(job, survey_folder, given)
+        survey, given = _run_survey(job, survey_folder, given)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
         _process(job, Reel(job.frames), part, (1, 1), given, out)
     return read_capture(out)
@@ -133,7 +133,7 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
         check_place(_capture_dir(sequences, first), job)
     with cleaning_up(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
         given = read_given(job.settings, job.frames)
-        survey = _run_survey(job, survey_folder, given)
+        survey, given = _run_survey(job, survey_folder, given)
         parts = find_parts(survey, job.settings, job.frames.path, job.name)
         with hold(*(sequences / part.name for part in parts if part.name != job.name)):
             for part in parts:
@@ -153,7 +153,8 @@ def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_
     """
     settings.check()
     selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
-    frames = open_source(source, selection, settings.fps, settings.turn // 90, settings.deinterlace)
+    turns = settings.turn // 90
+    frames = open_source(source, selection, settings.fps, turns, settings.deinterlace, settings.stream)
     name = name or plain_name(source.resolve().stem)
     # Files enter the key by their content, not by their path.
     contents = {
@@ -266,13 +267,17 @@ def _leads_out(work: Path) -> bool:
         return True
 
 
-def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> Survey:
+def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Survey, GivenInputs]:
+    """Return the survey, and what is given with the alpha of the source."""
     tell_kind(job.frames)
     survey = survey_source(job.frames, prepare(folder, job.key), given.landmarks, job.detector)
+    given = with_own_alpha(given, job.frames, survey.transparent)
+    if any(value is not None for value in vars(given).values()):
+        check_one_size(survey, job.frames.path)
     tell_fields(job.frames, survey)
     if given.landmarks is None:
         check_upright(job.frames, survey, job.settings.turn, job.detector)
-    return survey
+    return survey, given
 
 
 def _process(job: CaptureJob, reel: Reel, part: Part, place: tuple[int, int], given: GivenInputs, out: Path) -> None:

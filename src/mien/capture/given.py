@@ -3,12 +3,12 @@
 import csv
 import io
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from mien.bounded import open_ordinary, short_lines
 from mien.capture.crop import Crop, whole_picture
@@ -19,6 +19,7 @@ from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, list_images, open_source, read_image
 from mien.errors import UserError
 from mien.limits import MAX_NUMBER
+from mien.progress import say
 from mien.storage import read_arrays
 from mien.terminal import counted
 
@@ -32,12 +33,27 @@ _MAX_SHOWN = 40
 class GivenMattes:
     """Mattes of a source's frames, read once and in order."""
 
-    def __init__(self, path: Path, picture_size: tuple[int, int], lens: Lens | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        picture_size: tuple[int, int],
+        lens: Lens | None = None,
+        own: FrameSource | None = None,
+    ) -> None:
+        """Prepare to read mattes.
+
+        Args:
+            path: a video or a folder of pictures.
+            picture_size: width and height in pixels of the source's pictures.
+            lens: lens whose distortion is taken out.
+            own: the source itself, if its alpha is the matte.
+        """
         self._path, self._lens = path, lens
-        self._size = picture_size
-        self._files = list_images(path) if path.is_dir() else None
+        self._size, self._is_own = picture_size, own is not None
+        self._files = list_images(path) if own is None and path.is_dir() else None
         whole = FrameSelection()
-        self._stream = iter(()) if self._files else open_source(path, whole, 25.0).frames()
+        source = replace(own, selection=whole, lens=None) if own else None
+        self._stream = iter(()) if self._files else (source or open_source(path, whole, 25.0)).frames()
 
     def check(self, number: int) -> None:
         """Read one matte, to find mistakes before anything that takes long.
@@ -63,7 +79,9 @@ class GivenMattes:
             frame = next(itertools.dropwhile(lambda frame: frame.number < number, self._stream), None)
             if frame is None:
                 raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
-            name, matte = self._path, frame.picture()[..., 1]
+            name, matte = self._path, frame.alpha()
+            if matte is None:
+                matte = np.full(self._size[::-1], 255, np.uint8) if self._is_own else frame.picture()[..., 1]
         if matte.shape[::-1] != self._size:
             raise UserError(
                 f"{name}: is {matte.shape[1]}x{matte.shape[0]}, but the source's pictures are "
@@ -109,6 +127,28 @@ def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
         landmarks = read_landmarks(settings.landmarks, frames.count())
         landmarks = landmarks if frames.lens is None else frames.lens.straighten_points(landmarks, width, height)
     return GivenInputs(plate, mattes, landmarks)
+
+
+def with_own_alpha(given: GivenInputs, frames: FrameSource, transparent: Bool[np.ndarray, " t"]) -> GivenInputs:
+    """Return the inputs with the source's alpha as mattes, if most of its pictures have some and no mattes are given.
+
+    Args:
+        given: what the user gave besides the source.
+        frames: the source.
+        transparent: its pictures with alpha that is not opaque.
+    """
+    opaque = int((~transparent).sum())
+    if given.mattes is not None or 2 * opaque > len(transparent):
+        return given
+    unused = ", and the clean plate is not used" if given.plate is not None else ""
+    say(f"{frames.path}: its alpha is the matte{unused}")
+    if opaque:
+        say(
+            f"warning: {frames.path}: {opaque} of {len(transparent)} frames are opaque, so all that they show counts "
+            "as the person; give them alpha, or leave them out"
+        )
+    width, height = next(frames.frames()).size()
+    return replace(given, mattes=GivenMattes(frames.path, (width, height), frames.lens, frames))
 
 
 def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]:
@@ -214,5 +254,6 @@ def _read_matte(path: Path) -> UInt8[np.ndarray, "h w"]:
     if matte is None or matte.dtype not in (np.uint8, np.uint16):
         raise UserError(f"{path}: cannot be read as a matte; write a grey picture of 8 or 16 bit")
     if matte.ndim == 3:
-        matte = matte[..., 3 if matte.shape[2] == 4 else 1]
+        has_alpha = matte.shape[2] == 4 and matte[..., 3].min() < matte[..., 3].max()
+        matte = matte[..., 3 if has_alpha else 1]
     return np.ascontiguousarray(matte if matte.dtype == np.uint8 else (matte // 257).astype(np.uint8))

@@ -16,14 +16,15 @@ import av
 import av.error
 import numpy as np
 from av.container import InputContainer
+from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from mien.capture.camera_names import CameraName, remedy
 from mien.capture.colors import UNSPECIFIED
 from mien.capture.constants import CAPTURE
-from mien.capture.display import Display
+from mien.capture.display import Display, brought_to, has_shape
 from mien.capture.video import DEFAULT_FPS
-from mien.capture.video_file import open_video, read_container_tags
+from mien.capture.video_file import find_streams, open_video, read_container_tags
 from mien.errors import UserError
 
 _ASKED = {"framerate": "30", "video_size": "640x480"}
@@ -156,9 +157,13 @@ class LiveCamera:
 
     def _read(self, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
         """Keep each frame when it comes, until the end or an error of the device."""
-        container = read_container_tags(Path(self.name.device))[0] if self.name.is_file else UNSPECIFIED
+        container = UNSPECIFIED
+        if self.name.is_file:
+            path = Path(self.name.device)
+            container, _ = read_container_tags(path, find_streams(path)[0])
         display = Display(str(self.name), 1.0, CAPTURE.live_side, container)
         began: float | None = None
+        size: tuple[int, int] | None = None
         with contextlib.suppress(av.error.FFmpegError, OSError):
             for due, frame in frames:
                 now = self._clock()
@@ -168,7 +173,14 @@ class LiveCamera:
                     now = max(now, began + due)
                 if self._stopping.is_set():
                     return
-                self._keep(LiveFrame(self.frames, now, np.ascontiguousarray(display.show(frame))))
+                picture = display.show(frame)
+                size = size or (picture.shape[1], picture.shape[0])
+                if not has_shape(picture, size):
+                    raise UserError(
+                        f"{self.name}: the picture changes from {size[0]}x{size[1]} to {picture.shape[1]}x"
+                        f"{picture.shape[0]} at {due:.1f} s; start again with what comes after"
+                    )
+                self._keep(LiveFrame(self.frames, now, np.ascontiguousarray(brought_to(picture, size))))
 
     def _keep(self, frame: LiveFrame) -> None:
         if self.is_lost:
@@ -200,7 +212,7 @@ class _Opened(contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFr
 def _file(path: Path) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
     with open_video(path) as (container, stream):
         fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
-        yield _timed(container, fps)
+        yield _timed(container, stream, fps)
 
 
 @contextlib.contextmanager
@@ -209,7 +221,7 @@ def _device(name: CameraName) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]
     with container:
         if not container.streams.video:
             raise UserError(f"--by {name}: has no pictures; {_remedy(name)}")
-        yield _timed(container, DEFAULT_FPS)
+        yield _timed(container, container.streams.video[0], DEFAULT_FPS)
 
 
 def _open_device(name: CameraName) -> InputContainer:
@@ -233,11 +245,11 @@ def _remedy(name: CameraName) -> str:
     return "check the address, and that it can be reached from here" if name.is_stream else remedy()
 
 
-def _timed(container: InputContainer, fps: float) -> Iterator[tuple[float, av.VideoFrame]]:
+def _timed(container: InputContainer, stream: VideoStream, fps: float) -> Iterator[tuple[float, av.VideoFrame]]:
     """Frames with their times in seconds from the first one."""
     first: float | None = None
     latest = -1 / fps
-    for frame in container.decode(video=0):
+    for frame in container.decode(stream):
         seconds = latest + 1 / fps
         if frame.pts is not None and frame.time_base is not None:
             absolute = float(frame.pts * frame.time_base)

@@ -13,6 +13,10 @@ from mien.capture.settings import CaptureSettings
 from mien.capture.survey import Survey, no_face, slice_survey
 from mien.errors import UserError
 from mien.progress import say
+from mien.terminal import counted
+
+_MANY_LEFT_OUT = 0.1
+"""Share of the frames in parts that are left out from which on that is a warning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +44,11 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     Raises:
         UserError: no face was found.
     """
-    cuts = find_cuts(survey.thumbnails) if settings.cuts else []
+    for turn in survey.changes_of_shape():
+        raise UserError(
+            f"{path}: {_change_of_size(survey, turn)}; capture it with `mien capture`, which makes a part of each shape"
+        )
+    cuts = find_cuts(survey.thumbnails, survey.boxes) if settings.cuts else []
     if cuts:
         say(f"warning: {path}: the video cuts to another shot at {_list_times(survey, cuts)}; tracking may fail there")
     part = _make_part(survey, 0, settings, name)
@@ -51,43 +59,89 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
 
 
 def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str) -> list[Part]:
-    """Return a part for each shot that is long enough and shows a face.
+    """Return a part for each shot that is long enough and shows a face. A change of the picture's shape ends a shot.
 
     A single part is called `name`, several are called `name`-1, `name`-2, ...
 
     Raises:
         UserError: there is no such shot.
     """
-    cuts = find_cuts(survey.thumbnails) if settings.cuts else []
-    bounds = [0, *cuts, len(survey.timestamps)]
+    cuts = find_cuts(survey.thumbnails, survey.boxes) if settings.cuts else []
+    turns = survey.changes_of_shape()
+    bounds = sorted({0, *cuts, *turns, len(survey.timestamps)})
     interval = float(np.median(np.diff(survey.timestamps))) if len(survey.timestamps) > 1 else 0.0
     short, faceless, found = [], [], []
     for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
         seconds = float(survey.timestamps[stop - 1] - survey.timestamps[start]) + interval
         # Tolerate half a frame: 25 frames at 25 per second last a second.
-        if cuts and seconds < settings.shortest_part - interval / 2:
-            short.append(start)
+        if len(bounds) > 2 and seconds < settings.shortest_part - interval / 2:
+            short.append((start, stop))
             continue
         part = _make_part(slice_survey(survey, slice(start, stop)), start, settings, name)
-        faceless.append(start) if part is None else found.append(part)
-    if short:
-        least = f"{settings.shortest_part:g} s"
-        say(f"{path}: {len(short)} parts shorter than {least} are left out, at {_list_times(survey, short)}")
+        faceless.append((start, stop)) if part is None else found.append(part)
+    for turn in turns:
+        say(f"{path}: {_change_of_size(survey, turn)}; a part begins there")
     if not found and short:
+        whole = "" if turns else ", or --capture.no-cuts to keep the video whole"
         raise UserError(
-            f"{path}: has {len(cuts)} cuts, and no part of {settings.shortest_part:g} s or more shows a face; "
-            "give a smaller --capture.shortest-part, or --capture.no-cuts to keep the video whole"
+            f"{path}: has {len(bounds) - 1} parts, which begin at {_list_times(survey, bounds[:-1])}, and none of "
+            f"{settings.shortest_part:g} s or more shows a face; give a smaller --capture.shortest-part{whole}"
         )
     if not found:
         raise no_face(path, len(survey.timestamps))
-    if faceless:
-        say(f"{path}: {len(faceless)} parts without a face are left out, at {_list_times(survey, faceless)}")
+    _tell_left_out(path, survey, short, faceless, settings)
     parts = _number_parts(found, name)
     if cuts:
         say(f"{path}: cuts to another shot at {_list_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
     for part in parts:
         _tell_people(path, part)
     return parts
+
+
+def check_one_size(survey: Survey, path: Path) -> None:
+    """Refuse a video whose pictures change their size, for what needs one size: given inputs, calibrated cameras.
+
+    Raises:
+        UserError: the size changes. The message names the second.
+    """
+    changes = np.flatnonzero((survey.sizes[1:] != survey.sizes[:-1]).any(axis=1)) + 1
+    if len(changes):
+        raise UserError(
+            f"{path}: {_change_of_size(survey, int(changes[0]))}; calibrated cameras, and what is given for each "
+            "frame (mattes, landmarks, a clean plate), need one size: convert the video to one"
+        )
+
+
+def _change_of_size(survey: Survey, frame: int) -> str:
+    before, after = ("x".join(map(str, survey.sizes[index].tolist())) for index in (frame - 1, frame))
+    return f"the picture changes from {before} to {after} at {_list_times(survey, [frame])}"
+
+
+def _tell_left_out(
+    path: Path,
+    survey: Survey,
+    short: list[tuple[int, int]],
+    faceless: list[tuple[int, int]],
+    settings: CaptureSettings,
+) -> None:
+    """Say which frames belong to no part. It is a warning if they are many."""
+    total = len(survey.timestamps)
+    many = sum(stop - start for start, stop in short + faceless) > _MANY_LEFT_OUT * total
+    least = f"{settings.shortest_part:g} s"
+    keeps = "--capture.shortest-part keeps shorter ones" + (
+        "" if survey.changes_of_shape() else ", --capture.no-cuts all"
+    )
+    for spans, why, remedy in (
+        (short, f"parts shorter than {least}", keeps),
+        (faceless, "parts without a face", ""),
+    ):
+        if spans:
+            frames = sum(stop - start for start, stop in spans)
+            at = _list_times(survey, [start for start, _ in spans])
+            say(
+                f"{'warning: ' if many else ''}{path}: {len(spans)} {why} are left out, at {at}: {frames} of "
+                f"{counted(total, 'frame')}{f'; {remedy}' if remedy and many else ''}"
+            )
 
 
 def _number_parts(parts: list[Part], name: str) -> list[Part]:
@@ -131,15 +185,20 @@ def _list_times(survey: Survey, frames: list[int]) -> str:
     return f"{listed}{', ...' if len(frames) > 5 else ''} s"
 
 
-def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
+def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"], faces: Float[np.ndarray, "t f 4"] | None = None) -> list[int]:
     """Return the numbers of the frames that begin a new shot; 0 is not among them.
 
-    A cut is a change that is much larger than the changes beside it, and that the next frames do not undo. Thumbnails
-    are divided by their mean before they are compared, so that switching on a light is no cut.
+    A cut is a change of most of the picture, or of the places of all faces. It is much larger than the changes beside
+    it, and the next frames do not undo it. A light that is switched on is no cut. Neither is a caption or a window that
+    appears beside a face, or a person who leaves another one.
+
+    Args:
+        thumbnails: the pictures.
+        faces: left, top, right, bottom of the faces as fractions of each picture, NaN where there are fewer.
     """
     pictures = thumbnails.astype(np.float32)
-    pictures /= np.maximum(pictures.mean(axis=(1, 2, 3), keepdims=True), 1.0)
-    changes = np.array([_difference(*pair) for pair in zip(pictures[:-1], pictures[1:], strict=True)])
+    boxes = np.full((len(pictures), 1, 4), np.nan) if faces is None else faces
+    changes = np.array([_difference(pictures, boxes, index, index + 1) for index in range(len(pictures) - 1)])
     cuts = []
     for index in np.flatnonzero(changes > CAPTURE.cut_least_change).tolist():
         beside = np.concatenate(
@@ -148,20 +207,37 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"]) -> list[int]:
         # The largest neighbour may be the other half of a cut that passes through a blended frame.
         loudest = np.sort(beside)[-2] if len(beside) > 1 else 0.0
         stands_out = changes[index] > CAPTURE.cut_least_contrast * loudest
-        if stands_out and _parted(pictures, index + 1) > 0.5 * changes[index]:
+        if stands_out and _parted(pictures, boxes, index + 1) > 0.5 * changes[index]:
             cuts.append(index + 1)
     return cuts
 
 
-def _parted(pictures: Float[np.ndarray, "t h w 3"], start: int) -> float:
+def _parted(pictures: Float[np.ndarray, "t h w 3"], boxes: Float[np.ndarray, "t f 4"], start: int) -> float:
     """Return the smallest difference between a frame shortly before `start` and one shortly after it."""
-    before, after = pictures[max(start - CAPTURE.cut_reach, 0) : start], pictures[start : start + CAPTURE.cut_reach]
-    return min(_difference(one, other) for one in before for other in after)
+    before = range(max(start - CAPTURE.cut_reach, 0), start)
+    after = range(start, min(start + CAPTURE.cut_reach, len(pictures)))
+    return min(_difference(pictures, boxes, one, other) for one in before for other in after)
 
 
-def _difference(one: Float[np.ndarray, "h w 3"], other: Float[np.ndarray, "h w 3"]) -> float:
+def _difference(
+    pictures: Float[np.ndarray, "t h w 3"], boxes: Float[np.ndarray, "t f 4"], one: int, other: int
+) -> float:
+    """Return the change of most of two pictures, or of the face's place that changes least, relative to their level."""
+    before, after = pictures[one], pictures[other]
+    # A caption changes the mean of a picture, but not the ratio of most of its pixels.
+    gain = float(np.median((after.mean(axis=-1) + 1) / (before.mean(axis=-1) + 1)))
+    change = np.abs(gain * before - after).mean(axis=-1) / max(float(after.mean()), 1.0)
     rows, columns = CAPTURE.cut_blocks
-    height, width = one.shape[0] // rows, one.shape[1] // columns
-    difference = np.abs(one - other).mean(axis=-1)[: rows * height, : columns * width]
-    blocks = np.sort(difference.reshape(rows, height, columns, width).mean(axis=(1, 3)).ravel())
-    return float(blocks[-(rows * columns // 4) :].mean())
+    height, width = change.shape[0] // rows, change.shape[1] // columns
+    blocks = change[: rows * height, : columns * width].reshape(rows, height, columns, width).mean(axis=(1, 3))
+    faces = [float(np.median(_inside(change, box))) for box in (*boxes[one], *boxes[other]) if np.isfinite(box[0])]
+    return max(float(np.median(blocks)), min(faces, default=0.0))
+
+
+def _inside(picture: Float[np.ndarray, "h w"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "h2 w2"]:
+    """Return the part of a picture in a box, at least one pixel."""
+    height, width = picture.shape
+    left, right = np.clip([np.floor(box[0] * width), np.ceil(box[2] * width)], 0, width).astype(int)
+    top, bottom = np.clip([np.floor(box[1] * height), np.ceil(box[3] * height)], 0, height).astype(int)
+    left, top = min(left, width - 1), min(top, height - 1)
+    return picture[top : max(bottom, top + 1), left : max(right, left + 1)]

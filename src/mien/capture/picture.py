@@ -23,6 +23,8 @@ _MAX_SCANS = 200
 """Most scans of a JPEG. Cameras and editors write one to fourteen, and each costs a pass over the whole picture."""
 _NO_FRAMES = (0xC4, 0xC8, 0xCC)
 """Markers between 0xC0 and 0xCF that start no JPEG frame."""
+_HEADER = 4096
+"""Bytes in which a PNG names its transparent colours."""
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _TIFF_WIDTHS, _TIFF_HEIGHTS = (256, 322), (257, 323)
 """TIFF tags of the picture's size and of its tiles' size."""
@@ -56,6 +58,18 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         return None
+
+
+def may_have_alpha(path: Path) -> bool:
+    """Whether the header of a PNG, WebP or TIFF leaves room for alpha. Other pictures have none."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(_HEADER)
+    except OSError:
+        return False
+    if data.startswith(b"\x89PNG"):
+        return data[25:26] in (b"\4", b"\6") or b"tRNS" in data
+    return data[:4] in (b"II\x2a\0", b"MM\0\x2a", b"II\x2b\0", b"MM\0\x2b") or data[8:16] in (b"WEBPVP8X", b"WEBPVP8L")
 
 
 def announced_size(data: bytes) -> tuple[int, int] | None:

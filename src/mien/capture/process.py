@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8, UInt64
 from mien.capture.backend import DetectorChoice
 from mien.capture.constants import CAPTURE
 from mien.capture.crop import Crop
+from mien.capture.display import brought_to
 from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
 from mien.capture.given import GivenInputs
@@ -179,7 +180,8 @@ class PartProcessor:
         return Chunk(landmarks, quality, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 
     def _cropped(self, frame: SourceFrame) -> tuple[int, np.ndarray]:
-        return frame.number, self._part.crop.apply(frame.picture())
+        width, height = self._part.survey.picture_size.tolist()
+        return frame.number, self._part.crop.apply(brought_to(frame.picture(), (width, height)))
 
     def _given_landmarks(self, timestep: int, number: int) -> Float[np.ndarray, "l 2"] | None:
         """Return the user's landmarks, or None if the followed person is not seen."""

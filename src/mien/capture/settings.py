@@ -27,6 +27,9 @@ class CaptureSettings:
     """Time in the video at which to stop, in seconds. 0 captures to the end."""
     turn: Literal[0, 90, 180, 270] = 0
     """Degrees to turn the pictures clockwise, for a video whose rotation flag was lost."""
+    stream: int | None = None
+    """Index of the stream to capture, in a video file that has several, as FFmpeg counts them from 0. By default, it is
+    the one that the file marks as default, or else the one with most pixels."""
     stride: int = 1
     """Take every n-th frame: 2 takes half of them."""
     max_frames: int = 0
@@ -58,6 +61,7 @@ class CaptureSettings:
         _require(_is_at_least(self.start, 0), "start", self.start, "give the seconds to skip, 0 or more")
         later = self.end == 0 or _is_at_least(self.end, self.start) and self.end > self.start
         _require(later, "end", self.end, f"give a time after --capture.start ({self.start:g}), or 0 for all")
+        _require(self.stream is None or self.stream >= 0, "stream", self.stream or 0, "give an index, 0 or more")
         _require(self.stride >= 1, "stride", self.stride, "give 1 for every frame, 2 for every second one, ...")
         _require(self.max_frames >= 0, "max-frames", self.max_frames, "give 0 for all frames, or a positive number")
         _require(_is_at_least(self.fps, 0) and self.fps > 0, "fps", self.fps, "give frames per second, above 0")

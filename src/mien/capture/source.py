@@ -7,16 +7,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.capture.alpha import as_matte, over_ground
 from mien.capture.color_correction import ColorCorrection
 from mien.capture.deinterlacing import Deinterlace
 from mien.capture.lens import Lens
-from mien.capture.picture import decode_picture
+from mien.capture.picture import decode_picture, may_have_alpha
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.capture.video_file import VIDEO_SUFFIXES
 from mien.errors import UserError
@@ -50,8 +51,12 @@ class SourceFrame(NamedTuple):
     """Time since the first frame taken, in seconds."""
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
     """Makes the sRGB picture. This is the costly part, so call it only if the picture is needed."""
+    size: Callable[[], tuple[int, int]]
+    """Returns the width and height in pixels of the picture before it is shrunk. They may change within a video."""
     is_deinterlaced: bool
     """Whether the picture is made of an interlaced frame."""
+    alpha: Callable[[], UInt8[np.ndarray, "h w"] | None]
+    """Makes the alpha of the picture before it is shrunk; None if it has none or is opaque. It ignores the lens."""
     combs: Callable[[], float]
     """Measures the combs of the frame as stored, as a part of its pixels (`mien.capture.fields.combs`)."""
 
@@ -74,6 +79,10 @@ class FrameSource:
     """Number of quarter turns clockwise, besides the file's own rotation flag."""
     deinterlace: Deinterlace = "auto"
     """Which frames of a video are deinterlaced."""
+    stream: int | None = None
+    """Index of the video's stream that is read. None for a folder."""
+    other_streams: tuple[int, ...] = ()
+    """Indices of the video's other streams of pictures."""
     has_field_pictures: bool = False
     """Whether the pictures are single fields of interlaced video, of half the height (HEVC)."""
     lens: Lens | None = None
@@ -90,9 +99,9 @@ class FrameSource:
         if self.path.is_dir():
             everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
         else:
-            everything = read_lazily(self.path, longest_side, self.deinterlace)
+            everything = read_lazily(self.path, longest_side, self.deinterlace, self.stream)
         taken, candidates, first, origin = 0, 0, 0.0, 0.0
-        for number, (seconds, picture, is_deinterlaced, combs) in enumerate(everything):
+        for number, (seconds, picture, size, is_deinterlaced, alpha, combs) in enumerate(everything):
             if number < self.selection.offset:
                 continue
             origin = seconds if number == self.selection.offset and number else origin
@@ -107,7 +116,9 @@ class FrameSource:
             first = seconds if taken == 0 else first
             turned = partial(_turned, picture, self.quarter_turns) if self.quarter_turns else picture
             given = partial(self._as_calibrated, turned) if self.lens or self.colors else turned
-            yield SourceFrame(number, seconds - first, given, is_deinterlaced, combs)
+            shown = partial(_swapped, size) if self.quarter_turns % 2 else size
+            matte = partial(_turned, alpha, self.quarter_turns) if self.quarter_turns else alpha
+            yield SourceFrame(number, seconds - first, given, shown, is_deinterlaced, matte, combs)
             taken += 1
             if taken == self.selection.max_frames:
                 break
@@ -130,11 +141,16 @@ class FrameSource:
         Raises:
             UserError: the source is damaged.
         """
-        return len(list_images(self.path)) if self.path.is_dir() else count_frames(self.path)
+        return len(list_images(self.path)) if self.path.is_dir() else count_frames(self.path, self.stream)
 
 
 def open_source(
-    path: Path, selection: FrameSelection, fps: float, quarter_turns: int = 0, deinterlace: Deinterlace = "auto"
+    path: Path,
+    selection: FrameSelection,
+    fps: float,
+    quarter_turns: int = 0,
+    deinterlace: Deinterlace = "auto",
+    stream: int | None = None,
 ) -> FrameSource:
     """Open a source without reading its frames.
 
@@ -144,18 +160,19 @@ def open_source(
         fps: frame rate of a folder of images, in frames per second. A video has its own.
         quarter_turns: number of quarter turns clockwise.
         deinterlace: which frames of a video are deinterlaced.
+        stream: index of a video's stream; by default that of `mien.capture.video_file.find_streams`.
 
     Raises:
-        UserError: the source is missing, is no video, or holds no images.
+        UserError: the source is missing, is no video, lacks the stream, or holds no images.
     """
-    hdr, has_field_pictures = "", False
+    info = None
     if path.is_dir():
         images = list_images(path)
         total = len(images)
         content_hash = _hash_files(images, with_names=True)
     else:
-        info = probe_video(path)
-        fps, total, hdr, has_field_pictures = info.fps, info.frames, info.hdr, info.has_field_pictures
+        info = probe_video(path, stream)
+        fps, total = info.fps, info.frames
         content_hash = _hash_files([path], with_names=False)
     last = min(total, round(selection.end * fps)) if selection.end else total
     last = min(last, max(0, total - selection.offset))
@@ -169,15 +186,23 @@ def open_source(
         fps / selection.stride,
         expected,
         content_hash,
-        hdr,
+        info.hdr if info else "",
         quarter_turns,
         deinterlace,
-        has_field_pictures,
+        info.stream if info else None,
+        info.other_streams if info else (),
+        info is not None and info.has_field_pictures,
     )
 
 
-def _turned(picture: Callable[[], np.ndarray], quarter_turns: int) -> UInt8[np.ndarray, "h w 3"]:
-    return np.ascontiguousarray(np.rot90(picture(), -quarter_turns))
+def _turned(picture: Callable[[], np.ndarray | None], quarter_turns: int) -> Any:
+    made = picture()
+    return made if made is None else np.ascontiguousarray(np.rot90(made, -quarter_turns))
+
+
+def _swapped(size: Callable[[], tuple[int, int]]) -> tuple[int, int]:
+    width, height = size()
+    return height, width
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -214,12 +239,34 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     return image.astype(np.uint8, copy=False)
 
 
+def _read_with_alpha(path: Path) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]] | None:
+    """Read the colours and the alpha of a picture as they are stored; None if it has no alpha or is opaque."""
+    if not may_have_alpha(path):
+        return None
+    image = decode_picture(path, cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.shape[2] != 4 or image.dtype not in (np.uint8, np.uint16):
+        return None
+    levels = image if image.dtype == np.uint8 else (image // 257).astype(np.uint8)
+    alpha = as_matte(levels[..., 3])
+    return None if alpha is None else (levels[..., 2::-1], alpha)
+
+
+def _alpha_of(path: Path) -> UInt8[np.ndarray, "h w"] | None:
+    read = _read_with_alpha(path)
+    return None if read is None else read[1]
+
+
 def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFrame]:
     shape: tuple[int, ...] | None = None
 
+    def size() -> tuple[int, int]:
+        height, width = shape[:2] if shape else read_image(images[0]).shape[:2]
+        return width, height
+
     def read(path: Path) -> np.ndarray:
         nonlocal shape
-        image = read_image(path)
+        with_alpha = _read_with_alpha(path)
+        image = read_image(path) if with_alpha is None else over_ground(*with_alpha)
         shape = shape or image.shape
         if image.shape != shape:
             raise UserError(
@@ -228,8 +275,9 @@ def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFr
             )
         return shrink_to(image, longest_side) if longest_side else image
 
-    for index, path in enumerate(list_images(folder)):
-        yield LazyFrame(index / fps, partial(read, path))
+    images = list_images(folder)
+    for index, path in enumerate(images):
+        yield LazyFrame(index / fps, partial(read, path), size, alpha=partial(_alpha_of, path))
 
 
 def shrink_to(image: UInt8[np.ndarray, "h w 3"], longest_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:

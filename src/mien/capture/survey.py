@@ -3,10 +3,11 @@
 It also finds out whether the video lies on its side, and explains why no face was found in it.
 """
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 
 from mien.capture.backend import DetectorChoice
 from mien.capture.constants import CAPTURE
+from mien.capture.display import same_shape
 from mien.capture.faces import MAX_FACES, FaceFinder
 from mien.capture.source import FrameSource, SourceFrame
 from mien.errors import UserError
@@ -55,8 +57,20 @@ class Survey:
     """Frames whose picture is made of an interlaced frame."""
     combs: Float[np.ndarray, " t"]
     """Part of each frame as stored in which lines alternate between two moments, 0..1; NaN where it is not measured."""
-    picture_size: Int64[np.ndarray, " 2"]
-    """Width and height of the source in pixels."""
+    transparent: Bool[np.ndarray, " t"]
+    """Pictures with alpha that is not opaque."""
+    sizes: Int64[np.ndarray, "t 2"]
+    """Width and height of each picture in pixels, before it is shrunk."""
+
+    @property
+    def picture_size(self) -> Int64[np.ndarray, " 2"]:
+        """Width and height in pixels of the largest picture, to which the others of its shape are brought."""
+        return self.sizes[np.argmax(self.sizes.prod(axis=1))]
+
+    def changes_of_shape(self) -> list[int]:
+        """Return the numbers of the frames whose aspect ratio differs from that of the frame before."""
+        sizes = [(int(width), int(height)) for width, height in self.sizes]
+        return [index for index in range(1, len(sizes)) if not same_shape(sizes[index - 1], sizes[index])]
 
 
 def survey_source(
@@ -83,14 +97,12 @@ def survey_source(
         return _read(whole)
     for path in itertools.takewhile(Path.exists, (_chunk_path(work, index) for index in itertools.count())):
         done.append(_read(path))
-    first = next(frames.frames()).picture()
-    size = np.array([first.shape[1], first.shape[0]], np.int64)
     stream = itertools.islice(frames.frames(CAPTURE.survey_side), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
     with ExitStack() as stack:
-        find = _search(stack.enter_context(FaceFinder(detector))) if landmarks is None else _look_up(landmarks / size)
+        find = _search(stack.enter_context(FaceFinder(detector))) if landmarks is None else _look_up(landmarks)
         advance = stack.enter_context(progress_bar(title, frames.expected_frames, len(done) * _CHUNK))
-        while seen := _observe(itertools.islice(stream, _CHUNK), find, size, advance):
+        while seen := _observe(itertools.islice(stream, _CHUNK), find, advance):
             _write(_chunk_path(work, len(done)), seen)
             done.append(seen)
     survey = _join(done)
@@ -115,7 +127,8 @@ def _read(path: Path) -> Survey:
     kinds = {
         "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MAX_FACES, 4), np.float64),
         "looks": ((t, MAX_FACES, colors), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
-        "deinterlaced": ((t,), np.bool_), "combs": ((t,), np.float64), "picture_size": ((2,), np.int64),
+        "deinterlaced": ((t,), np.bool_), "combs": ((t,), np.float64), "transparent": ((t,), np.bool_),
+        "sizes": ((t, 2), np.int64),
     }  # fmt: skip
     with expect_whole(path, "delete its folder and run `mien capture` again"):
         for name, (shape, dtype) in kinds.items():
@@ -126,23 +139,22 @@ def _read(path: Path) -> Survey:
 
 def slice_survey(survey: Survey, span: slice) -> Survey:
     """Return some consecutive frames. Their times still count from the start of the whole."""
-    parts = {field.name: getattr(survey, field.name)[span] for field in fields(survey) if field.name != "picture_size"}
-    return Survey(**parts, picture_size=survey.picture_size)
+    return Survey(**{field.name: getattr(survey, field.name)[span] for field in fields(survey)})
 
 
-_Find = Callable[[int, np.ndarray], np.ndarray]
-"""Returns the boxes [n, 4] of the faces in a frame, given its index and its picture."""
+_Find = Callable[[SourceFrame, np.ndarray], np.ndarray]
+"""Returns the boxes [n, 4] of the faces in a frame, given the frame and its picture."""
 
 
 def _search(finder: FaceFinder) -> _Find:
-    return lambda number, image: finder.find(image)
+    return lambda frame, image: finder.find(image)
 
 
 def _look_up(landmarks: Float[np.ndarray, "n l 2"]) -> _Find:
-    """Return boxes around landmarks that are given as fractions of the picture."""
+    """Return boxes around landmarks that are given in pixels."""
 
-    def find(number: int, image: np.ndarray) -> np.ndarray:
-        face = landmarks[number]
+    def find(frame: SourceFrame, image: np.ndarray) -> np.ndarray:
+        face = landmarks[frame.number] / frame.size()
         return (
             np.concatenate([face.min(axis=0), face.max(axis=0)])[None] if np.isfinite(face).all() else np.zeros((0, 4))
         )
@@ -150,26 +162,28 @@ def _look_up(landmarks: Float[np.ndarray, "n l 2"]) -> _Find:
     return find
 
 
-def _observe(stream: Iterator[SourceFrame], find: _Find, size: np.ndarray, advance: Advance) -> Survey | None:
+def _observe(stream: Iterator[SourceFrame], find: _Find, advance: Advance) -> Survey | None:
     """Survey the frames of a stream; None if it is at its end."""
-    rows: list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray, bool, float]] = []
+    rows: list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray, bool, float, bool, tuple[int, int]]] = []
     for frame in stream:
         image = frame.picture()
-        found = find(frame.number, image)
+        found = find(frame, image)
         largest = np.argsort(-np.prod(found[:, 2:] - found[:, :2], axis=1))[:MAX_FACES]
         boxes = np.full((MAX_FACES, 4), np.nan)
         boxes[: len(largest)] = found[largest]
         colors = np.stack([_mean_colors(image, box) for box in boxes])
         thumbnail = cv2.resize(image, CAPTURE.cut_thumbnail, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         measured = frame.combs() if len(rows) % _COMB_STRIDE == 0 else np.nan
-        rows.append((frame.number, frame.seconds, boxes, colors, thumbnail, frame.is_deinterlaced, measured))
+        seen = frame.is_deinterlaced, measured, frame.alpha() is not None, frame.size()
+        rows.append((frame.number, frame.seconds, boxes, colors, thumbnail, *seen))
         advance()
     if not rows:
         return None
-    numbers, timestamps, boxes, colors, thumbnails, deinterlaced, combs = (
+    numbers, timestamps, boxes, colors, thumbnails, deinterlaced, combs, transparent, sizes = (
         np.array(column) for column in zip(*rows, strict=True)
     )
-    return Survey(numbers.astype(np.int64), timestamps, boxes, colors, thumbnails, deinterlaced, combs, size)
+    whole = numbers.astype(np.int64), sizes.astype(np.int64)
+    return Survey(whole[0], timestamps, boxes, colors, thumbnails, deinterlaced, combs, transparent, whole[1])
 
 
 def _mean_colors(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
@@ -190,9 +204,8 @@ def _chunk_path(work: Path, index: int) -> Path:
 
 
 def _join(chunks: list[Survey]) -> Survey:
-    names = [field.name for field in fields(Survey) if field.name != "picture_size"]
-    joined = {name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names}
-    return Survey(**joined, picture_size=chunks[0].picture_size)
+    names = [field.name for field in fields(Survey)]
+    return Survey(**{name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names})
 
 
 def check_upright(frames: FrameSource, survey: Survey, turned: int, detector: DetectorChoice = "auto") -> None:
@@ -210,7 +223,7 @@ def check_upright(frames: FrameSource, survey: Survey, turned: int, detector: De
     turn = _best_turn(frames, survey, detector)
     option = f"--capture.turn {(turned + turn) % 360}"
     if not np.isfinite(survey.boxes).any():
-        raise _no_face_because(frames, survey, option if turn else "")
+        raise _no_face_because(frames, survey, option if turn else "", detector)
     if turn:
         lies = "upside down" if turn == 180 else "on its side"
         say(f"warning: {frames.path}: the face seems to lie {lies}; if it does, add {option}")
@@ -238,9 +251,23 @@ def no_face(path: Path, frames: int, remedy: str = "give a video that shows a fa
     )
 
 
-def _no_face_because(frames: FrameSource, survey: Survey, option: str) -> UserError:
+def _stream_with_face(frames: FrameSource, detector: DetectorChoice) -> int | None:
+    """Return the first of the file's other streams that shows a face in some pictures at its beginning."""
+    for stream in frames.other_streams:
+        other, stride = replace(frames, stream=stream), _BEGINNING // _MAX_TURNED
+        pictures = itertools.islice(other.frames(CAPTURE.survey_side), 0, _BEGINNING, stride)
+        with FaceFinder(detector) as finder, contextlib.suppress(UserError):
+            if any(len(finder.find(frame.picture())) for frame in pictures):
+                return stream
+    return None
+
+
+def _no_face_because(frames: FrameSource, survey: Survey, option: str, detector: DetectorChoice) -> UserError:
     """Return the error for a video without a face, with the cause if the pictures show it."""
     path, count, level = frames.path, len(survey.timestamps), float(survey.thumbnails.mean()) / 255
+    stream = _stream_with_face(frames, detector)
+    if stream is not None:
+        return no_face(path, count, f"stream {stream} of the file shows one: add --capture.stream {stream}")
     if option:
         return no_face(path, count, f"there is one if the pictures are turned: add {option}")
     if level < _MIN_LEVEL:

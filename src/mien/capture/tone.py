@@ -1,4 +1,6 @@
-"""Step 1: convert HDR video to sRGB. PQ or HLG light and BT.2020 colours are mapped to 0..255 by one fixed curve.
+"""Step 1: convert HDR video, and ordinary video in wide colours, to sRGB.
+
+PQ or HLG light and BT.2020 colours are mapped to 0..255 by one fixed curve.
 
 The curve is the same for every frame and every clip, so a face keeps its colours when the scene around it changes:
 
@@ -9,6 +11,8 @@ The curve is the same for every frame and every clip, so a face keeps its colour
    stay.
 4. sRGB's transfer function, 8 bit.
 """
+
+from functools import cache
 
 import cv2
 import numpy as np
@@ -28,6 +32,12 @@ _BT2020_TO_BT709 = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]], np.float32
 )
 """ITU-R BT.2407, section 2."""
+_P3_TO_BT709 = np.array(
+    [[1.224940, -0.224940, 0.0], [-0.042057, 1.042057, 0.0], [-0.019638, -0.078636, 1.098274]], np.float32
+)
+"""Both have the white D65."""
+_WIDE = {9: _BT2020_TO_BT709, 12: _P3_TO_BT709}
+"""Matrices to BT.709 by the code of the primaries (ITU-T H.273)."""
 _BT2020_LUMA = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
 
 
@@ -41,7 +51,6 @@ class ToneMapper:
         signal = np.minimum(np.arange(1 << _SIGNAL_BITS) / (entries - 1), 1)
         decoded = hlg_scene_light(signal) if self._is_hlg else pq_light(signal) / CAPTURE.hdr_white
         self._light = decoded.astype(np.float32)
-        self._levels = np.rint(255 * srgb_signal(np.arange(_LIGHT_STEPS) / (_LIGHT_STEPS - 1))).astype(np.uint8)
 
     def to_srgb(self, picture: UInt16[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Convert a picture of 16-bit non-linear R'G'B' in BT.2020."""
@@ -57,7 +66,22 @@ class ToneMapper:
             light[bright] *= (roll_off(values) / values)[:, None]
         np.clip(light, 0, 1, out=light)
         light *= _LIGHT_STEPS - 1
-        return self._levels[np.rint(light).astype(np.uint16)]
+        return _levels_of_light()[np.rint(light).astype(np.uint16)]
+
+
+def is_wide(primaries: int) -> bool:
+    """Whether primaries (ITU-T H.273) are wide ones that are converted."""
+    return primaries in _WIDE
+
+
+def narrowed(picture: UInt8[np.ndarray, "h w 3"], primaries: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Convert a picture of wide primaries to those of sRGB. Greys stay, and colours outside are clipped.
+
+    The transfer function is taken for that of sRGB, as for all video that is not HDR.
+    """
+    light = cv2.transform(_light_of_levels()[picture], _WIDE[primaries])
+    np.clip(light, 0, 1, out=light)
+    return _levels_of_light()[np.rint(light * (_LIGHT_STEPS - 1)).astype(np.uint16)]
 
 
 def pq_light(signal: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
@@ -84,3 +108,16 @@ def roll_off(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
 def srgb_signal(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
     """Return the sRGB signal 0..1 of linear light 0..1 (IEC 61966-2-1)."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(np.maximum(light, 1e-9), 1 / 2.4) - 0.055)
+
+
+@cache
+def _levels_of_light() -> UInt8[np.ndarray, " n"]:
+    """Return sRGB's levels of `_LIGHT_STEPS` steps of light from 0 to 1."""
+    return np.rint(255 * srgb_signal(np.arange(_LIGHT_STEPS) / (_LIGHT_STEPS - 1))).astype(np.uint8)
+
+
+@cache
+def _light_of_levels() -> Float[np.ndarray, " 256"]:
+    """Return the light 0..1 of sRGB's levels."""
+    light = np.linspace(0, 1, 1 << 16)
+    return np.interp(np.arange(256) / 255, srgb_signal(light), light).astype(np.float32)

@@ -13,15 +13,16 @@ import av
 import av.error
 import numpy as np
 from av.container import InputContainer
+from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from mien.capture.colors import Colors, colors_of
-from mien.capture.display import ACCURATE, Display
+from mien.capture.display import ACCURATE, Display, brought_to, has_shape
 from mien.capture.fields import Deinterlace, FieldOrder, combs, deinterlace, no_combs
 from mien.capture.sound import add_sound
-from mien.capture.video_file import TOO_MANY_PIXELS, create_video, open_video, read_container_tags
+from mien.capture.video_file import TOO_MANY_PIXELS, create_video, find_streams, open_video, read_container_tags
 from mien.errors import UserError
 from mien.files import write_atomically
 from mien.progress import say
@@ -29,6 +30,8 @@ from mien.progress import say
 _THREADS = 2
 DEFAULT_FPS = 25.0
 """Frames a second of a stream that names no rate."""
+_WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+"""Decoders that read the alpha of a codec, if others do not."""
 _MAX_PROBED = 100
 """Packets at the beginning in which a probe looks for a picture."""
 
@@ -45,6 +48,10 @@ class VideoInfo:
     """HDR transfer function: PQ, HLG, or empty for ordinary video."""
     has_field_pictures: bool
     """Whether its pictures are single fields of interlaced video, of half the height (HEVC)."""
+    stream: int
+    """Index of the stream that is read."""
+    other_streams: tuple[int, ...]
+    """Indices of the file's other streams of pictures."""
 
 
 class LazyFrame(NamedTuple):
@@ -54,19 +61,27 @@ class LazyFrame(NamedTuple):
     """Time since the first frame, in seconds."""
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
     """Makes the sRGB picture."""
+    size: Callable[[], tuple[int, int]]
+    """Returns the width and height in pixels of the picture as it is shown, before it is shrunk."""
     is_deinterlaced: bool = False
     """Whether the picture is made of an interlaced frame."""
+    alpha: Callable[[], UInt8[np.ndarray, "h w"] | None] = lambda: None
+    """Makes the alpha of the picture as it is shown, before it is shrunk; None if there is none or it is opaque."""
     combs: Callable[[], float] = no_combs
     """Measures the combs of the frame as stored, as a part of its pixels (`mien.capture.fields.combs`)."""
 
 
-def probe_video(path: Path) -> VideoInfo:
+def probe_video(path: Path, wanted: int | None = None) -> VideoInfo:
     """Return the frame rate, the expected number of frames, and the HDR transfer function.
 
+    Args:
+        path: path of the video.
+        wanted: index of the stream that is read; by default that of `find_streams`.
+
     Raises:
-        UserError: the file is missing or is no video.
+        UserError: the file is missing, is no video, or lacks the stream.
     """
-    with open_video(path) as (container, stream):
+    with open_video(path, wanted) as (container, stream):
         fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
         if stream.duration is not None and stream.time_base is not None:
             seconds = float(stream.duration * stream.time_base)
@@ -76,11 +91,13 @@ def probe_video(path: Path) -> VideoInfo:
         first = _first_frame(container, stream)
         hdr = colors_of(first, colors).hdr if first is not None else ""
         has_field_pictures = first is not None and first.interlaced_frame and order.has_field_pictures
-        return VideoInfo(fps, stream.frames or round(seconds * fps), hdr, has_field_pictures)
+        others = tuple(index for index in find_streams(path) if index != stream.index)
+        frames = stream.frames or round(seconds * fps)
+        return VideoInfo(fps, frames, hdr, has_field_pictures, stream.index, others)
 
 
 def _container_tags(path: Path, stream: VideoStream) -> tuple[Colors, FieldOrder]:
-    colors, order = read_container_tags(path)
+    colors, order = read_container_tags(path, stream.index)
     return colors, FieldOrder(stream.codec_context.name, order)
 
 
@@ -97,13 +114,13 @@ def _first_frame(container: InputContainer, stream: VideoStream) -> av.VideoFram
     return None
 
 
-def count_frames(path: Path) -> int:
-    """Count the frames in a video by reading its packets without decoding them.
+def count_frames(path: Path, wanted: int | None = None) -> int:
+    """Count the frames in a video's stream (`probe_video`) by reading its packets without decoding them.
 
     Raises:
         UserError: the file is missing or is no video.
     """
-    with open_video(path) as (container, stream):
+    with open_video(path, wanted) as (container, stream):
         try:
             # An edit list discards frames that others need for decoding.
             return sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
@@ -113,6 +130,8 @@ def count_frames(path: Path) -> int:
 
 def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
     """Yield every frame in display order: its time in seconds from the first frame, and its sRGB picture.
+
+    Pictures of the first one's shape have its size. Others keep their own.
 
     The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.capture.tone`), and
     interlaced frames are deinterlaced, one picture for each frame (`mien.capture.fields`). Damaged parts are skipped
@@ -125,16 +144,21 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
     Raises:
         UserError: the file is missing, is no video, or no frame of it can be decoded.
     """
+    first: tuple[int, int] | None = None
     for frame in read_lazily(path, longest_side):
-        yield frame.seconds, frame.picture()
+        picture = frame.picture()
+        first = first or (picture.shape[1], picture.shape[0])
+        yield frame.seconds, brought_to(picture, first) if has_shape(picture, first) else picture
 
 
-def read_lazily(path: Path, longest_side: int = 0, mode: Deinterlace = "auto") -> Iterator[LazyFrame]:
+def read_lazily(
+    path: Path, longest_side: int = 0, mode: Deinterlace = "auto", wanted: int | None = None
+) -> Iterator[LazyFrame]:
     """Yield frames as `read_video_frames` does, but convert only pictures that are requested.
 
     The conversion is most of the work.
     """
-    with open_video(path) as (container, stream):
+    with open_video(path, wanted) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
         interval = 1.0 / float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
@@ -152,7 +176,14 @@ def read_lazily(path: Path, longest_side: int = 0, mode: Deinterlace = "auto") -
                 seconds = absolute - first
             # Times must increase for everything that differentiates over time, but broken files repeat them.
             latest = seconds if seconds > latest else latest + interval
-            yield LazyFrame(latest, partial(display.show, shown), is_deinterlaced, partial(combs, frame))
+            yield LazyFrame(
+                latest,
+                partial(display.show, shown),
+                partial(display.size_of, shown),
+                is_deinterlaced,
+                partial(display.alpha, shown),
+                partial(combs, frame),
+            )
 
 
 def write_video(
@@ -227,10 +258,28 @@ def _encode(
         container.mux([packet for packet in (heard, *packets) if packet is not None])
 
 
+def _decoder(stream: VideoStream) -> Callable[[av.Packet], list[av.VideoFrame]]:
+    """Return what decodes the packets of a stream. FFmpeg's own decoders of VP8 and VP9 leave out the alpha."""
+    name = _WITH_ALPHA.get(stream.codec_context.name)
+    if name is None or stream.metadata.get("alpha_mode") != "1":
+        return lambda packet: [frame for frame in packet.decode() if isinstance(frame, av.VideoFrame)]
+    context = av.CodecContext.create(name, "r")
+    assert isinstance(context, VideoCodecContext)
+    context.options = stream.codec_context.options
+
+    def decode(packet: av.Packet) -> list[av.VideoFrame]:
+        frames = context.decode(packet if packet.size else None)
+        for frame in frames:
+            frame.time_base = stream.time_base
+        return frames
+
+    return decode
+
+
 def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
     """Yield all frames. Parts that cannot be decoded are skipped, counted, and reported at the end."""
     damaged, decoded = 0, 0
-    packets = container.demux(stream)
+    packets, decode = container.demux(stream), _decoder(stream)
     while True:
         try:
             packet = next(packets, None)
@@ -242,7 +291,7 @@ def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Itera
         if packet is None:
             break
         try:
-            frames = packet.decode()
+            frames = decode(packet)
         except av.error.FFmpegError:
             damaged += 1
             continue

@@ -5,11 +5,14 @@ playlist makes it open the files in the list. So it never gets a name here. It r
 opened, may open nothing else, and accepts only containers that hold their own pictures.
 """
 
+import contextlib
+import itertools
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import av
 import av.error
@@ -48,6 +51,12 @@ _ANY_TITLE: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version_
 """Titles may have any encoding. PyAV 19 takes them as they are and no longer has the argument."""
 _BUFFER = 1 << 16
 """Bytes that FFmpeg requests at a time."""
+_STILLS = Disposition.timed_thumbnails | Disposition.still_image
+_MOST_FPS = 1000
+"""Frames a second above which a stream of pictures is no film."""
+_COUNTED = 5000
+"""Packets in which a stream has to have two, or it counts as a still picture."""
+_AnyStream = TypeVar("_AnyStream", VideoStream, AudioStream)
 
 
 class _Local:
@@ -60,22 +69,39 @@ class _Local:
 
 
 @contextmanager
-def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open a video file and its first stream of moving pictures, ready to be decoded. A cover picture does not count.
+def open_video(path: Path, wanted: int | None = None) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Open a video file and a stream of moving pictures, ready to be decoded.
+
+    Args:
+        path: path of the file.
+        wanted: index of the stream. By default it is the first one that `find_streams` returns.
 
     Raises:
-        UserError: the file is missing, is no video, has a container or codec that is not supported, or has pictures of
-            more than `MAX_FRAME_PIXELS` pixels.
+        UserError: the file is missing, is no video, has a container or codec that is not supported, lacks the wanted
+            stream, or has pictures of more than `MAX_FRAME_PIXELS` pixels.
     """
     with _open_container(path, "video") as container:
-        stream = _moving_pictures(path, container)
+        stream = _moving_pictures(path, container, wanted)
         _check_size(path, stream.codec_context.width, stream.codec_context.height)
         stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
         yield container, stream
 
 
-def read_container_tags(path: Path) -> tuple[Colors, int]:
-    """Return the colours of a video and the order of its fields (FFmpeg's code) as its container states them.
+def find_streams(path: Path) -> list[int]:
+    """Return the indices of a file's streams of moving pictures, the one that counts as the video first.
+
+    Covers, thumbnails, streams of one packet and streams of more than 1,000 frames a second come last. Of the others,
+    streams that the file marks as default come first, then those with more pixels.
+
+    Raises:
+        UserError: as `open_video` does.
+    """
+    with _open_container(path, "video") as container:
+        return [stream.index for stream in _rank(path, _known_pictures(path, container))]
+
+
+def read_container_tags(path: Path, index: int) -> tuple[Colors, int]:
+    """Return the colours of a stream and the order of its fields (FFmpeg's code) as its container states them.
 
     FFmpeg replaces them by what the first pictures say as soon as it may decode them, so it may not here.
 
@@ -83,13 +109,13 @@ def read_container_tags(path: Path) -> tuple[Colors, int]:
         UserError: as `open_video` does.
     """
     with _open_container(path, "video", {"codec_whitelist": "none"}) as container:
-        context = _moving_pictures(path, container).codec_context
+        context = _moving_pictures(path, container, index).codec_context
         return stated_colors(context), context.field_order
 
 
 @contextmanager
 def open_sound(path: Path) -> Iterator[tuple[InputContainer, AudioStream]]:
-    """Open a file and its first stream of sound, ready to be decoded.
+    """Open a file and its stream of sound, chosen by the rule of `find_streams`, ready to be decoded.
 
     Raises:
         UserError: the file is missing, is neither sound nor video, or has no sound that can be decoded.
@@ -98,7 +124,7 @@ def open_sound(path: Path) -> Iterator[tuple[InputContainer, AudioStream]]:
         streams = [stream for stream in container.streams.audio if stream.codec_context is not None]
         if not streams:
             raise UserError(f"{path}: has no sound; give a file with sound in it, such as a .wav")
-        yield container, streams[0]
+        yield container, _rank(path, streams)[0]
 
 
 @contextmanager
@@ -186,7 +212,24 @@ def _why_not(path: Path, error: av.error.FFmpegError | OSError, kind: str) -> st
     return f"cannot be read as a video ({error.strerror or error}); {remedy}"
 
 
-def _moving_pictures(path: Path, container: InputContainer) -> VideoStream:
+def _moving_pictures(path: Path, container: InputContainer, wanted: int | None) -> VideoStream:
+    known = _known_pictures(path, container)
+    if wanted is None:
+        return _rank(path, known)[0]
+    for stream in container.streams.video:
+        if stream.index == wanted and stream.codec_context is not None:
+            return stream
+    raise UserError(
+        f"{path}: --capture.stream {wanted} is no stream of pictures; its streams of pictures are {list_streams(known)}"
+    )
+
+
+def list_streams(streams: Sequence[VideoStream]) -> str:
+    """Return the indices and sizes of streams, for messages."""
+    return ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in streams)
+
+
+def _known_pictures(path: Path, container: InputContainer) -> list[VideoStream]:
     streams = container.streams.video
     if not streams:
         raise UserError(f"{path}: has no video stream; give a file with pictures in it")
@@ -198,7 +241,34 @@ def _moving_pictures(path: Path, container: InputContainer) -> VideoStream:
     if not known:
         codec = _codec_name(container, moving[0].index)
         raise UserError(f"{path}: FFmpeg does not know its codec ({codec}); convert it to H.264")
-    return known[0]
+    return known
+
+
+def _rank(path: Path, streams: list[_AnyStream]) -> list[_AnyStream]:
+    """Return the streams of one kind in the order of `find_streams`."""
+    if len(streams) == 1:
+        return streams
+    packets = _count_packets(path, [stream.index for stream in streams])
+
+    def place(stream: _AnyStream) -> tuple[bool, bool, int, int]:
+        pixels = stream.width * stream.height if isinstance(stream, VideoStream) else 0
+        is_still = packets[stream.index] < 2 or bool(stream.disposition & _STILLS)
+        is_odd = isinstance(stream, VideoStream) and (stream.average_rate or 0) > _MOST_FPS
+        return is_still or is_odd, not stream.disposition & Disposition.default, -pixels, stream.index
+
+    return sorted(streams, key=place)
+
+
+def _count_packets(path: Path, indices: list[int]) -> Counter[int]:
+    """Count the packets of streams, until each has two or many of another have been read."""
+    counts: Counter[int] = Counter()
+    damage = contextlib.suppress(av.error.FFmpegError, OSError)
+    with _open_container(path, "video", {"codec_whitelist": "none"}) as container, damage:
+        for packet in itertools.islice(container.demux([container.streams[index] for index in indices]), _COUNTED):
+            counts[packet.stream_index] += packet.size > 0
+            if all(counts[index] > 1 for index in indices):
+                break
+    return counts
 
 
 def _codec_name(container: InputContainer, index: int) -> str:

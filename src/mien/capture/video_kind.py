@@ -20,6 +20,12 @@ progressive clips have at most 0.0008, with noise of 8 levels 0.0027. Woven from
 
 def tell_kind(frames: FrameSource) -> None:
     """Say what the file states, before it is read."""
+    if frames.other_streams:
+        others = ", ".join(map(str, frames.other_streams))
+        say(
+            f"{frames.path}: has several streams of pictures; stream {frames.stream} is captured, and --capture.stream "
+            f"chooses another ({others})"
+        )
     if frames.hdr:
         say(f"{frames.path}: HDR video ({frames.hdr}); its pictures are tone-mapped to sRGB")
     if frames.has_field_pictures:

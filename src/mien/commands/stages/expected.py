@@ -28,7 +28,7 @@ def count_captured(source: Path, settings: CaptureSettings) -> int:
         if source.is_dir():
             fps, frames = settings.fps, len(listed(source))
         else:
-            info = probe_video(source)
+            info = probe_video(source, settings.stream)
             fps, frames = info.fps, info.frames
     except (UserError, OSError):  # the stage itself reports it
         return 0
