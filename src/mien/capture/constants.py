@@ -103,6 +103,30 @@ class CaptureConstants:
     person_least_frames: int = 3
     """Frames below which a track counts as a false detection, in clips of at least as many frames. Not varied."""
 
+    # same_person.py; chosen on thirds of the seven reference clips, which show seven people (log)
+    identity_pictures: int = 48
+    """Pictures of a capture, spread evenly, of which shapes of faces are compared. Not varied."""
+    identity_most_pairs: int = 8
+    """Pairs of pictures that are compared, those of the most similar poses. Not varied."""
+    identity_least_pairs: int = 3
+    """Pairs below which nothing is said. Not varied."""
+    identity_most_turn: float = 0.35
+    """Angle in radians between the poses of two pictures up to which they are compared."""
+    identity_noise: float = 1e-3
+    """Variance of a coordinate, added to the spread within clips, in units of the face's size."""
+    identity_most_difference: float = 3.1
+    """Largest difference of one person's faces. Thirds of a clip differ by up to 2.7, two people by 3.5 or more."""
+    identity_near_turn: float = 0.15
+    """Angle up to which that holds; the estimated shape follows the pose..."""
+    identity_turn_allowance: float = 20.0
+    """...and this much more difference is allowed for each radian beyond."""
+    identity_neighbors: int = 4
+    """Most captures of a workspace that a new one is compared with. Not varied."""
+    identity_noise: float = 3e-4
+    """Variance of a coordinate below which the spread within a clip is not trusted, in units of the face's size."""
+    identity_most_difference: float = 4.6
+    """Difference up to which two captures show one person. Halves of a clip differ by at most 3.3, people by 5.4."""
+
     # plate.py
     plate_person_level: float = 0.9
     """Value of the person mask from which it is trusted away from its border. All numbers of plates were set by eye."""

@@ -6,21 +6,23 @@ Only a few frames are in memory at a time.
 import hashlib
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from mien.capture.backend import Detector, choose_detector, detector_entry
 from mien.capture.capture import Capture
-from mien.capture.frame_files import FrameLayout
+from mien.capture.frame_files import FRAMES, FrameLayout
 from mien.capture.given import GivenInputs, read_given, with_own_alpha
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
-from mien.capture.parts import Part, check_one_size, find_parts, whole_part
-from mien.capture.process import Reel, process_part
+from mien.capture.parts import Part, check_one_size, find_parts, number_parts, whole_part
+from mien.capture.process import Chunk, Reel, process_part
 from mien.capture.room import check_room
+from mien.capture.same_person import check_neighbors, face_shapes, group_people, tell_who
 from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, FrameSource, open_source
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
@@ -48,6 +50,19 @@ class CaptureJob:
     key: str
     replace: bool
     detector: Detector = "mediapipe"
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A part whose frames and mattes are written, but not the files beside them."""
+
+    part: Part
+    layout: FrameLayout
+    chunks: list[Chunk]
+
+    def pictures(self) -> np.ndarray:
+        """Frames [t, h, w, 3] as a memory map."""
+        return np.memmap(self.layout.raw(FRAMES), np.uint8, "r", shape=self.layout.shape(FRAMES))[:, 0]
 
 
 def capture_video(
@@ -88,7 +103,10 @@ def _capture_whole(out: Path, job: CaptureJob) -> Capture:
         given = read_given(job.settings, job.frames)
         survey, given = _run_survey(job, survey_folder, given)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
-        _process(job, Reel(job.frames), part, (1, 1), given, out)
+        key = _part_key(job, 1, 1)
+        draft = _draft(job, Reel(job.frames), part, key, given, out)
+        if draft is not None:
+            _finish(job, draft, key, (1, 1), given, out)
     return read_capture(out)
 
 
@@ -138,11 +156,55 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
         with hold(*(sequences / part.name for part in parts if part.name != job.name)):
             for part in parts:
                 check_place(_capture_dir(sequences, part.name), job)
-            reel = Reel(job.frames)
-            for number, part in enumerate(parts, 1):
-                _process(job, reel, part, (number, len(parts)), given, _capture_dir(sequences, part.name))
+            parts = _capture_one_person(sequences, job, parts, given)
     _tell_leftovers(sequences, job, {part.name for part in parts})
     return [read_capture(_capture_dir(sequences, part.name)) for part in parts]
+
+
+def _capture_one_person(sequences: Path, job: CaptureJob, parts: list[Part], given: GivenInputs) -> list[Part]:
+    """Capture the parts that show the person of the settings, and return them under their final names.
+
+    Raises:
+        UserError: the workspace's other captures show another person, or there is no such person.
+    """
+    reel, drafts = Reel(job.frames), []
+    for number, part in enumerate(parts, 1):
+        out = _capture_dir(sequences, part.name)
+        drafts.append(_draft(job, reel, part, _part_key(job, number, len(parts)), given, out))
+    unfinished = [draft for draft in drafts if draft is not None]
+    if len(unfinished) == len(parts) and job.settings.person:
+        # Parts that are finished were compared by the call that was interrupted.
+        try:
+            parts = _kept(sequences, job, unfinished)
+        except UserError:
+            _discard(unfinished)
+            raise
+        drafts = [draft for draft in drafts if any(draft.part.start == part.start for part in parts)]
+    for number, (draft, part) in enumerate(zip(drafts, parts, strict=True), 1):
+        if draft is not None:
+            place, out = (number, len(parts)), _capture_dir(sequences, part.name)
+            out.parent.mkdir(exist_ok=True)
+            _finish(job, replace(draft, part=part), _part_key(job, *place), place, given, out)
+    _discard(unfinished)
+    return parts
+
+
+def _discard(drafts: list[Draft]) -> None:
+    for draft in drafts:
+        remove_tree(draft.layout.folder)
+        with suppress(OSError):  # a capture is in it
+            draft.layout.folder.parent.rmdir()
+
+
+def _kept(sequences: Path, job: CaptureJob, drafts: list[Draft]) -> list[Part]:
+    parts, person = [draft.part for draft in drafts], job.settings.person
+    shapes = [face_shapes(draft.pictures(), job.detector) for draft in drafts] if len(drafts) > 1 else []
+    people = group_people(shapes, [part.timesteps for part in parts]) if shapes else [[0]]
+    tell_who(job.frames.path, parts, people, person)
+    kept = people[person - 1]
+    first = drafts[max(kept, key=lambda index: parts[index].timesteps)]
+    check_neighbors(sequences, job.name, job.frames.path, first.pictures(), job.detector)
+    return number_parts([parts[index] for index in kept], job.name)
 
 
 def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> CaptureJob:
@@ -280,17 +342,20 @@ def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Surv
     return survey, given
 
 
-def _process(job: CaptureJob, reel: Reel, part: Part, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
-    """Capture one part, unless that has been done."""
-    key = _part_key(job, *place)
+def _draft(job: CaptureJob, reel: Reel, part: Part, key: str, given: GivenInputs, out: Path) -> Draft | None:
+    """Write the frames and mattes of a part beside `out`, or return None if the part is finished."""
     if read_finished(out, key) is not None:
-        return
+        return None
     work = prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
     check_room(layout, part.name, out)
-    chunks = process_part(reel, part, given, layout, work / _CHUNKS, detector=job.detector)
+    return Draft(part, layout, process_part(reel, part, given, layout, work / _CHUNKS, detector=job.detector))
+
+
+def _finish(job: CaptureJob, draft: Draft, key: str, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
     detector = job.detector if given.landmarks is None else "mediapipe"
-    finish_part(layout, out, chunks, part, Origin(job.frames, key, job.name, place, detector), (STATE, _CHUNKS))
+    origin = Origin(job.frames, key, job.name, place, detector)
+    finish_part(draft.layout, out, draft.chunks, draft.part, origin, (STATE, _CHUNKS))
 
 
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:

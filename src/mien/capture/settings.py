@@ -41,6 +41,9 @@ class CaptureSettings:
     it whole."""
     shortest_part: float = 1.0
     """Shortest shot to keep in a video with cuts, in seconds. Shorter shots are left out."""
+    person: int = 1
+    """Whom to keep of a video that cuts between people: 1 is the person in most frames, 2 the next. 0 takes all for one
+    person, and does not compare them with other videos of the workspace."""
     deinterlace: Deinterlace = "auto"
     """Which frames of an interlaced video become progressive pictures, one for each frame. auto: those that are marked
     as interlaced. always: all, for a video that lost the mark. never: none, for one that was filmed progressively."""
@@ -66,6 +69,9 @@ class CaptureSettings:
         _require(self.max_frames >= 0, "max-frames", self.max_frames, "give 0 for all frames, or a positive number")
         _require(_is_at_least(self.fps, 0) and self.fps > 0, "fps", self.fps, "give frames per second, above 0")
         _require(_is_at_least(self.shortest_part, 0), "shortest-part", self.shortest_part, "give seconds, 0 or more")
+        _require(
+            self.person >= 0, "person", self.person, "give 1 for the person in most frames, 2, 3, ..., or 0 for all"
+        )
         if self.mattes is not None and self.clean_plate is not None:
             raise UserError("--capture.mattes and --capture.clean-plate: give one of them; ready mattes need no plate")
         for option, path in (

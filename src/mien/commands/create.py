@@ -88,6 +88,7 @@ class Command:
         from mien.commands.stages.tracking import check_masks
         from mien.progress import say, whole_command
         from mien.training import check_run, check_untouched
+        from mien.training.run import check_videos as check_trained_videos
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
@@ -101,6 +102,7 @@ class Command:
         check_masks(workspace, workspace.sequence_names(), self.scoring)
         if self.calibration is None:
             names = sequence_names(self.videos, self.name)
+            check_trained_videos(workspace.run_dir(run), names, workspace.sequence_names())
             for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
                 say(f"warning: {warning}")
         with whole_command(self._overall(settings)):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import sys
 from collections.abc import Mapping
 from collections.abc import Sequence as Items
@@ -87,6 +88,33 @@ def check_run(
     if names is not None and trained != list(names):
         raise UserError(f"{run_dir}: was trained on {', '.join(trained)}, not on {', '.join(names)}; {remedy}")
     return True
+
+
+def check_videos(run_dir: Path, names: Items[str], known: Items[str]) -> None:
+    """Check that a run was trained on the captures of these videos, before they are captured.
+
+    Args:
+        run_dir: folder of the run, which may be missing.
+        names: names of the videos. One with cuts becomes NAME-1, NAME-2, ...
+        known: names of the workspace's sequences. Those that are known may be left out of a run.
+
+    Raises:
+        UserError: it was trained on others.
+    """
+    if not (run_dir / "config.json").is_file():
+        return
+    trained = [entry["sequence"] for entry in read_run_config(run_dir)["data"]]
+    of = {sequence: name for name in names for sequence in (*trained, *known) if is_part_of(sequence, name)}
+    if not all(sequence in of for sequence in trained) or not set(names) <= set(of.values()):
+        raise UserError(
+            f"{run_dir}: was trained on {', '.join(trained)}, not on {', '.join(names)}; give this run another name "
+            "(--run NAME) or delete it"
+        )
+
+
+def is_part_of(sequence: str, name: str) -> bool:
+    """Whether a sequence is called as a video, or as one of its parts NAME-1, NAME-2, ..."""
+    return sequence == name or re.fullmatch(re.escape(name) + r"-\d+", sequence) is not None
 
 
 def check_data(run_dir: Path, trackings: Mapping[str, Tracking]) -> None:
