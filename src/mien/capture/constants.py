@@ -103,6 +103,17 @@ class CaptureConstants:
     person_least_frames: int = 3
     """Frames below which a track counts as a false detection, in clips of at least as many frames. Not varied."""
 
+    # matte_owner.py
+    matte_apart_distance: float = 0.02
+    """Distance from the person, as a fraction of the longer side, from which a region of the matte is not theirs. Set
+    by eye on d14 and s18, with the next two."""
+    matte_apart_most_area: float = 0.25
+    """Area of such a region, in areas of the person's, up to which it goes: shoulders below a covered neck stay."""
+    matte_bridge: float = 0.008
+    """Half of the width of what does not join two regions, in longer sides: ends of hair reach to d14's bottle."""
+    matte_held_frames: int = 12
+    """Frames before and after in which another face still counts where it is not found. Not varied."""
+
     # same_person.py; chosen on thirds of the seven reference clips, which show seven people (log)
     identity_pictures: int = 48
     """Pictures of a capture, spread evenly, of which shapes of faces are compared. Not varied."""

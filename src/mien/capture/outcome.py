@@ -82,6 +82,7 @@ def finish_part(
         "frames": len(valid),
         "frames_without_face": int((~valid).sum()),
         "frames_with_several_faces": int(part.person.crowded.sum()),
+        "matte_pixels_taken_off": round(float(np.concatenate([chunk.taken_off for chunk in chunks]).mean()), 1),
         "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
         **kind_report(origin.frames, survey),
         **pace_report(part.name, timestamps),

@@ -19,6 +19,7 @@ from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
 from mien.capture.given import GivenInputs
 from mien.capture.matte import MakeMatte, choose_matting
+from mien.capture.matte_owner import held, without_others
 from mien.capture.parts import Part
 from mien.capture.people import Person
 from mien.capture.quality import MEASURES, measure_face
@@ -40,6 +41,8 @@ class Chunk:
     """Positions in pixels of the cropped frames; NaN where there is no face."""
     quality: Float[np.ndarray, "t m"]
     """Results of `measure_face`; NaN where there is no face."""
+    taken_off: Float[np.ndarray, " t"]
+    """Pixels of the matte that are not the person's, and were taken off."""
     frame_digests: UInt64[np.ndarray, "t 1"]
     matte_digests: UInt64[np.ndarray, "t 1"]
 
@@ -133,6 +136,8 @@ class PartProcessor:
         """Prepare to process the part, skipping its first `done` frames."""
         self._path, self._part, self._given = reel.path, part, given
         self._detector: DetectorChoice = detector
+        others = held(part.person.others, CAPTURE.matte_held_frames) * np.tile(part.survey.picture_size, 2)
+        self._others = _to_crop(others, part.crop)
         begin = done - CAPTURE.lead_in if done >= CAPTURE.lead_in else 0
         left = part.timesteps - begin
         self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
@@ -152,6 +157,7 @@ class PartProcessor:
         part = self._part
         landmarks = np.full((count, LANDMARKS, 2), np.nan, np.float32)
         quality = np.full((count, MEASURES), np.nan, np.float32)
+        taken_off = np.zeros(count, np.float32)
         done = 0
         with ExitStack() as stack:
             follower = None
@@ -168,7 +174,10 @@ class PartProcessor:
                 found = self._given_landmarks(timestep, number) if follower is None else follower.find(timestep, image)
                 if found is not None:
                     landmarks[index] = found
-                make = partial(_finish, image, matting.prepare(number, image), landmarks[index], quality[index])
+                make_matte = matting.prepare(number, image)
+                if self._given.mattes is None and found is not None:
+                    make_matte = partial(_own_matte, make_matte, found, self._others[timestep], taken_off[index:][:1])
+                make = partial(_finish, image, make_matte, landmarks[index], quality[index])
                 writer.submit(timestep, make)
                 self._recent.append((timestep, image))
                 advance()
@@ -177,7 +186,7 @@ class PartProcessor:
         if done < count:
             raise UserError(f"{self._path}: has fewer frames than before; wait until it is complete, then run it again")
         span = slice(start, start + count), slice(camera, camera + 1)
-        return Chunk(landmarks, quality, writer.digests[FRAMES][span], writer.digests[MATTES][span])
+        return Chunk(landmarks, quality, taken_off, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 
     def _cropped(self, frame: SourceFrame) -> tuple[int, np.ndarray]:
         width, height = self._part.survey.picture_size.tolist()
@@ -204,6 +213,8 @@ def _read(path: Path) -> Chunk:
             or arrays["quality"].shape != (t, MEASURES)
         ):
             raise ValueError("landmarks or quality of another size")
+        if arrays["taken_off"].shape != (t,):
+            raise ValueError("pixels taken off of another number")
         if any(arrays[name].shape != (t, 1) for name in ("frame_digests", "matte_digests")):
             raise ValueError("digests of another number")
         if len({len(array) for array in arrays.values()}) > 1:
@@ -241,6 +252,14 @@ def process_part(
             write_arrays(path, vars(chunk))
             chunks.append(chunk)
     return chunks
+
+
+def _own_matte(make: MakeMatte, landmarks: np.ndarray, others: np.ndarray, taken_off: np.ndarray) -> np.ndarray:
+    """Make the matte of the person with these landmarks, and write how many pixels that takes off."""
+    matte = make()
+    own = without_others(matte, _box(landmarks).astype(np.float64), others)
+    taken_off[:] = ((matte > 0) & (own == 0)).sum()
+    return own
 
 
 def _finish(

@@ -75,8 +75,10 @@ def shape_difference(one: Shapes, other: Float[np.ndarray, "m k 3"]) -> float | 
     return float(np.linalg.norm(change @ directions / scale)) / allowed
 
 
-def group_people(shapes: Sequence[Shapes], frames: Sequence[int]) -> list[list[int]]:
-    """Return the captures (as indices) of each person, the person with most frames first.
+def group_people(shapes: Sequence[np.ndarray], frames: Sequence[int]) -> list[list[int]]:
+    """Return the captures (as indices, with their `face_shapes` and numbers of frames) of each person.
+
+    The person with most frames comes first.
 
     A capture joins the person whose longest capture it differs from least, unless it differs from all of them. It
     joins the first one where nothing can be said.
