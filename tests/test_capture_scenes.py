@@ -14,7 +14,7 @@ import pytest
 
 from capture_helpers import face_picture, interrupt_at, tree_bytes
 from mien.avatar import DEFAULT_METHOD
-from mien.capture import CaptureSettings, capture_video, capture_video_parts, from_video, read_capture
+from mien.capture import CaptureSettings, capture_video, capture_video_parts, process, read_capture
 from mien.capture.crop import Crop
 from mien.capture.faces import MAX_FACES, LandmarkDetector
 from mien.capture.parts import find_cuts
@@ -142,7 +142,7 @@ def test_cuts_can_be_ignored_and_short_parts_kept(shots, tmp_path, capsys):
 def test_interrupted_parts_go_on_to_the_same_bytes(shots, tmp_path, monkeypatch):
     settings = CaptureSettings(size=64, shortest_part=0.2, max_frames=17)
     capture_video_parts(shots, tmp_path / "straight", settings)
-    calls = interrupt_at(2, monkeypatch, from_video, "process_part")
+    calls = interrupt_at(2, monkeypatch, process, "PartProcessor")
     with pytest.raises(KeyboardInterrupt):
         capture_video_parts(shots, tmp_path / "interrupted", settings)
     capture_video_parts(shots, tmp_path / "interrupted", settings)

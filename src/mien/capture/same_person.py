@@ -78,15 +78,14 @@ def shape_difference(one: Shapes, other: Float[np.ndarray, "m k 3"]) -> float | 
 def group_people(shapes: Sequence[np.ndarray], frames: Sequence[int]) -> list[list[int]]:
     """Return the captures (as indices, with their `face_shapes` and numbers of frames) of each person.
 
-    The person with most frames comes first.
-
-    A capture joins the person whose longest capture it differs from least, unless it differs from all of them. It
-    joins the first one where nothing can be said.
+    The person with most frames comes first. A capture joins the person whose longest capture it differs from least. It
+    is of somebody else if it differs from all; where nothing can be said about a person, it joins that one.
     """
     people: list[list[int]] = []
     for index in sorted(range(len(shapes)), key=lambda index: (-frames[index], index)):
-        found = [shape_difference(shapes[person[0]], shapes[index]) for person in people]
-        likely = [(difference or 0.0, person) for difference, person in zip(found, people, strict=True)]
+        found = [(shape_difference(shapes[person[0]], shapes[index]), person) for person in people]
+        # An unknown difference is as good as the limit.
+        likely = [(1.0 if difference is None else difference, person) for difference, person in found]
         difference, person = min(likely, key=lambda pair: pair[0], default=(np.inf, []))
         person.append(index) if difference <= 1 else people.append([index])
     return sorted((sorted(person) for person in people), key=lambda person: -sum(frames[index] for index in person))
