@@ -50,7 +50,7 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
         )
     cuts = find_cuts(survey.thumbnails, survey.boxes) if settings.cuts else []
     if cuts:
-        say(f"warning: {path}: the video cuts to another shot at {list_times(survey, cuts)}; tracking may fail there")
+        say(f"warning: {path}: the video cuts to another shot at {_list_times(survey, cuts)}; tracking may fail there")
     part = _make_part(survey, 0, settings, name)
     if part is None:
         raise no_face(path, len(survey.timestamps))
@@ -84,7 +84,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     if not found and short:
         whole = "" if turns else ", or --capture.no-cuts to keep the video whole"
         raise UserError(
-            f"{path}: has {len(bounds) - 1} parts, which begin at {list_times(survey, bounds[:-1])}, and none of "
+            f"{path}: has {len(bounds) - 1} parts, which begin at {_list_times(survey, bounds[:-1])}, and none of "
             f"{settings.shortest_part:g} s or more shows a face; give a smaller --capture.shortest-part{whole}"
         )
     if not found:
@@ -92,7 +92,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     _tell_left_out(path, survey, short, faceless, settings)
     parts = number_parts(found, name)
     if cuts:
-        say(f"{path}: cuts to another shot at {list_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
+        say(f"{path}: cuts to another shot at {_list_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
     for part in parts:
         _tell_people(path, part)
     return parts
@@ -114,7 +114,7 @@ def check_one_size(survey: Survey, path: Path) -> None:
 
 def _change_of_size(survey: Survey, frame: int) -> str:
     before, after = ("x".join(map(str, survey.sizes[index].tolist())) for index in (frame - 1, frame))
-    return f"the picture changes from {before} to {after} at {list_times(survey, [frame])}"
+    return f"the picture changes from {before} to {after} at {_list_times(survey, [frame])}"
 
 
 def _tell_left_out(
@@ -137,7 +137,7 @@ def _tell_left_out(
     ):
         if spans:
             frames = sum(stop - start for start, stop in spans)
-            at = list_times(survey, [start for start, _ in spans])
+            at = _list_times(survey, [start for start, _ in spans])
             say(
                 f"{'warning: ' if many else ''}{path}: {len(spans)} {why} are left out, at {at}: {frames} of "
                 f"{counted(total, 'frame')}{f'; {remedy}' if remedy and many else ''}"
@@ -177,7 +177,7 @@ def _tell_people(path: Path, part: Part) -> None:
     )
 
 
-def list_times(survey: Survey, frames: list[int]) -> str:
+def _list_times(survey: Survey, frames: list[int]) -> str:
     """List the times of up to five frames, for messages."""
     listed = ", ".join(f"{survey.timestamps[frame]:.1f}" for frame in frames[:5])
     return f"{listed}{', ...' if len(frames) > 5 else ''} s"
