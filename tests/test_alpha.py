@@ -14,9 +14,8 @@ from mien.capture.source import FrameSelection, open_source
 from mien.capture.video import write_video
 
 SIDE = 160
-ALPHA = cv2.GaussianBlur(
-    cv2.ellipse(np.zeros((SIDE, SIDE), np.uint8), (80, 84), (52, 70), 0, 0, 360, 255, -1), (0, 0), 3
-)
+_DRAWN = cv2.ellipse(np.zeros((SIDE, SIDE), np.uint8), (80, 84), (52, 70), 0, 0, 360, 255, -1)
+ALPHA = cv2.GaussianBlur(_DRAWN, (0, 0), 3)
 VIDEOS = {
     "prores 4444.mov": ("prores_ks", "yuva444p10le", {}),
     "vp9.webm": ("libvpx-vp9", "yuva420p", {"crf": "4", "b": "0"}),
@@ -41,9 +40,7 @@ def expected(colors: Pixels) -> Pixels:
 
 def colors_of(kind: str) -> Pixels:
     y, x = np.mgrid[:SIDE, :SIDE]
-    return (
-        np.stack([180 + 0 * x, 90 + x // 4, 120 + y // 4], axis=-1) if kind != "grey" else np.full((SIDE, SIDE, 3), 170)
-    )
+    return np.full((SIDE, SIDE, 3), 170) if kind == "grey" else np.dstack([180 + 0 * x, 90 + x // 4, 120 + y // 4])
 
 
 def write_picture(path: Path, pixels: Pixels, kind: str) -> None:
@@ -129,12 +126,3 @@ def test_mattes_that_are_given_count_more_than_alpha(test_data, tmp_path):
     settings = CaptureSettings(crop="none", mattes=mattes)
     (capture,) = capture_video_parts(folder, tmp_path / "sequences", settings)
     assert capture.mattes.min() >= 254
-
-
-@pytest.mark.unchecked
-def test_the_case_of_a_folder_with_alpha(test_data, tmp_path):
-    folder = test_data / "cases" / "rgba_folder"
-    (capture,) = capture_video_parts(folder, tmp_path, CaptureSettings(crop="none"))
-    given = cv2.imread(str(folder / "f_000.png"), cv2.IMREAD_UNCHANGED)
-    assert given is not None
-    assert (capture.mattes[0, 0] == given[..., 3]).all()

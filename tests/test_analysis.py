@@ -19,7 +19,6 @@ import train_toy
 from capture_helpers import tree_bytes
 from damage import edit_json
 from mien.cli import main
-from mien.commands.analyze import Command
 from mien.face import FaceModel
 from mien.lab.analysis.gaussian_avatars import growth, speed
 from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
@@ -198,16 +197,6 @@ def test_tables_and_charts_of_any_analysis_are_read_again(workspace: Path, tmp_p
     assert parts["dots"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
     assert lab.run_analysis(*arguments)["parts"] == parts
     assert (tmp_path / "out/analysis.html").read_text() == page
-
-
-def test_parts_that_train_are_left_out_unless_asked_for() -> None:
-    for analysis in lab.ANALYSES.values():
-        names = [part.name for part in analysis.parts]
-        assert all(name in str(Command.__doc__) for name in names)
-        quick = [part.name for part in analysis.parts if not part.trainings]
-        assert [part.name for part in lab.chosen_parts(analysis, (), False)] == quick
-        trained = [part.name for part in analysis.parts if part.trainings or part.name == names[0]]
-        assert [part.name for part in lab.chosen_parts(analysis, names[:1], True)] == trained
 
 
 BAD = [

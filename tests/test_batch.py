@@ -1,6 +1,5 @@
 """`mien batch`: rows run once, failures stay alone, and what lost processes leave is taken up."""
 
-import importlib
 import os
 import signal
 import threading
@@ -14,7 +13,6 @@ from forked import ForkServer
 from mien.batch import Batch, Driver, EngineOptions, Row, State, batch_progress, progress_text, run_row, shard_of
 from mien.errors import UserError
 from mien.locks import hold
-from needs import NO_ENGINE
 from other_process import Holder
 
 
@@ -180,32 +178,6 @@ def test_workspaces_go_through_a_store(tmp_path: Path):
     store = tmp_path / "store/away"
     check_store(Batch(tmp_path / "batch"), f"file://{store.parent}")
     assert {path.name: path.read_text() for path in store.iterdir()} == {"kept": "away\naway\n"}
-
-
-@pytest.mark.long
-def test_workspaces_go_through_an_object_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    try:  # `make batch-engines` installs them
-        moto, s3fs = (importlib.import_module(name) for name in ("moto.server", "s3fs"))
-    except ModuleNotFoundError:
-        pytest.skip(NO_ENGINE)
-    server = moto.ThreadedMotoServer("127.0.0.1", 0)
-    server.start()
-    for name, value in (("ACCESS_KEY_ID", "here"), ("SECRET_ACCESS_KEY", "here"), ("DEFAULT_REGION", "us-east-1")):
-        monkeypatch.setenv(f"AWS_{name}", value)
-    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*server.get_host_and_port()))
-    try:
-        files = s3fs.S3FileSystem(skip_instance_cache=True)
-        files.mkdir("bucket")
-        files.pipe_file("bucket/clips/ann.mp4", b"a video")
-        batch = Batch(tmp_path)
-        check_store(batch, "s3://bucket/people", ("size", "s3://bucket/clips/ann.mp4"))
-        state = batch.read_state("away")
-        assert state is not None
-        assert state.runs[0]["psnr"] == 7.0
-        assert files.find("bucket/people") == ["bucket/people/away/kept"]
-        assert files.cat_file("bucket/people/away/kept") == b"away\naway\n"
-    finally:
-        server.stop()
 
 
 def check_store(batch: Batch, store: str, *steps: tuple[str, str]) -> None:

@@ -7,7 +7,6 @@ import re
 import sys
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -107,8 +106,6 @@ def test_every_name_that_the_api_page_imports_is_stable_and_it_lists_them_all() 
     assert (ROOT / "src" / "mien" / "py.typed").is_file()
 
 
-MOST = 1_200_000
-"""Bytes that the avatar of the first page may have."""
 FRAMES = "document.querySelectorAll('iframe.living').length"
 ALIVE = """(async () => {
   const frame = document.querySelector("iframe.living");
@@ -118,33 +115,6 @@ ALIVE = """(async () => {
   const viewer = await frame.contentWindow.mien;
   return [frame.getAttribute("src"), frame.title, viewer.avatar.expression_names.length];
 })()"""
-
-
-@pytest.fixture(scope="module")
-def builder() -> ModuleType:
-    """The program behind `make docs`."""
-    pytest.importorskip("sphinx")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "docs" / "site")
-        return importlib.import_module("build")
-
-
-def test_a_large_avatar_is_made_smaller_or_left_out(builder: ModuleType, tmp_path: Path, monkeypatch, capsys) -> None:
-    avatar, aside = tmp_path / "me.html", tmp_path / "site" / "avatar.html"
-    assert builder.small_page(avatar, aside) is None
-    assert "is made by `make demo`" in capsys.readouterr().out
-    for size, page in ((MOST, avatar), (MOST + 1, None)):
-        avatar.write_bytes(b" " * size)
-        assert builder.small_page(avatar, aside) == page
-        builder.copy_pages(tmp_path / "pages", page is not None)
-        assert ('src="avatar.html"' in (tmp_path / "pages" / "index.md").read_text()) == (page is not None)
-    assert "has more than 1,200,000 bytes" in capsys.readouterr().out
-    (tmp_path / "sequences" / "demo").mkdir(parents=True)
-    asked: list[list[str]] = []
-    for code, page in ((0, aside), (2, None)):
-        monkeypatch.setattr(builder, "mien", lambda words, code=code: asked.append(words) or code)
-        assert builder.small_page(avatar, aside) == page
-    assert asked[0][:6] == ["export", str(tmp_path), "--out", str(aside), "--largest", "1.2"]
 
 
 def build_first_page(folder: str) -> None:

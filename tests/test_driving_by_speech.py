@@ -1,6 +1,5 @@
 """A voice drives an avatar: silence, loudness, high and low sounds, and the sound in the video."""
 
-import contextlib
 import wave
 from pathlib import Path
 
@@ -229,20 +228,9 @@ def test_sound_that_changes_its_channels_is_read_to_its_end(tmp_path: Path) -> N
     """Recorders append, and streams switch from one channel to two."""
     path = tmp_path / "a.mp3"
     one, two = write_mp3(path, "mono", 0.5), write_mp3(path, "stereo", 0.7)
-    for content in (one + two, two + one, one + two + one):
+    damaged = one + two[:3000] + bytes(100) + two[3100:]
+    for content in (one + two, two + one, one + two + one, damaged):
         path.write_bytes(content)
         samples = read_sound(path)
         assert len(samples) > 1.1 * RATE
         assert np.abs(samples[-RATE // 4 : -RATE // 8]).max() > 0.3
-
-
-def test_a_damaged_mp3_is_read_or_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp3"
-    content, random = write_mp3(path, "stereo", 0.5), np.random.default_rng(0)
-    for _ in range(20):
-        data = bytearray(content)
-        for place in random.integers(0, len(data), 20):
-            data[place] = random.integers(0, 256)
-        path.write_bytes(data[: random.integers(1, len(data))])
-        with contextlib.suppress(UserError):
-            assert np.isfinite(read_sound(path)).all()

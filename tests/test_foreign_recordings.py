@@ -25,20 +25,17 @@ def turning(*yaws: float, times: str = "0:00:00:{:02d}.0", **others: float) -> l
     return [row(times.format(2 * index), HeadYaw=yaw, **others) for index, yaw in enumerate(yaws)]
 
 
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        (turning(0, 1.69, 2.9), "line 4: HeadYaw is 2.9; angles are in radians, .* beyond 1.7; divide degrees by 57.3"),
-        (turning(0, LeftEyePitch=-14), "line 2: LeftEyePitch is -14; angles are in radians"),
-        (turning(0, HeadRoll=3.2), "line 2: HeadRoll is 3.2; .* beyond 3.14; divide"),
-        (
-            turning(0, 0.1, 1.2),
-            r"line 4: HeadYaw goes from 0.1 to 1.2 in 0.033 s; .* more than 20 a second; divide deg",
-        ),
-        (turning(0, JawOpen=45), "line 2: JawOpen is 45; coefficients go from 0 to 1; divide percent by 100"),
-        (turning(0, JawOpen=-45), "line 2: JawOpen is -45; .* correct or delete the row"),
-    ],
-)
+@pytest.mark.parametrize(("rows", "words"), [
+    (turning(0, 1.69, 2.9), "line 4: HeadYaw is 2.9; angles are in radians, .* beyond 1.7; divide degrees by 57.3"),
+    (turning(0, LeftEyePitch=-14), "line 2: LeftEyePitch is -14; angles are in radians"),
+    (turning(0, HeadRoll=3.2), "line 2: HeadRoll is 3.2; .* beyond 3.14; divide"),
+    (
+        turning(0, 0.1, 1.2),
+        r"line 4: HeadYaw goes from 0.1 to 1.2 in 0.033 s; .* more than 20 a second; divide deg",
+    ),
+    (turning(0, JawOpen=45), "line 2: JawOpen is 45; coefficients go from 0 to 1; divide percent by 100"),
+    (turning(0, JawOpen=-45), "line 2: JawOpen is -45; .* correct or delete the row"),
+])  # fmt: skip
 def test_units_that_cannot_be_are_named(tmp_path: Path, rows: list[list[str]], words: str) -> None:
     with pytest.raises(UserError, match=words):
         read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
@@ -92,13 +89,10 @@ def table(path: Path, *columns: str, rows: int = 4, step: float = 1.0) -> Path:
     return write_csv(path, *cells, columns=list(columns))
 
 
-@pytest.mark.parametrize(
-    ("key", "step", "fps", "rate"),
-    [
-        ("frame", 1, None, 30), ("frame", 1, 24.0, 24), ("Frame", 2, 60.0, 30),
-        ("timestamp_ms", 40, None, 25), ("time", 0.02, None, 50), ("time", 0.02, 25.0, 25),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("key", "step", "fps", "rate"), [
+    ("frame", 1, None, 30), ("frame", 1, 24.0, 24), ("Frame", 2, 60.0, 30),
+    ("timestamp_ms", 40, None, 25), ("time", 0.02, None, 50), ("time", 0.02, 25.0, 25),
+])  # fmt: skip
 def test_tables_of_other_programs(tmp_path: Path, key: str, step: float, fps: float | None, rate: float) -> None:
     motion = read_live_link_face(
         table(tmp_path / "a.csv", key, "jawOpen", "MouthSmile_L", "confidence", step=step), fps
@@ -112,16 +106,13 @@ def test_tables_of_other_programs(tmp_path: Path, key: str, step: float, fps: fl
     assert assumed == [True] * (key == "frame" and fps is None)
 
 
-@pytest.mark.parametrize(
-    ("columns", "step", "words"),
-    [
-        (("frame", "AU01_r"), 1, "lacks ARKit's names, or a column Timecode, timestamp_ms, time or frame; give"),
-        (("row", "jawOpen"), 1, "lacks ARKit's names, or a column Timecode"),
-        (("timestamp_ms", "jawOpen"), 0.0333, "there would be 30,030 frames in a second; give milliseconds"),
-        (("time", "jawOpen"), 33.3, 'a frame would last 33 s; give seconds, or call milliseconds "timestamp_ms"'),
-        (("time", "jawOpen"), float("nan"), "line 2: time is 'nan'; give every row a number"),
-    ],
-)
+@pytest.mark.parametrize(("columns", "step", "words"), [
+    (("frame", "AU01_r"), 1, "lacks ARKit's names, or a column Timecode, timestamp_ms, time or frame; give"),
+    (("row", "jawOpen"), 1, "lacks ARKit's names, or a column Timecode"),
+    (("timestamp_ms", "jawOpen"), 0.0333, "there would be 30,030 frames in a second; give milliseconds"),
+    (("time", "jawOpen"), 33.3, 'a frame would last 33 s; give seconds, or call milliseconds "timestamp_ms"'),
+    (("time", "jawOpen"), float("nan"), "line 2: time is 'nan'; give every row a number"),
+])  # fmt: skip
 def test_tables_that_cannot_be_read(tmp_path: Path, columns: tuple[str, ...], step: float, words: str) -> None:
     with pytest.raises(UserError, match=words):
         read_live_link_face(table(tmp_path / "a.csv", *columns, step=step))

@@ -39,16 +39,13 @@ def cameras() -> list[CalibratedCamera]:
     return [CalibratedCamera(name, toy_camera(16)) for name in ("00", "01")]
 
 
-@pytest.mark.parametrize(
-    ("names", "read"),
-    [
-        (("2.png", "10.png"), list_images),
-        (("00.mp4", "01.mp4"), lambda folder: match_sources([folder], cameras(), folder / "cameras.json")),
-        (("ann.mp4", "bob.mov"), lambda folder: [Path(row.steps[0][1]) for row in read_table(folder)]),
-        (("a.png", "b.png"), lambda folder: list(open_pictures(folder).files.values())),
-        (("a.obj", "b.obj"), lambda folder: listed(folder, "*.obj")),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("names", "read"), [
+    (("2.png", "10.png"), list_images),
+    (("00.mp4", "01.mp4"), lambda folder: match_sources([folder], cameras(), folder / "cameras.json")),
+    (("ann.mp4", "bob.mov"), lambda folder: [Path(row.steps[0][1]) for row in read_table(folder)]),
+    (("a.png", "b.png"), lambda folder: list(open_pictures(folder).files.values())),
+    (("a.obj", "b.obj"), lambda folder: listed(folder, "*.obj")),
+])  # fmt: skip
 def test_what_systems_leave_is_skipped(
     tmp_path: Path, names: tuple[str, ...], read: Callable[[Path], list[Path]]
 ) -> None:
@@ -74,9 +71,7 @@ def test_pictures_drive_an_avatar(
 ) -> None:
     """A picture, or a folder of few, is repeated, because tracking needs three frames."""
     captured: list[Path] = []
-    monkeypatch.setattr(
-        driving, "run_capture_stage", lambda workspace, source, *_: captured.extend(list_images(source))
-    )
+    monkeypatch.setattr(driving, "run_capture_stage", lambda _, source, *__: captured.extend(list_images(source)))
     monkeypatch.setattr(driving, "run_tracking_stage", lambda *_, **__: {"clip": None})
     monkeypatch.setattr(driving, "cache_folder", lambda: tmp_path / "cache")
     folder = given(tmp_path / "people", *names)
@@ -91,12 +86,9 @@ def test_pictures_drive_an_avatar(
 @pytest.mark.parametrize("name", ["transforms.json", "cameras.json"])
 def test_a_calibration_of_nerfstudio_is_named(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
-    path.write_text(
-        json.dumps({"fl_x": 500, "frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]})
-    )
-    with pytest.raises(
-        UserError, match=rf"{name}: is nerfstudio's transforms.json, .*its matrices are camera-to-world"
-    ):
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
+    path.write_text(json.dumps({"fl_x": 500, "frames": frames}))
+    with pytest.raises(UserError, match=rf"{name}: is nerfstudio's transforms.json, .*matrices are camera-to-world"):
         read_calibration(path)
     path.write_text(json.dumps({"frames": 3}))
     with pytest.raises(UserError, match="write it as described in docs/using.md"):

@@ -109,13 +109,8 @@ def _packed(folder: Path, **changed: Any) -> Path:
 def test_faces_of_three_and_four_corners_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     for text in (
-        b"",
-        b"v 0 0\nf 1 2 3\n",
-        b"v a b c\nf 1 2 3\n",
-        b"v 0 0 0\nf 1 x 3\n",
-        b"v 0 0 0\nf 1 2\n",
-        b"\xff\x00",
-    ):
+        b"", b"v 0 0\nf 1 2 3\n", b"v a b c\nf 1 2 3\n", b"v 0 0 0\nf 1 x 3\n", b"v 0 0 0\nf 1 2\n", b"\xff\x00",
+    ):  # fmt: skip
         path.write_bytes(text)
         with pytest.raises(UserError, match="cannot be read as .obj") as told:
             read_obj(path)

@@ -26,15 +26,12 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return line
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("a.csv", "video,preset\nann.mp4,draft;--out;/elsewhere\n"),
-        ("a.csv", "video;preset\nann.mp4;--out=/elsewhere\n"),
-        ("a.csv", "video,capture.mattes\nann.mp4,-o\n"),
-        ("a.json", json.dumps([{"video": "ann.mp4", "preset": ["draft", "--out", "/elsewhere"]}])),
-    ],
-)
+@pytest.mark.parametrize(("name", "text"), [
+    ("a.csv", "video,preset\nann.mp4,draft;--out;/elsewhere\n"),
+    ("a.csv", "video;preset\nann.mp4;--out=/elsewhere\n"),
+    ("a.csv", "video,capture.mattes\nann.mp4,-o\n"),
+    ("a.json", json.dumps([{"video": "ann.mp4", "preset": ["draft", "--out", "/elsewhere"]}])),
+])  # fmt: skip
 def test_a_cell_is_never_an_option(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / "ann.mp4").touch()
     (tmp_path / name).write_text(text)
@@ -81,22 +78,19 @@ def hostile(**given: object) -> str:
     return json.dumps({"format": "mien.batch-row", "version": 1, **whole, **given})
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "[" * 100_000 + "]" * 100_000,
-        hostile(seconds=0).replace('"seconds": 0', '"seconds": ' + "9" * 400),
-        hostile(runs=[{"run": "a", "method": "a", "psnr": 0}]).replace('"psnr": 0', '"psnr": ' + "9" * 400),
-        hostile(runs=[{"run": "a", "method": ["a"]}]),
-        hostile(runs=[{"run": "../../a", "method": "a"}]),
-        hostile(runs=[{"run": "a", "method": "a", "psnr": {"deep": []}}]),
-        hostile(runs=[1]),
-        hostile(began=1e308, seconds=1e308, status="running"),
-        hostile(seconds=float("nan")),
-        hostile(mien=["0"]),
-        hostile(stages={"a\x1b[2J": 1.0}),
-    ],
-)
+@pytest.mark.parametrize("content", [
+    "[" * 100_000 + "]" * 100_000,
+    hostile(seconds=0).replace('"seconds": 0', '"seconds": ' + "9" * 400),
+    hostile(runs=[{"run": "a", "method": "a", "psnr": 0}]).replace('"psnr": 0', '"psnr": ' + "9" * 400),
+    hostile(runs=[{"run": "a", "method": ["a"]}]),
+    hostile(runs=[{"run": "../../a", "method": "a"}]),
+    hostile(runs=[{"run": "a", "method": "a", "psnr": {"deep": []}}]),
+    hostile(runs=[1]),
+    hostile(began=1e308, seconds=1e308, status="running"),
+    hostile(seconds=float("nan")),
+    hostile(mien=["0"]),
+    hostile(stages={"a\x1b[2J": 1.0}),
+])  # fmt: skip
 def test_hostile_states_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str) -> None:
     batch = Batch(tmp_path)
     batch.write_plan([Row("ann", ())])

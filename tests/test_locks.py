@@ -25,7 +25,7 @@ from mien import locks
 from mien.capture import read_capture, write_capture
 from mien.errors import CannotWriteError, UserError
 from mien.files import replace_folder
-from mien.locks import BeingWrittenError, check_free, hold, holder_of, lock_file, read_beside_writers, read_holder
+from mien.locks import BeingWrittenError, hold, holder_of, lock_file, read_beside_writers
 from mien.tracking import read_tracking, write_tracking
 from other_process import Holder
 from toy_scene import toy_face_model, toy_tracking
@@ -61,23 +61,6 @@ def test_nothing_stays_of_a_lock(tmp_path: Path) -> None:
     one, other = (tmp_path / ("n" * 250 + end) for end in "12")
     with hold(one), hold(other):
         assert lock_file(one) != lock_file(other), "long names have locks of their own"
-
-
-def test_the_lock_of_a_killed_process_is_free_at_once(mortal: Holder, tmp_path: Path, monkeypatch) -> None:
-    """Its name is not told: a new holder that has not signed yet leaves the old name for a moment."""
-    monkeypatch.setattr(locks, "PATIENCE_SECONDS", 0.05)
-    place = tmp_path / "r"
-    with mortal.holding(place):
-        mortal.kill()
-    assert holder_of(place) is None
-    with lock_file(place).open() as handle:
-        assert read_holder(handle.fileno()) is None
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        with pytest.raises(BeingWrittenError, match="has not left its name"):
-            check_free(place)
-    with hold(place):
-        assert json.loads(lock_file(place).read_text())["pid"] == os.getpid()
-    assert not lock_file(place).exists()
 
 
 def test_children_do_not_keep_the_lock_of_a_parent_that_has_died(tmp_path: Path) -> None:
@@ -146,16 +129,13 @@ def test_a_strangers_lock_file_does_no_harm(kind: str, tmp_path: Path) -> None:
     assert kind != "other content" or file.read_text() == "mine"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        json.dumps({"pid": 7, "host": "h\x1b[31m", "since": "\u202e" * 90, "command": "mien\n\rtrain" + "x" * 3000}),
-        json.dumps({"pid": 7, "host": [["h"] * 50], "since": {"a": 1}, "command": None}),
-        json.dumps({"pid": 1 << 40, "host": "h"}),
-        "[" * 4000,
-        "\x00" * 5000,
-    ],
-)
+@pytest.mark.parametrize("text", [
+    json.dumps({"pid": 7, "host": "h\x1b[31m", "since": "\u202e" * 90, "command": "mien\n\rtrain" + "x" * 3000}),
+    json.dumps({"pid": 7, "host": [["h"] * 50], "since": {"a": 1}, "command": None}),
+    json.dumps({"pid": 1 << 40, "host": "h"}),
+    "[" * 4000,
+    "\x00" * 5000,
+])  # fmt: skip
 def test_what_a_holder_says_is_not_trusted(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locks, "PATIENCE_SECONDS", 0.05)
     file = lock_file(tmp_path / "r")

@@ -25,16 +25,13 @@ def drawn(*ellipses: tuple[int, int, int, int], bridge: int = 0) -> np.ndarray:
 PERSON, HEAD, BOTTLE, BODY = (90, 90, 80, 100), (200, 60, 60, 80), (260, 120, 20, 60), (90, 210, 110, 90)
 
 
-@pytest.mark.parametrize(
-    ("given", "others", "wanted"),
-    [
-        pytest.param(drawn(PERSON), NOBODY, drawn(PERSON), id="alone"),
-        pytest.param(drawn(PERSON, HEAD), OTHER[None], drawn(PERSON), id="another head"),
-        pytest.param(drawn(PERSON, BOTTLE), NOBODY, drawn(PERSON), id="a bottle"),
-        pytest.param(drawn(PERSON, BODY), NOBODY, drawn(PERSON, BODY), id="a body below a covered neck"),
-        pytest.param(drawn(PERSON), OTHER[None], drawn(PERSON), id="a face that the matte does not hold"),
-    ],
-)
+@pytest.mark.parametrize(("given", "others", "wanted"), [
+    pytest.param(drawn(PERSON), NOBODY, drawn(PERSON), id="alone"),
+    pytest.param(drawn(PERSON, HEAD), OTHER[None], drawn(PERSON), id="another head"),
+    pytest.param(drawn(PERSON, BOTTLE), NOBODY, drawn(PERSON), id="a bottle"),
+    pytest.param(drawn(PERSON, BODY), NOBODY, drawn(PERSON, BODY), id="a body below a covered neck"),
+    pytest.param(drawn(PERSON), OTHER[None], drawn(PERSON), id="a face that the matte does not hold"),
+])  # fmt: skip
 def test_what_is_not_the_person_goes(given: np.ndarray, others: np.ndarray, wanted: np.ndarray) -> None:
     np.testing.assert_array_equal(without_others(given, FACE, others), wanted)
 

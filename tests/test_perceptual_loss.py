@@ -57,17 +57,6 @@ def test_distance_is_that_of_the_networks_layers() -> None:
     assert float(features(image, target)) == pytest.approx(by_torchs_layers(image, target), rel=1e-3)
 
 
-@pytest.mark.parametrize("blocks", [1, 2, 3])
-def test_gradient_is_the_slope_of_the_distance(blocks: int) -> None:
-    features = load_training_features(dtype=torch.float64, blocks=blocks)
-    image, target = some_picture(0, 16).double().requires_grad_(), some_picture(1, 16).double()
-    (gradient,) = torch.autograd.grad(features(image, target), image)
-    direction = torch.randn(image.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    with torch.no_grad():
-        ahead, behind = (float(features(image + sign * 1e-6 * direction, target)) for sign in (1, -1))
-    assert float((gradient * direction).sum()) == pytest.approx((ahead - behind) / 2e-6, rel=1e-3)
-
-
 def some_target(parts: tuple[tuple[int, int, int, int], ...], height: int = 60, width: int = 80) -> Target:
     picture = torch.zeros(height, width, 3, dtype=torch.uint8)
     return Target(picture, picture[..., 0], (10, 5, 50, 50), torch.ones(3), parts)
@@ -113,12 +102,6 @@ def test_the_whole_person_counts_fully() -> None:
     assert found == [(pytest.approx(2.0 * whole(50), rel=1e-5), (50, 50, 3))] * 2
     boxes = {(10, 5, 50, 40): (10, 5, 50, 40), (0, 0, 0, 0): (0, 0, 16, 16), (78, 59, 2, 1): (64, 44, 16, 16)}
     assert {box: person_box(replace(some_target(()), box=box)) for box in boxes} == boxes
-
-
-def test_steps_that_have_the_loss() -> None:
-    for weight, steps in ((1.0, [6, 9, 12, 15, 18, 21]), (0.0, [])):
-        loss = PerceptualLoss(weight=weight, start=0.25, every=3)
-        assert [step for step in range(24) if loss.due(step, 24)] == steps
 
 
 CONFIG = replace(

@@ -64,21 +64,6 @@ def test_balls_on_the_axis_show_their_colors_at_the_center(backend: Backend) -> 
     assert torch.autograd.grad(alpha, large.opacities)[0].item() == 0
 
 
-@pytest.mark.exact
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_local_frame_moves_the_camera(backend: Backend) -> None:
-    """Spherical harmonics are evaluated in the local frame, so a posed head keeps its colours."""
-    scene = random_scene(0, coefficients=9)
-    local = replace(scene.gaussians, T_world_local=None)
-    # Not `@`, which adds in another order on another processor.
-    moved = scene.camera.in_frame(known(scene.gaussians.T_world_local))
-    found, expected = (
-        rasterize(gaussians, camera, scene.background, backend).image
-        for gaussians, camera in ((scene.gaussians, scene.camera), (local, moved))
-    )
-    assert torch.equal(found, expected)
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_batches_equal_their_single_pictures(backend: Backend) -> None:
     scenes = [random_scene(seed, count=50) for seed in range(3)]

@@ -19,23 +19,12 @@ from shared_things import MadeOnce, toy_workspace
 
 COMMANDS = ("batch", "capture", "create", "drive", "export", "render", "view")
 THINGS = {
-    "a workspace": "W",
-    "workspace": "W",
-    "a video": "clip.mp4",
-    "video": "clip.mp4",
-    "a picture": "photo.jpg",
-    "a folder of pictures": "pictures",
-    "the folder of a video's pictures": "pictures",
-    "a .csv of Live Link Face": "take.csv",
-    "of ARKit's names": "time.csv",
-    "a .json of blend shapes": "plain.json",
-    "recording": "take.csv",
-    "a sound file": "voice.wav",
-    "sequence folder of the driver at rest": "W/sequences/clip",
-    "first": "first",
-    "calm": "calm",
-    "model": "model",
-}
+    "a workspace": "W", "workspace": "W", "a video": "clip.mp4", "video": "clip.mp4", "a picture": "photo.jpg",
+    "a folder of pictures": "pictures", "the folder of a video's pictures": "pictures",
+    "a .csv of Live Link Face": "take.csv", "of ARKit's names": "time.csv", "a .json of blend shapes": "plain.json",
+    "recording": "take.csv", "a sound file": "voice.wav", "sequence folder of the driver at rest": "W/sequences/clip",
+    "first": "first", "calm": "calm", "model": "model",
+}  # fmt: skip
 """Words of messages for what to give, and such a thing."""
 NOT_GIVEN = "missing"
 
@@ -81,22 +70,19 @@ def remedies(arguments: list[str], message: str) -> Iterator[list[str]]:
             yield [THINGS[words] if word == wrong[1] else word for word in arguments]
 
 
-@pytest.mark.parametrize(
-    ("typed", "count"),
-    [
-        (f"drive W --by {NOT_GIVEN} --out a.mp4", 8),
-        (f"drive W --by {NOT_GIVEN}", 8),
-        ("drive W --by notes.txt --out a.mp4", 8),
-        ("drive W --by pose.bvh --out a.mp4", 8),
-        (f"view W --play {NOT_GIVEN}", 8),
-        (f"drive W --by take.csv --neutral {NOT_GIVEN} --out a.mp4", 7),
-        ("drive W --by take.csv --sequence a --out a.mp4", 1),
-        ("drive W --by take.csv --fps 70", 1),
-        ("drive W --by clip.mp4 --camera-format v4l2 --out a.mp4", 1),
-        ("create photo.jpg --out N", 2),
-        ("capture photo.jpg --out N", 2),
-    ],
-)
+@pytest.mark.parametrize(("typed", "count"), [
+    (f"drive W --by {NOT_GIVEN} --out a.mp4", 8),
+    (f"drive W --by {NOT_GIVEN}", 8),
+    ("drive W --by notes.txt --out a.mp4", 8),
+    ("drive W --by pose.bvh --out a.mp4", 8),
+    (f"view W --play {NOT_GIVEN}", 8),
+    (f"drive W --by take.csv --neutral {NOT_GIVEN} --out a.mp4", 7),
+    ("drive W --by take.csv --sequence a --out a.mp4", 1),
+    ("drive W --by take.csv --fps 70", 1),
+    ("drive W --by clip.mp4 --camera-format v4l2 --out a.mp4", 1),
+    ("create photo.jpg --out N", 2),
+    ("capture photo.jpg --out N", 2),
+])  # fmt: skip
 def test_each_remedy_is_accepted(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], typed: str, count: int
 ) -> None:

@@ -31,15 +31,12 @@ def written(path: Path, types: dict[str, str], newline: str, coefficients: int =
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
-@pytest.mark.parametrize(
-    "types",
-    [
-        {},
-        {"red": "uint8", "green": "uint8", "blue": "uint8"},
-        {"nx": "int16", "label": "uint32", "time": "float64"},
-        {"*": "float64"},
-    ],
-)
+@pytest.mark.parametrize("types", [
+    {},
+    {"red": "uint8", "green": "uint8", "blue": "uint8"},
+    {"nx": "int16", "label": "uint32", "time": "float64"},
+    {"*": "float64"},
+])  # fmt: skip
 def test_every_ply_of_floats_is_read(tmp_path: Path, newline: str, types: dict[str, str]) -> None:
     path = tmp_path / "a.ply"
     columns = written(path, types, newline)
@@ -51,15 +48,12 @@ def test_every_ply_of_floats_is_read(tmp_path: Path, newline: str, types: dict[s
     np.testing.assert_array_equal(read.sh[:, 1, 2].numpy(), columns["f_rest_6"])
 
 
-@pytest.mark.parametrize(
-    ("types", "extra", "words"),
-    [
-        ({"x": "uint8"}, "", "has 'property uchar x', not float"),
-        ({"f_rest_3": "int16"}, "", "has 'property short f_rest_3', not float"),
-        ({}, "property list uchar int vertex_indices\n", "has 'property list uchar int vertex_indices', not float"),
-        ({}, "property uint packed_position\n", "is a compressed .ply, .* save it uncompressed, or as .sog"),
-    ],
-)
+@pytest.mark.parametrize(("types", "extra", "words"), [
+    ({"x": "uint8"}, "", "has 'property uchar x', not float"),
+    ({"f_rest_3": "int16"}, "", "has 'property short f_rest_3', not float"),
+    ({}, "property list uchar int vertex_indices\n", "has 'property list uchar int vertex_indices', not float"),
+    ({}, "property uint packed_position\n", "is a compressed .ply, .* save it uncompressed, or as .sog"),
+])  # fmt: skip
 def test_other_plys_are_named(tmp_path: Path, types: dict[str, str], extra: str, words: str) -> None:
     path = tmp_path / "a.ply"
     written(path, types, "\n")

@@ -4,28 +4,22 @@ import io
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from rich.console import Console
 
-from forked import ForkServer, run_forked
+from forked import ForkServer
 from mien import progress, runtime
-from mien.capture import CaptureSettings
-from mien.capture.video import write_video
 from mien.cli import main
-from mien.commands.stages.expected import count_captured, count_scored, expected_pieces
-from mien.commands.stages.names import sequence_name
+from mien.commands.stages.expected import count_scored, expected_pieces
 from mien.errors import UserError
 from mien.overall import Overall, Piece
 from mien.progress import progress_bar, say, whole_command
-from mien.terminal import counted, plain_name, printable, show
+from mien.terminal import plain_name, printable, show
 from mien.threads import MAX_THREADS, asked_threads, thread_count
 from mien.tracking import TrackingSettings
 from mien.training import TrainSettings
@@ -77,11 +71,6 @@ def test_complaints_are_one_harmless_line(arguments: list[str], tmp_path: Path, 
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert told.strip().isprintable()
-
-
-def test_names_of_videos_become_names_of_folders() -> None:
-    assert sequence_name(Path(NASTY.replace("/", "")), None) == "_[2J__[red]x[red][]:smile:___"
-    assert sequence_name(Path("take:1.mp4"), None) == "take:1"
 
 
 FULL = "mien: standard output: cannot be written (No space left on device); correct that and run the command again\n"
@@ -161,18 +150,6 @@ def test_threads_that_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (asked_threads(), thread_count()) == (None, os.cpu_count())
 
 
-def test_instructions_that_the_machine_lacks_are_told(fork_server: ForkServer, tmp_path: Path) -> None:
-    ended = run_forked(fork_server, "demo", "--out", tmp_path / "demo", env={"MIEN_ISA": "mmx"})
-    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
-    assert ended.stderr.startswith("mien: MIEN_ISA=mmx: this machine has ")
-    assert not (tmp_path / "demo").exists()
-
-
-def test_a_number_agrees_with_its_noun() -> None:
-    told = [counted(count, "frame") for count in (0, 1, 2, 12_000)]
-    assert told == ["0 frames", "1 frame", "2 frames", "12,000 frames"]
-
-
 SETTINGS = TrainSettings(steps=12_000)
 TWO = [Piece("capture", "capture ", 10.0), Piece("training", "training", 190.0)]
 
@@ -198,40 +175,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 def pieces_of(frames: int, settings: TrainSettings = SETTINGS) -> list[Piece]:
     return expected_pieces([frames], count_scored([frames], ["me"], settings), TrackingSettings(), settings, "auto")
-
-
-def work(pieces: list[Piece], seconds: list[float]) -> Iterator[tuple[int, float, float]]:
-    """Do pieces that take so long, and yield the stage, the moment and the remaining time after each tenth of each."""
-    clock = Clock()
-    overall = Overall(pieces, clock)
-    for piece, each in zip(pieces, seconds, strict=True):
-        assert overall.begin(f"{piece.title} me", 0.0)
-        for tenth in range(1, 11):
-            clock.now += each / 10
-            overall.advance(tenth / 10)
-            yield overall.stage(), clock.now, overall.remaining()
-        overall.end()
-
-
-@pytest.mark.parametrize(("frames", "slower", "most"), [
-    (1000, {}, {2: 0.25, 3: 0.1, 4: 0.05}),
-    (1000, dict.fromkeys(("capture", "tracking", "training", "scoring"), 0.25), {2: 0.25, 3: 0.1, 4: 0.05}),
-    (1000, dict.fromkeys(("capture", "tracking", "training", "scoring"), 6.0), {2: 0.25, 3: 0.1, 4: 0.05}),
-    (500, {"training": 5.0}, {3: 0.25}),
-])  # fmt: skip
-def test_the_estimate_converges(frames: int, slower: dict[str, float], most: dict[int, float]) -> None:
-    """The error shrinks on machines of any speed, and a method that takes longer is noticed while it trains."""
-    pieces = pieces_of(frames)
-    seconds = [slower.get(piece.stage, 1.0) * piece.seconds for piece in pieces]
-    whole = sum(seconds)
-    moments = list(work(pieces, seconds))
-    errors = [(stage, abs(now + left - whole) / whole) for stage, now, left in moments]
-    for stage, bound in most.items():
-        assert max(error for at, error in errors if at == stage) < bound, stage
-    assert moments[-1][2] == 0.0
-    stages = [stage for stage, *_ in moments]
-    assert all(before <= after for before, after in pairwise(stages))
-    assert set(stages) == {1, 2, 3, 4}
 
 
 def test_current_stages_take_no_time_and_other_bars_do_not_count() -> None:
@@ -264,18 +207,6 @@ def test_pieces_follow_the_settings() -> None:
     assert sum(piece.title == "Scoring masks" for piece in without) == 2
     assert count_scored([100, 50], ["a", "b"], TrainSettings(held_out_sequences=("b",), split="none")) == 50
     assert count_scored([100, 50], ["a", "b"], TrainSettings(held_out_sequences=("b",))) == 70
-
-
-def test_frames_are_counted_as_the_settings_take_them(tmp_path: Path) -> None:
-    video, pictures, broken = tmp_path / "a.mp4", tmp_path / "pictures", tmp_path / "broken.mp4"
-    write_video(video, (np.zeros((32, 32, 3), np.uint8) for _ in range(50)), 25.0)
-    pictures.mkdir()
-    for number in range(7):
-        (pictures / f"{number}.png").touch()
-    broken.write_bytes(b"no video")
-    part = CaptureSettings(start=0.4, end=1.6, stride=2)
-    assert [count_captured(each, CaptureSettings()) for each in (video, pictures, broken)] == [50, 7, 0]
-    assert [count_captured(video, each) for each in (part, CaptureSettings(max_frames=9))] == [15, 9]
 
 
 def test_a_bar_has_the_whole_command_beside_it(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

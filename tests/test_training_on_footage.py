@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 import color_charts
-from dataset_writers import FRONTAL, write_nersemble, write_picture, write_take
+from dataset_writers import FRONTAL, write_nersemble, write_picture
 from known import known
 from mien.camera import Camera
 from mien.capture import Capture, read_capture
 from mien.capture.video import write_video
 from mien.cli import main
-from mien.datasets.pictures import read_picture
 from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
 from mien.training import read_curves, read_sequence
 
@@ -126,25 +125,3 @@ def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mat
         expected = cropped(capture, FRONTAL, matte)
         both, either = ((found > 127) & (expected > 127)).sum(), ((found > 127) | (expected > 127)).sum()
         assert both > 0.85 * either  # the network's mattes fade at the shirt
-
-
-@pytest.mark.unchecked
-@pytest.mark.usefixtures("short_films")
-def test_a_take_of_live_link_face_becomes_an_avatar(tmp_path: Path) -> None:
-    scene = SyntheticScene(replace(PERSON, width=256, height=320, script=(Segment("speech", 0.48),)), 3)
-    pictures = [frame.image for frame in scene.frames()]
-    take, root = tmp_path / "20240131_Me_3", tmp_path / "me"
-    write_take(take, lambda path, _: film(path, pictures, fps=25.0))
-    assert main(["import", str(take), "--out", str(root)]) == 0
-    folder = root / "sequences/20240131_Me_3"
-    assert read_capture(folder / "capture").timesteps == len(pictures)
-    assert main(["track", str(root), *LANDMARKS]) == 0
-    assert main(["train", str(root), "--run", "a", "--steps", "60", *SMALL, *PLAIN]) == 0
-    assert main(["evaluate", str(root), "--run", "a", "--no-perceptual"]) == 0
-    for each in json.loads((root / "runs/a/metrics.json").read_text())["protocols"].values():
-        assert each["head"]["psnr"] > each["baselines"]["mean_frame"]["head"]["psnr"] + 1
-    line = ["drive", str(root), "--run", "a", "--by", str(folder / "driving.csv")]
-    assert main([*line, "--out", str(tmp_path / "d_%06d.png"), "--size", "64", "--unlimited"]) == 0
-    drawn = [read_picture(path)[0].astype(int) for path in sorted(tmp_path.glob("d_*.png"))]
-    assert len(drawn) == 6
-    assert np.abs(drawn[5] - drawn[0]).max() > 10, "the mouth opens"

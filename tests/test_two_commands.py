@@ -5,7 +5,6 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -120,15 +119,6 @@ def test_a_run_that_is_being_trained_cannot_be_rendered_yet(
     assert f"clip: is being written by another command (process {other.pid} on" in capsys.readouterr().err
 
 
-def test_the_command_after_a_kill_goes_on_at_once(mortal: Holder, studio: Studio) -> None:
-    train = ["train", str(studio.root), "--run", "killed", "--steps", "3", "--split", "tail", *RANK]
-    with mortal.holding(studio.root / "runs" / "killed"):
-        assert main(train) == 2
-        mortal.kill()
-        assert main(train) == 0
-    assert_same_run(studio, "killed")
-
-
 def assert_same_run(studio: Studio, name: str) -> None:
     """Check that the run has the bytes of the one that was trained alone."""
     alone, run = studio.root / "runs" / "alone", studio.root / "runs" / name
@@ -182,38 +172,3 @@ def test_one_of_two_works_and_the_other_names_it_or_finds_all_done(
         assert json.loads((out / "analysis.json").read_text())["parts"].keys() == {"growth"}
         assert (out / "analysis.html").is_file()
     assert not lock_file(out).exists()
-
-
-def figures_of_both(run: Path) -> Any:
-    """The figures that both commands compute. `create` judges the avatar alone by ST-LPIPS."""
-
-    def shared(entry: dict[str, Any]) -> dict[str, Any]:
-        return {name: value for name, value in entry.items() if name not in ("seconds_per_frame", "perceptual")}
-
-    return json.loads((run / "metrics.json").read_text(), object_hook=shared)["protocols"]["self_reenactment_tail"]
-
-
-@pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize(("first_is", "trained"), [("create", True), ("evaluate", True), ("create", False)])
-def test_create_beside_evaluate(
-    first_is: str, trained: bool, where: str, studio: Studio, fork_server: ForkServer, tmp_path: Path
-) -> None:
-    """`create` beside `evaluate` works on a finished run without figures, and on a run that has to be trained first."""
-    name, runs = f"{first_is}-{where}-{trained}", studio.root / "runs"
-    shutil.copytree(runs / "alone", runs / name, ignore=shutil.ignore_patterns("metrics.json", "report.html", "videos"))
-    if not trained:
-        (runs / name / "training.json").unlink()
-    create = ["create", str(studio.video), "--out", str(studio.root), "--run", name, *studio.create_options]
-    lines = [create, ["evaluate", str(studio.root), "--run", name]]
-    if first_is == "evaluate":
-        lines.reverse()
-    first, second = beside(fork_server, tmp_path / "wait", (where, name), *lines)
-    assert first.poll() == 0, first.stderr
-    if where == "within":
-        assert_told(first, name, second)
-    elif trained:
-        assert second.poll() == 0, second.stderr
-    else:
-        assert "its training was not finished" in second.stderr
-    assert_same_run(studio, name)
-    assert figures_of_both(runs / name) == figures_of_both(runs / "alone")

@@ -106,9 +106,3 @@ def test_a_webcam_behind_a_screen_recording_is_named_and_can_be_chosen(test_data
     assert (capture.timesteps, capture.width) == (4, 160)
     with pytest.raises(UserError, match=r"stream 2 is no stream of pictures; .* 0 \(256x256\), 1 \(160x160\)"):
         capture_video(path, tmp_path / "none", CaptureSettings(stream=2))
-
-
-def test_the_case_with_a_thumbnail(test_data) -> None:
-    path = test_data / "cases" / "thumbnail_first.mkv"
-    assert count_frames(path) == 30
-    assert {picture.shape for _, picture in read_video_frames(path)} == {(320, 320, 3)}
