@@ -210,15 +210,6 @@ def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch
             assert moments.first.device.type == "meta"
 
 
-def test_regions_are_looked_for_where_the_model_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A GPU refuses tensors of two devices. The `meta` device does not."""
-    asked: list[tuple[str, str]] = []
-    monkeypatch.setattr(torch, "isin", lambda a, b: asked.append((a.device.type, b.device.type)) or a == 0)
-    face_model, _ = toy_sequence(timesteps=1, size=32)
-    face_model.to(META).region_mask("lips")
-    assert asked == [("meta", "meta")]
-
-
 def _rendered(gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:
     """Return a rendering with the same dependences as a rasterizer's."""
     offset = torch.zeros(len(gaussians), 2, device="meta", requires_grad=True)

@@ -1,10 +1,9 @@
-"""A short demo, every use of its avatar, every command without a network, the examples and the code of docs/api.md."""
+"""A short demo, who can read its reports, every command without a network, the examples and the code of docs/api.md."""
 
 import fcntl
 import json
 import re
 import runpy
-import shutil
 import socket
 import struct
 import sys
@@ -16,13 +15,12 @@ import pytest
 from batch_stub import PROGRAM
 from conftest import MadeOnce
 from demo_case import DEMO, FRAMES, VIDEO, leave_network, make_demo, skip_if_online
-from forked import ForkServer, run_forked
+from forked import ForkServer
 from fuzzing.kills import TRACK
 from mien import runtime, tracking
 from mien.avatar import DEFAULT_METHOD
 from mien.capture.video import probe_video
 from mien.cli import COMMANDS, main
-from mien.export import read_ply
 from mien.face import add_face_model
 from mien.tracking import PhotometricSettings, TrackingSettings
 from toy_scene import toy_face_model
@@ -61,39 +59,6 @@ def test_everybody_can_read_the_reports(demo: Path, tmp_path: Path) -> None:
     for page in (demo / RUN / "report.html", tracked, tmp_path / "compare.html"):
         for size, device in (((1280, 800), []), ((390, 844), ["dark", "touch"])):
             assert violations(page, size, device) == [], (page, device)
-
-
-def test_the_same_command_finds_everything_done(demo: Path, fork_server: ForkServer, tmp_path: Path) -> None:
-    shutil.copytree(demo, tmp_path / "demo")
-    avatar = tmp_path / "demo" / RUN / "avatar" / "avatar.safetensors"
-    before = avatar.stat().st_mtime_ns
-    done = run_forked(fork_server, "demo", "--out", tmp_path / "demo", *DEMO)
-    assert done.returncode == 0, done.stderr
-    assert avatar.stat().st_mtime_ns == before
-    for work in ("Drawing", "capture synthetic:", "Tracking:", "training:", "evaluate self_reenactment:", "film:"):
-        assert work not in done.stderr
-
-
-def test_using_the_avatar(demo: Path, tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text('[{"blendshapes": {"jawOpen": 0.5}}, {"blendshapes": {}}]')
-    for line in (
-        "export {me} --out {out}/open.ply --set jawOpen=0.6",
-        "export {me} --out {out}/me.mien",
-        "export {me} --out {out}/talk.ply --series synthetic --every 5",
-        "render {me} --out {out}/still.png --size 64",
-        "render {me} --out {out}/aside.png --size 64 --yaw 30",
-        "render {me} --out {out}/f --path sway --frames 2 --background transparent --size 64",
-        "render {me} --out {out}/turn.mp4 --size 64 --frames 6",
-        "drive {me} --by {out}/a.json --out {out}/d.webm --background transparent --size 64",
-        "drive {me} --by {me} --out {out}/driven.mp4 --size 64",
-    ):
-        assert main(line.format(me=demo, out=tmp_path).split()) == 0, line
-    assert len(read_ply(tmp_path / "open.ply")) > 1000
-    assert (tmp_path / "aside.png").read_bytes() != (tmp_path / "still.png").read_bytes()
-    assert runtime.load(tmp_path / "me.mien").render()[1].max() > 0.5
-    assert (len(list(tmp_path.glob("talk_*.ply"))), len(list((tmp_path / "f").iterdir()))) == (3, 2)
-    assert probe_video(tmp_path / "turn.mp4").frames == 6
-    assert probe_video(tmp_path / "driven.mp4").frames == FRAMES
 
 
 OF_A_VIDEO = {

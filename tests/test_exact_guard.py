@@ -1,7 +1,5 @@
 """The guard finds inexact arithmetic, and everything that must be the same everywhere passes it."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -11,22 +9,14 @@ from exact_guard import InexactError, exact_guard
 from mien import exact
 from mien.avatar import DEFAULT_METHOD
 from mien.files import file_digest, write_json
-from mien.gaussians import Gaussians
-from mien.lab.synthetic import RECIPES, SyntheticScene
-from mien.render import rasterize
 from mien.training import trainer
 from mien.training.footage.frames import FrameOrder, background_at, training_frames
 from mien.training.footage.sequence import Targets
 from plain_settings import plain_config, plain_run
-from rasterize_scenes import random_scene
 from toy_scene import toy_sequence
 
 pytestmark = pytest.mark.exact
 
-PLAIN = replace(
-    RECIPES["demo"], width=48, height=48, fps=4.0, seconds=0.5, texture_size=64, supersample=1, hair="none",
-    glasses=False, brows_and_lashes=False,
-)  # fmt: skip
 T, A = torch.ones(5, 5), np.ones((5, 5))
 LEARNT = torch.ones(5, 5, requires_grad=True)
 INEXACT = (
@@ -50,25 +40,6 @@ def test_the_guard_refuses_what_has_several_orders_and_lets_pass_what_has_one():
         assert float((T[:, :3] * T[:, :3]).sum(-1)[0]) == 3
         assert exact.product(A, A)[0, 0] == 5
         assert A.sum() == 25
-
-
-def test_drawing_has_no_product_of_a_library():
-    scene = SyntheticScene(PLAIN, 3)
-    with exact_guard():
-        scene.frame(1)
-
-
-def test_native_rasterizer_adds_up_by_itself():
-    scene = random_scene(0, coefficients=9)
-    given = replace(scene.gaussians, T_world_local=None)
-    means = given.means.clone().requires_grad_()
-    gaussians = Gaussians(means, given.quats, given.scales, given.opacities, given.sh)
-    gradient = torch.ones(scene.camera.height, scene.camera.width, 3)
-    with exact_guard():
-        rendering = rasterize(gaussians, scene.camera, scene.background, "native")
-        rendering.image.backward(gradient)
-    assert means.grad is not None
-    assert float(means.grad.abs().max()) > 0
 
 
 def test_a_step_of_training_adds_up_by_itself():

@@ -1,8 +1,6 @@
 """Loading gives the face model, whatever happens to the baked files on disk."""
 
-import importlib
 import json
-import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -93,17 +91,6 @@ def test_unknown_names_and_landmarks_of_another_mesh_are_refused():
     assert moved.content_hash != model.content_hash
     assert moved.topology_hash == model.topology_hash
     assert replace(model, faces=model.faces.roll(1, 1)).topology_hash != model.topology_hash
-
-
-@pytest.mark.unchecked
-def test_a_baked_model_loads_without_its_source(monkeypatch):
-    load_face_model("anny")
-    for name in list(sys.modules):
-        if name.split(".")[0] == "mien" and name != "mien._native":
-            monkeypatch.delitem(sys.modules, name)
-    for name in ("anny", "cv2", "mediapipe", "warp"):
-        monkeypatch.setitem(sys.modules, name, None)
-    assert importlib.import_module("mien.face").load_face_model("anny").name == "anny"
 
 
 @pytest.fixture

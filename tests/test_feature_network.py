@@ -71,14 +71,6 @@ def test_other_dtypes_have_factored_gradients_too() -> None:
         torch.testing.assert_close(own, expected)
 
 
-def test_reference_has_the_gradients_of_finite_differences() -> None:
-    def outputs(a: Tensor, b: Tensor, c: Tensor, d: Tensor, *layers: Tensor) -> tuple[Tensor, Tensor]:
-        return feature_network_reference(a, b, c, d, Layers(*layers))
-
-    given = [tensor.requires_grad_() for tensor in arguments((3, 4, 5, 2, 6, 7), torch.float64)]
-    assert torch.autograd.gradcheck(outputs, given)
-
-
 def test_gradients_are_the_same_whether_own_numbers_have_one_and_outputs_without_any(isa: str) -> None:
     given, by, found = arguments(SIZES[4]), gradients_of(SIZES[4]), []
     bases, _, _, own, *_ = given

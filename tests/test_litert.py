@@ -1,11 +1,6 @@
 """The detector on ai-edge-litert: like mediapipe's, on drawn and real faces, near and far; and who chooses it."""
 
-import hashlib
-import io
 import itertools
-import re
-import zipfile
-from importlib import resources
 from importlib.util import find_spec
 
 import cv2
@@ -16,15 +11,11 @@ from mien.capture import backend
 from mien.capture.faces import FaceFinder, LandmarkDetector, MeshReader
 from mien.capture.from_video import open_job
 from mien.capture.litert.mesh import Mesh
-from mien.capture.litert.networks import network_content
 from mien.capture.matte import Segmenter
 from mien.capture.settings import CaptureSettings
 from mien.capture.video import read_video_frames
-from mien.export.webcam import own_model
-from mien.face import FaceModel
 from mien.lab.synthetic import SyntheticRecipe, SyntheticScene
 from mien.picture_files import write_png
-from mien.tracking.landmarks import read_response
 
 pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
 
@@ -104,22 +95,3 @@ def test_litert_serves_where_mediapipe_is_missing_and_its_captures_are_others(dr
     assert backend.choose_detector() == "litert"
     with pytest.raises(ModuleNotFoundError, match="mediapipe"):
         backend.choose_detector("mediapipe")
-
-
-def test_networks_are_the_published_ones():
-    """After decompression, two have the sums of NOTICE; two are files of face_landmarker.task, whose sum is tested."""
-    notice = (resources.files("mien.capture") / "data" / "NOTICE").read_text(encoding="utf-8")
-    for name, file in (("far_faces", "face_detection_full_range_sparse"), ("person", "selfie_segmentation")):
-        content = network_content(name)
-        told = re.search(rf"{file}\.tflite: ([\d,]+) bytes, SHA-256\s+([0-9a-f]{{64}})\.", notice)
-        assert told is not None
-        assert told.groups() == (f"{len(content):,}", hashlib.sha256(content).hexdigest())
-    with zipfile.ZipFile(io.BytesIO(own_model())) as task:
-        assert network_content("near_faces") == task.read("face_detector.tflite")
-        assert network_content("landmarks") == task.read("face_landmarks_detector.tflite")
-
-
-def test_each_detector_has_its_own_offsets(anny: FaceModel):
-    one, other = read_response(anny, 0.003), read_response(anny, 0.003, "litert")
-    assert 0.3 < 1e3 * float((one.mean - other.mean).norm(dim=1).mean()) < 2
-    assert (one.by_person == other.by_person).all()

@@ -1,4 +1,4 @@
-"""The network of points against finite differences. tests/test_training_native.py compares it with its twin."""
+"""The network of points: the ends of its activations, and gradients that nobody needs. test_training_native has its twin."""
 
 import torch
 from torch import Tensor
@@ -59,15 +59,6 @@ def test_softplus_over_its_whole_range(isa: str) -> None:
     expected = torch.nn.functional.softplus(inputs.double(), beta=100)
     torch.testing.assert_close(outputs.double(), expected, atol=2e-8, rtol=1e-6)
     torch.testing.assert_close(slope.double(), (100 * inputs.double()).sigmoid(), atol=2e-5, rtol=0)
-
-
-def test_reference_has_the_gradients_of_finite_differences() -> None:
-    for sizes in (NETWORKS[0], NETWORKS[4]):
-        small: Sizes = (3, 2, tuple((1 + outputs % 5, activation, extra) for outputs, activation, extra in sizes[2]))
-        given = [tensor.requires_grad_() for tensor in arguments(small, torch.float64)]
-        assert torch.autograd.gradcheck(
-            lambda inputs, *parameters, small=small: point_network(inputs, layers_of(small, list(parameters))), given
-        )
 
 
 def test_what_needs_no_gradient_gets_none() -> None:

@@ -1,54 +1,19 @@
-"""`seams.py` finds what it is meant for, mutations and the native module's stub fit the code, and calls are checked."""
+"""Mutations and the stub of the native module fit the code, and calls are checked."""
 
 import ast
-from abc import ABC, abstractmethod
 from pathlib import Path
 
 import pytest
 import torch
 from jaxtyping import TypeCheckError
-from torch import nn
 
 import mien
 from checked_types import unchecked
 from mien import _native
 from mien.rotation import skew
 from mutations.copies import Case, read_cases
-from seams import override_faults, private_faults
 
 ROOT = Path(__file__).parents[1]
-PRIVATE = """from mien.face import _part, loading
-from mien import _native, cli
-_native.draw()
-loading._read(1)
-loading.read(1)
-monkeypatch.setattr(cli, '_run', None)
-self._y
-"""
-
-
-class Base(nn.Module, ABC):
-    @abstractmethod
-    def open(self) -> None: ...
-    @property
-    def size(self) -> int: ...
-
-
-class Own(Base):
-    def open(self) -> None: ...
-    def forward(self) -> None: ...
-
-
-class Last(Own):
-    def open(self) -> None: ...
-    @property
-    def size(self) -> int: ...
-
-
-def test_what_seams_finds() -> None:
-    faults = [fault.replace(f"{__name__}.", "").split(",")[0] for fault in override_faults([Base, Own, Last])]
-    assert faults == ["Last.open overrides that of Own", "Last.size overrides that of Base"]
-    assert sorted(fault.split(":")[1] for fault in private_faults({"t.py": PRIVATE})) == ["1", "4", "6"]
 
 
 @pytest.mark.parametrize("case", read_cases(), ids=lambda case: f"{case.file}: {case.old[:30]}")

@@ -22,7 +22,7 @@ from mien.capture.video import read_video_frames
 from mien.cli import main
 from mien.commands.stages import pictures
 from mien.evaluation.partial import PartialScores
-from mien.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Put, Terminated, orderly_stops, stops_put_off
+from mien.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Terminated, orderly_stops, stops_put_off
 from toy_workspace import write_toy_workspace
 
 KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated, signal.SIGHUP: HungUp}
@@ -106,23 +106,6 @@ def test_other_errors_are_raised_and_reported_as_ever(monkeypatch: pytest.Monkey
     with pytest.raises(ZeroDivisionError), orderly_stops():
         raise ZeroDivisionError(bool(Finalised()))
     assert reported == [ZeroDivisionError]
-
-
-@of_every_kind
-def test_a_stop_is_put_off(number: signal.Signals) -> None:
-    done = []
-
-    def work(stop: Put) -> None:
-        for step in range(4):
-            if step == 1:
-                signal.raise_signal(number)
-                signal.raise_signal(signal.SIGINT)
-            done.append((step, stop.asked()))
-            stop.follow()
-
-    with pytest.raises(KINDS[number]), stops_put_off() as stop:
-        work(stop)
-    assert done == [(0, False), (1, True)]
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, EXIT_TERMINATED), (signal.SIGHUP, EXIT_HUNG_UP)])

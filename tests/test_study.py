@@ -17,7 +17,7 @@ from mien.avatar import METHODS
 from mien.capture.video import read_video_frames
 from mien.cli import main
 from mien.errors import UserError
-from mien.lab.analysis.study import StudySettings, read_key
+from mien.lab.analysis.study import read_key
 from mien.lab.analysis.study.clips import spans
 from mien.lab.analysis.study.drawing import encode
 from mien.lab.analysis.study.files import QUESTIONS, read_all_answers
@@ -233,12 +233,6 @@ def test_bad_options_are_told_in_one_line(workspace: Path, tmp_path: Path, capsy
     refused(capsys, "is given twice", "make", workspace, workspace, "--out", page)
     refused(capsys, "no such folder", "make", tmp_path / "gone", "--out", page)
     assert not page.exists()
-
-
-def test_defaults_are_the_paper_s() -> None:
-    settings = StudySettings()
-    settings.check()
-    assert settings.clips == 10
 
 
 START = 'document.getElementById("start").click()'

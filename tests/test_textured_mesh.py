@@ -11,7 +11,7 @@ from torch import Tensor
 from damage import edit_json
 from known import known
 from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, load_avatar, move_avatar, write_avatar
-from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, middles_of_parts, place_surfels
+from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.mirror import triangle_geometry
@@ -66,18 +66,6 @@ def plane_model(cells: int = 5) -> FaceModel:
         face_regions=torch.zeros(len(faces), dtype=torch.long), identity_basis=torch.zeros(2, v, 3),
         expression_basis=torch.zeros(2, v, 3), skinning_weights=torch.eye(3)[:1].repeat(v, 1),
     )  # fmt: skip
-
-
-def test_parts_of_a_triangle_have_its_shape_and_fill_it() -> None:
-    for side in (1, 2, 5):
-        middles = middles_of_parts(side)
-        assert len(middles) == side**2
-        torch.testing.assert_close(middles.sum(1), torch.ones(side**2, dtype=torch.float64))
-        torch.testing.assert_close(middles.mean(0), torch.full((3,), 1 / 3, dtype=torch.float64))
-        # Parts about a middle reach a third of a part from it, so none is nearer to the border.
-        assert middles.min() == pytest.approx(1 / 3 / side)
-        apart = torch.cdist(middles, middles) + 9 * torch.eye(side**2)
-        assert side == 1 or apart.min() == pytest.approx(math.sqrt(6) / 3 / side)
 
 
 def test_surfels_cover_equal_areas() -> None:
@@ -137,15 +125,11 @@ def test_surfels_follow_offsets_exactly() -> None:
 
 def test_offsets_and_colours_are_averaged_over_neighbours() -> None:
     model = toy_face_model()
-    near, v = Neighbours(model.template, model.faces), len(model.template)
-    values = torch.randn(v, 2, dtype=torch.float64, requires_grad=True)
+    v = len(model.template)
     matrix = torch.zeros(v, v, dtype=torch.float64)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         matrix[model.faces[:, a], model.faces[:, b]] = matrix[model.faces[:, b], model.faces[:, a]] = 1
     matrix = matrix / matrix.sum(1, keepdim=True).clamp_min(1)
-    torch.testing.assert_close(near.means(values), matrix @ values)
-    (gradient,) = torch.autograd.grad(near.means(values)[3].sum(), values)
-    torch.testing.assert_close(gradient, matrix[3, :, None].expand(-1, 2))
     avatar = new_avatar(replace(PLAIN, smoothing=3), disturbed=1.0)
     smooth = torch.linalg.matrix_power((torch.eye(v) + matrix.float()) / 2, 3)
     offsets = avatar.get_buffer("movable") * (smooth @ avatar.vertex_means)

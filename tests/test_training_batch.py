@@ -1,7 +1,6 @@
 """Several frames in one optimiser step, and pictures of half the size at the start of a run."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +24,7 @@ from mien.training.footage.sequence import Targets
 from mien.training.trainer import passed, start, step
 from plain_settings import plain_mono_gaussian_avatar, plain_run
 from test_methods import new_avatar
-from test_training_resume import assert_same_results
 from toy_scene import toy_camera, toy_face, toy_sequence
-from train_toy import silence, stopped_at
 
 SMALL = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
@@ -186,20 +183,6 @@ def test_the_first_half_of_a_run_sees_pictures_of_half_the_size(tmp_path: Path, 
     assert forgotten == [16]
     monkeypatch.setattr("mien.training.batch.TRAINING", TRAINING)
     assert sizes_of(tmp_path / "small", monkeypatch) == [(32, 32, 32)] * 10
-
-
-@pytest.mark.unchecked
-@pytest.mark.usefixtures("_halved")
-def test_a_run_that_is_stopped_near_the_change_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    run = partial(train, [sequence], face_model, train_toy.CONFIG)
-    run(COARSE, tmp_path / "whole", silence)
-    often = replace(COARSE, checkpoint_every=1)
-    for last in (3, 5, 6):
-        with pytest.raises(KeyboardInterrupt):
-            run(often, tmp_path / "stopped", stopped_at(last))
-    run(often, tmp_path / "stopped", silence)
-    assert_same_results(tmp_path / "stopped", tmp_path / "whole")
 
 
 @pytest.mark.usefixtures("_halved")

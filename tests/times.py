@@ -26,7 +26,7 @@ THEMES = {
     "face models": "face|flame|gnm|ict|teeth",
     "capture, cameras, driving": "capture|video|color|camera|calibration|driv|motion|recordings|interlaced|litert|cuts",
     "datasets": "dataset|layout|named_split|submission",
-    "evaluation, reports, lab": "evaluation|analysis|study|bench|unseen|ablate|lpips|metrics|flicker|report",
+    "evaluation, reports, lab": "evaluation|analysis|study|bench|unseen|lpips|metrics|flicker|report",
     "docs, settings, presets": "docs|settings|setting_|paper_preset|public_api|constants|licences|release|seams",
     "training, avatars, rasterizer": "",
 }
