@@ -106,9 +106,6 @@ def test_what_matters_more_moves_further() -> None:
     descent.step([group])
     assert torch.allclose(values, torch.tensor([[-0.02, -0.005]]))
     assert values.grad is None
-    descent.step([group])
-    assert torch.equal(values[:, 0] / values[:, 1], torch.tensor([4.0])), "momentum goes on without a gradient"
-    assert values[0, 0] < -0.02
 
 
 @pytest.mark.unchecked

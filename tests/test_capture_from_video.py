@@ -1,7 +1,6 @@
 """A video becomes a capture, with the texture of a scanned face and with real footage."""
 
 import json
-import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -175,19 +174,6 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
         with pytest.raises(UserError, match=message) as error:
             capture_video(tmp_path / source, tmp_path / out, settings)
         assert "\n" not in str(error.value)
-
-
-def test_detectors_say_nothing(face_clip, tmp_path, capfd):
-    """Their native code writes to the file descriptor, at each start of a network."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", category=DeprecationWarning)
-        capture_video(face_clip, tmp_path / "out", CaptureSettings(size=64, max_frames=3))
-    said = capfd.readouterr()
-    assert said.out == ""
-    own = ("find the face", "capture wandering", "wandering: 3 frames of 64x64 take about")
-    lines = said.err.splitlines()
-    assert all(line.startswith(own) for line in lines), lines
 
 
 @pytest.mark.unchecked

@@ -116,8 +116,6 @@ def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> No
     ({"distortion": [1e200, 0, 0, 0, 0]}, "folds the picture"),
     ({"distortion": BARREL, "K": [[300, 5, 150], [0, 310, 125], [0, 0, 1]]}, "OpenCV's model has no skew"),
     ({"distCoeffs": BARREL}, "distCoeffs describes a lens in a way that mien does not read; .* as a list `dist"),
-    ({"radial_distortion": BARREL}, "radial_distortion describes a lens"),
-    ({"D": BARREL}, "D describes a lens"),
     ({"k1": -0.2}, "k1 describes a lens"),
     ({"distortion": BARREL, "fisheye": True}, "fisheye describes a lens"),
     ({"distortion": [0.1, 0, 0, 0], "model": "OPENCV_FISHEYE"}, "model describes a lens"),

@@ -45,8 +45,6 @@ def test_mirror_images_lie_on_the_other_side_in_the_same_region(anny, flame):
     reflected = middles * torch.tensor([-1.0, 1.0, 1.0])
     assert (reflected[has] - middles[images[has]]).norm(dim=1).median() < 1e-4
     assert torch.equal(anny.face_regions[images[has]], anny.face_regions[has])
-    aside = has[middles[has, 0] > 0.01]
-    assert (middles[images[aside], 0] < 0).all()
     random = torch.Generator().manual_seed(1)
     bent = replace(flame, template=flame.template + 3e-4 * torch.randn(flame.template.shape, generator=random))
     for model in (flame, bent):

@@ -111,10 +111,6 @@ def test_the_benchmark_counts_test_sequences_in_its_four_cameras(root: Path, mon
     experiment = found["self_reenactment_sequence"]
     assert set(experiment.held_out_frames) == {Frame(1, t, 0) for t in range(10)}
     assert experiment.whole_mattes
-    for folder in folders:
-        imported(folder, "vhap")
-    with pytest.raises(UserError, match="split nersemble-benchmark, and --protocol vhap needs the split of the"):
-        load_experiments(root / "runs" / "views", folders, "filmed", "vhap")
 
 
 def test_raw_recordings_are_cut_at_the_neck_line(root: Path, tmp_path: Path) -> None:

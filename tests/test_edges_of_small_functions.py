@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.arrays import native, recycled
+from mien.arrays import recycled
 from mien.camera import camera_from_fov
 from mien.capture.matte import guided_filter
 from mien.commands.expression import with_expression
@@ -182,14 +182,3 @@ def test_memory_is_used_again_but_never_while_somebody_holds_it() -> None:
     del view
     assert recycled(1024, 1025).data_ptr() == address
     assert (recycled(0, 3).shape, recycled(4, 0).shape) == ((0, 3), (4, 0))
-
-
-def test_the_reference_computes_what_the_core_cannot_take() -> None:
-    @native(lambda *_, **__: "reference")
-    def operation(*_: torch.Tensor, **__: torch.Tensor) -> str:
-        return "core"
-
-    two = torch.zeros(2)
-    assert operation(two, two.int()) == operation(two, named=two.int()) == "core"
-    for other in (two.double(), two.half(), torch.zeros(2, device="meta")):
-        assert operation(two, other) == operation(other, named=two) == "reference"

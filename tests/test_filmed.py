@@ -19,10 +19,8 @@ from mien.commands.stages import driving
 from mien.commands.stages.sheets import (
     TURNTABLE_TILES,
     Tile,
-    draw_sheet,
     expression_tiles,
     filmed_tiles,
-    named_picture,
     nearer_tiles,
     turntable_tiles,
 )
@@ -235,23 +233,6 @@ def test_a_turntable_ends_at_half_of_its_angle_on_either_side() -> None:
     assert len(tiles) == TURNTABLE_TILES
     torch.testing.assert_close(tiles[-1].camera.viewmat, orbit(CAMERA, torch.zeros(3), torch.pi / 3).viewmat)
     assert not torch.allclose(around[0].camera.viewmat, around[-1].camera.viewmat, atol=0.1)
-
-
-def test_names_are_legible_and_gaps_have_the_colour_of_the_background() -> None:
-    picture = np.zeros((20, 40, 3), np.uint8)
-    named = named_picture(picture, "a name that is far too wide for its tile")
-    assert np.array_equal(named[:20], picture)
-    assert (named[20:] < 255).any()
-    assert (named[20:, -2:] == 255).all(), "no letter is cut off"
-    blue = (26, 32, 80)
-    picture = np.full((512, 512, 3), blue, np.uint8)
-    sheet = draw_sheet(_turntable(), lambda face, camera: picture, blue)
-    high = named_picture(picture, "-70 degrees").shape[0] - 512
-    assert sheet.shape == (3 * (512 + high) + 2 * 4, 3 * 512 + 2 * 4, 3), "it fits a screen"
-    bar = sheet[512 : 512 + high, :512].astype(int)
-    rows = np.flatnonzero(np.abs(bar - blue).sum(-1).max(1) > 300)
-    assert np.ptp(rows) > 0.03 * 512, "letters are as large as their picture asks for, and light over a dark colour"
-    assert (sheet[:, 512:516] == blue).all()
 
 
 def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:

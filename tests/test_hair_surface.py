@@ -14,7 +14,6 @@ from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
-from mien.face.mirror import triangle_geometry
 from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.training import PRESETS, Sequence, train
@@ -61,15 +60,6 @@ def _pull(avatar: GaussianAvatars, surface: HairSurface, slope: float, rounds: i
         means.grad[:, 1] = slope * surface_of(avatar).sizes[avatar.store["face_index"]]
         surface.collect(surface_of(avatar), 0.1)
         surface.correct(surface_of(avatar), 0.1, _RATE)
-
-
-def test_the_gradient_of_the_height_is_that_of_the_posed_gaussians(anny):
-    """A loss that is the centres' place along the normals has a slope of 1 a metre for each Gaussian."""
-    avatar = _avatar(anny)
-    normals = triangle_geometry(anny.head_vertices(avatar.subject)[0], anny.faces)[2]
-    (avatar.pose(avatar.subject).gaussians.means.reshape(-1, 3) * normals).sum().backward()
-    gradient = known(surface_of(avatar).height_gradient())[surface_of(avatar).sizes > 1e-3]
-    torch.testing.assert_close(gradient, torch.ones_like(gradient), rtol=0.01, atol=0.01)
 
 
 @pytest.mark.parametrize("slope", [1.0, -1.0])
@@ -181,9 +171,6 @@ def test_contributions_are_the_shares_of_the_picture(anny):
         alpha = rasterize(avatar.pose(face).gaussians.timestep(0), camera, torch.zeros(3)).alpha
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-4)
     assert (found >= 0).all()
-    front = anny.region_mask("nose") & (triangle_views(anny(face)[0], anny.faces, camera.position) > 0.5)
-    assert float(found[back].median()) < 0.03
-    assert float(found[front].mean()) > 0.05
     behind = replace(face, head_rotation=torch.tensor([[0.0, torch.pi, 0.0]]))
     both = contributions(avatar, [(face, camera), (behind, camera)])
     assert float(both[back].mean()) > 0.5

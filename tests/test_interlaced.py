@@ -73,13 +73,11 @@ CODECS = {
 CONTAINER_ORDERS = {"tff": 2, "bff": 3}
 
 
-def write(path: Path, kind: str, frames: list[av.VideoFrame], order: int = 0, rotation: int = 0) -> None:
+def write(path: Path, kind: str, frames: list[av.VideoFrame], order: int = 0) -> None:
     codec, pixels, options = CODECS[kind]
 
     def prepare(stream: av.VideoStream) -> None:
         stream.codec_context.field_order = order
-        if rotation:
-            stream.set_display_rotation(rotation)
 
     is_interlaced = any(frame.interlaced_frame for frame in frames)
     encode(path, frames, codec, pixels, options=options if is_interlaced else None, prepare=prepare)
@@ -114,16 +112,6 @@ def test_each_interlaced_frame_becomes_one_picture_of_its_first_moment(kind, ord
         assert errors[0] < 7 < 20 < errors[1]
 
 
-@pytest.mark.parametrize("kind", ["h264.mp4", "prores.mov", "ffv1.mkv"])
-def test_progressive_frames_keep_every_bit(kind, pattern, tmp_path):
-    pictures = [moment(pattern, field) for field in range(FRAMES)]
-    write(tmp_path / kind, kind, flagged(pictures, CODECS[kind][1], ["prog"] * FRAMES))
-    for one, other in zip(*read_twice(tmp_path / kind), strict=True):
-        assert not one.is_deinterlaced
-        assert (one.picture() == other.picture()).all()
-        assert one.combs() < 0.001
-
-
 def test_only_the_interlaced_frames_of_a_mixed_clip_change(pattern, tmp_path):
     """Fields of one moment, as of a still head, lose nothing but single levels."""
     path, still = tmp_path / "mixed.mkv", moment(pattern, 0)
@@ -145,15 +133,6 @@ def test_unmarked_frames_are_deinterlaced_only_if_the_user_says_so(pattern, tmp_
         assert (one.is_deinterlaced, other.is_deinterlaced) == (False, True)
         assert one.combs() > 0.1
         assert bend_ratio(green(other)) < bend_ratio(green(one)) / 4
-
-
-def test_a_turned_interlaced_clip_is_upright(pattern, tmp_path):
-    path = tmp_path / "h264.mp4"
-    write(path, "h264.mp4", flagged(woven(pattern, "tff"), "yuv420p", ["tff"] * FRAMES), rotation=90)
-    frames = list(read_lazily(path))
-    assert all(frame.is_deinterlaced for frame in frames)
-    upright = np.rot90(moment(pattern, 4), 1)
-    assert np.abs(green(frames[2]).astype(int) - upright).mean() < 7
 
 
 @pytest.mark.parametrize(("pixels", "size"), [

@@ -11,7 +11,7 @@ import torch
 
 from known import known
 from mien import runtime
-from mien.avatar import METHODS, TRAINED, Avatar, HeadGasConfig, MethodConfig, ParameterGroup, Progress
+from mien.avatar import METHODS, Avatar, HeadGasConfig, MethodConfig, ParameterGroup, Progress
 from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.density import FixedDensity
 from mien.avatar.files import load_avatar, write_avatar
@@ -48,7 +48,6 @@ CONFIGS["mono_gaussian_avatar-batch"] = plain_mono_gaussian_avatar(
 )  # fmt: skip
 UNBAKED = ("headgas-no_mlp", "headgas-delta", "headgas-change_all")
 baked = pytest.mark.parametrize("method", [name for name in CONFIGS if name not in UNBAKED])
-method = pytest.mark.parametrize("method", METHODS)
 each = pytest.mark.parametrize("method", CONFIGS)
 
 
@@ -147,7 +146,7 @@ def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> N
 
 
 @pytest.mark.unchecked
-@method
+@pytest.mark.parametrize("method", METHODS)
 def test_an_avatar_becomes_a_file_a_page_and_a_mesh(method: str, tmp_path: Path) -> None:
     avatar = new_avatar(method)
     portable, model = make_portable(avatar, toy_camera(64), "toy"), avatar.face_model
@@ -186,13 +185,3 @@ def _gradient_of(group: ParameterGroup, name: str) -> torch.Tensor | None:
         return group.tensors[name].grad
     products = [rows[:, None] * columns[:, None] for rows, columns in group.factored[name].terms]
     return torch.stack(products).sum(0) if products else None
-
-
-@method
-def test_pose_depends_on_its_arguments_only(method: str) -> None:
-    avatar, face = new_avatar(method), toy_face(5)
-    first = avatar.pose(face[1]).gaussians
-    avatar.pose(face[3], Progress(1, 50))
-    assert torch.equal(first.means, avatar.pose(face[1]).gaussians.means)
-    together = avatar.pose(face, TRAINED).gaussians.timestep(1).means
-    torch.testing.assert_close(together, first.timestep(0).means, atol=1e-6, rtol=1e-5)

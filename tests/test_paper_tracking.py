@@ -128,22 +128,6 @@ def test_every_step_of_pass_and_epochs_has_all_cameras(case, monkeypatch):
     assert set(counts) == {2}
 
 
-def test_the_frame_pass_can_be_smooth_in_both_directions(case):
-    """A frame's neighbours are those before it, as fitted, and those after it, as they are expected."""
-    descent = _descent(case, PAPER)
-    rows, start = descent.state.frames[0], descent.start[0]
-    rows[:4] = descent.within(rows[:4] + 0.01)
-    around = frames.expected_around(descent, 0, 3)
-    torch.testing.assert_close(around[:4], rows[:4])
-    torch.testing.assert_close(around[4:], descent.within(rows[3] + start[4:] - start[3]))
-    target = descent.targets(0, 3)
-    moving = descent.moving(target[0], ())[0]
-    alone, smooth = (float(descent.frame_cost(target, moving, descent.scene.used, some)) for some in (None, around))
-    assert smooth > alone
-    half = float(descent.frame_cost(target, moving, descent.scene.used, around, 0.5))
-    assert half == pytest.approx((alone + smooth) / 2, rel=1e-5)
-
-
 def test_smoothness_in_the_frame_pass_is_a_setting(case):
     ends = {}
     for smoothness in (0.0, 1.0):

@@ -76,15 +76,6 @@ def test_slopes_are_the_gradients_of_the_distance() -> None:
         torch.testing.assert_close(slopes.detach(), expected)
 
 
-@torch.no_grad()
-def test_the_surface_starts_as_about_a_sphere() -> None:
-    torch.manual_seed(0)
-    network, directions = SurfaceNet(256, 7, 6), torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
-    inner, outer = (network(radius * directions) for radius in (0.3, 0.8))
-    assert (outer.distance - inner.distance).mean() > 0.2
-    assert (torch.nn.functional.normalize(outer.slope, dim=-1) * directions).sum(-1).mean() > 0.8
-
-
 def test_a_color_is_albedo_times_light_on_the_normal() -> None:
     avatar = new_avatar()
     surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)

@@ -8,22 +8,21 @@ from torch import Tensor
 
 from instruction_sets import by_threads
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
-from mien.avatar.ops.skin_points import blend_transforms, skin_points_reference, unskin
-from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, frames_to_world, triangle_frames
+from mien.avatar.ops.skin_points import blend_transforms, unskin
+from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, triangle_frames
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians
 from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
-from test_training_native import skin_inputs
 from toy_scene import toy_face, toy_face_model
 
 
 def random_rig(
-    seed: int = 0, timesteps: tuple[int, ...] = (), dtype: torch.dtype = torch.float64
+    seed: int = 0, dtype: torch.dtype = torch.float64
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return arguments of `bind_to_world`, at the size of a head."""
     generator = torch.Generator().manual_seed(seed)
-    vertices = 0.1 * torch.randn(*timesteps, 20, 3, generator=generator, dtype=dtype)
+    vertices = 0.1 * torch.randn(20, 3, generator=generator, dtype=dtype)
     faces = torch.stack([torch.randperm(20, generator=generator)[:3] for _ in range(30)])
     face_index = torch.randint(0, 30, (100,), generator=generator)
     means = torch.randn(100, 3, generator=generator, dtype=dtype)
@@ -39,16 +38,6 @@ def test_frame_of_a_known_triangle():
     torch.testing.assert_close(frames.R[0], torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
     torch.testing.assert_close(frames.T[0], torch.tensor([2.5 / 3, 1 / 3, 0]))
     torch.testing.assert_close(frames.k[0], torch.tensor(1.5))
-
-
-def test_frames_are_rotations_and_batch():
-    vertices, faces, *_ = random_rig(timesteps=(2, 3))
-    frames = triangle_frames(vertices, faces)
-    assert frames.R.shape == (2, 3, 30, 3, 3)
-    identity = torch.eye(3, dtype=torch.float64).expand_as(frames.R)
-    torch.testing.assert_close(frames.R @ frames.R.transpose(-1, -2), identity)
-    torch.testing.assert_close(torch.linalg.det(frames.R), torch.ones(2, 3, 30, dtype=torch.float64))
-    torch.testing.assert_close(frames.k[1, 2], triangle_frames(vertices[1, 2], faces).k)
 
 
 def test_a_gaussian_at_rest_takes_its_triangles_frame():
@@ -74,17 +63,6 @@ def test_gaussians_follow_a_similarity_of_the_mesh():
     torch.testing.assert_close(moved_means, 2 * means @ rotation.T + shift)
     torch.testing.assert_close(matrix_from_quaternion(moved_quats), rotation @ matrix_from_quaternion(quats))
     torch.testing.assert_close(moved_scales, 2 * scales)
-
-
-def test_reference_gradients_equal_finite_differences():
-    vertices, faces, face_index, *local = random_rig()
-
-    def world(vertices: Tensor, means: Tensor, quats: Tensor, log_scales: Tensor) -> tuple[Tensor, ...]:
-        frames = triangle_frames(vertices, faces)
-        return frames_to_world(frames, face_index, means, quats, log_scales)
-
-    inputs = [tensor.requires_grad_() for tensor in (vertices, *local)]
-    assert torch.autograd.gradcheck(world, inputs, fast_mode=True)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -113,11 +91,6 @@ def test_gradients_go_only_where_they_are_wanted_and_indices_are_checked():
         bind_to_world(vertices, faces + 1, face_index, *local)
     with pytest.raises(IndexError, match="face"):
         bind_to_world(vertices, faces, face_index - 1, *local)
-
-
-def test_reference_of_skinning_has_the_gradients_of_finite_differences() -> None:
-    given = [tensor.double().requires_grad_(index != 3) for index, tensor in enumerate(skin_inputs((4, 2, 3)))]
-    assert torch.autograd.gradcheck(skin_points_reference, given)
 
 
 def test_unskin_undoes_blended_transforms() -> None:

@@ -127,18 +127,6 @@ def test_the_newest_request_wins_and_pictures_are_full_when_nothing_moves() -> N
     assert stage.shown[2:] == [(1, 11, False)]
 
 
-def test_quick_pictures_are_always_full() -> None:
-    stage = Stage(1)
-    for seconds in (0.004, 0.016, 0.016, 0.03, 0.03, 0.03, 0.09, 0.0225, 0.0075, *[0.0035] * 6):
-        stage.seconds = seconds
-        stage.look(1, 11)
-        stage.loop.step()
-    sizes = [full for _, full in stage.drawn]
-    # It starts with half size; 30 ms do not change it, 90 ms do, and back only far below.
-    assert sizes[:9] == [False, *[True] * 6, False, False]
-    assert sizes[-1]
-
-
 def test_two_clients_take_turns_until_one_vanishes() -> None:
     stage = Stage(1, 2)
     for width in range(11, 17):
