@@ -23,7 +23,6 @@ import torch
 
 import train_toy
 from capture_helpers import write_gradient_video
-from damage import edit_json
 from mien.avatar import load_avatar, write_avatar
 from mien.capture import write_capture
 from mien.capture.video import write_video
@@ -111,21 +110,8 @@ def test_bad_json_and_tensors(tmp_path: Path) -> None:
         read_arrays(path)
 
 
-def test_an_edited_json_is_noticed(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    write_json(path, "x", 1, {"psnr": 31.5})
-    assert read_json(path, "x", 1) == {"format": "x", "version": 1, "psnr": 31.5}
-    path.write_text(path.read_text().replace("31.5", "39.5"))
-    with pytest.raises(UserError, match="damaged or edited"):
-        read_json(path, "x", 1)
-    edit_json(path, lambda content: None)
-    assert read_json(path, "x", 1)["psnr"] == 39.5
-
-
 def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_path: Path) -> None:
     readers = {"config.json": read_run_config, "metrics.json": read_metrics, "training.json": read_training_summary}
-    with pytest.raises(UserError, match=r"metrics\.json: missing; run `mien evaluate` again"):
-        read_metrics(tmp_path)
     for name, read in readers.items():
         (tmp_path / name).touch()
         with pytest.raises(UserError, match="cannot be read as json") as error:
@@ -134,15 +120,11 @@ def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_pa
     with pytest.raises(UserError, match="delete this file, not its folder, and run `mien evaluate` again"):
         read_metrics(tmp_path)
     shutil.copytree(run_dir / "avatar", tmp_path / "avatar")
-    for name in ("face_model.safetensors", "face_model.json", "avatar.safetensors", "avatar.json"):
+    for name in ("face_model.safetensors", "avatar.json"):
         path = tmp_path / "avatar" / name
         path.write_bytes(path.read_bytes()[:40])
         with pytest.raises(UserError, match=rf"{name}: .*; delete the run's training.json, .* again with `mien train`"):
             load_avatar(tmp_path)
-    (tmp_path / "avatar" / "avatar.json").write_bytes((run_dir / "avatar" / "avatar.json").read_bytes())
-    (tmp_path / "avatar" / "avatar.safetensors").unlink()
-    with pytest.raises(UserError, match=r"avatar\.safetensors: missing; .* train it again"):
-        load_avatar(tmp_path)
 
 
 def test_a_damaged_run_is_trained_again_as_advised(

@@ -2,8 +2,6 @@
 
 import itertools
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +22,6 @@ from mien.lab.benchmarking.timing import BenchmarkRow, Timing, time_function
 from mien.training.trainer import step
 
 pytestmark = pytest.mark.unchecked
-PEERS = Path(__file__).parent.parent / "benchmarks" / "peers"
 
 
 @pytest.fixture(autouse=True)
@@ -132,13 +129,6 @@ def test_a_case_trains(made: Any, count: int, name: str, shape: tuple[int, ...])
         step(state, data, train_step.SETTINGS)
     assert (state.step - begun, before.shape) == (count, shape)
     assert not torch.equal(before, state.avatar.gaussian_store()[name])
-
-
-@pytest.mark.slow
-def test_peers_are_compared_in_one_run() -> None:
-    command = [sys.executable, str(PEERS / "compare.py"), "--counts", "200", "--size", "48", "--rounds", "1", "--json"]
-    shown = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    assert {row["name"] for row in shown["rows"]} >= {"mien_native", "torch_tiles"}
 
 
 def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

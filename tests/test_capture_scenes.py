@@ -3,7 +3,6 @@
 Drawn people stand in front of plain walls, so that the true landmarks are known.
 """
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 
 from capture_helpers import face_picture, interrupt_at, tree_bytes
-from mien.avatar import DEFAULT_METHOD
 from mien.capture import CaptureSettings, capture_video, capture_video_parts, process, read_capture
 from mien.capture.crop import Crop
 from mien.capture.faces import MAX_FACES, LandmarkDetector
@@ -148,21 +146,6 @@ def test_interrupted_parts_go_on_to_the_same_bytes(shots, tmp_path, monkeypatch)
     capture_video_parts(shots, tmp_path / "interrupted", settings)
     assert [arguments[1].name for arguments in calls] == ["clip-1", "clip-2", "clip-2", "clip-3"]
     assert tree_bytes(tmp_path / "interrupted") == tree_bytes(tmp_path / "straight")
-
-
-@pytest.mark.unchecked
-@pytest.mark.usefixtures("short_films")
-def test_a_clip_with_cuts_becomes_an_avatar(shots, tmp_path):
-    arguments = ["create", str(shots), "--out", str(tmp_path / "out"), "--capture.size", "96"]
-    # test_subject_commands tracks several scenes together by their pixels.
-    arguments += ["--tracking.schedule", "landmarks", "--tracking.keyframes", "2", "--overlay", "none"]
-    arguments += ["--training.unseen", "trained", "--training.inside", "free", "--training.mesh", "tracked"]
-    assert main([*arguments, "--steps", "2", "--preset", "draft", "--hold-out", "clip-2"]) == 0
-    run = tmp_path / "out/runs" / DEFAULT_METHOD
-    trained = json.loads((run / "config.json").read_text())["data"]
-    assert [entry["sequence"] for entry in trained] == ["clip-1", "clip-2"]
-    metrics = json.loads((run / "metrics.json").read_text())
-    assert metrics["protocols"]["self_reenactment_sequence"]["frames"] == FRAMES
 
 
 def test_flashes_motion_and_light_are_no_cuts(test_data):

@@ -1,6 +1,5 @@
 """Captures on disk survive a round trip, keep a cache, and report damage. The room that one takes is said before."""
 
-import contextlib
 import dataclasses
 import os
 import runpy
@@ -101,19 +100,13 @@ def edit(**content):
 
 DAMAGES = [
     (lambda path: (path / "capture.json").unlink(), "capture.json: missing"),
-    (lambda path: os.truncate(path / "capture.json", 30), "cannot be read as json"),
     (edit(version=2), "version 2, expected"),
     (edit(format="mien.tracking"), "expected 'mien.capture'"),
-    (edit(camera_ids="0"), "missing or wrong entries"),
-    (edit(camera_ids=["../x", "y"]), "missing or wrong entries"),
     (edit(timesteps=2), "landmarks.safetensors: timestamps is"),
     (edit(fps=0), "missing or wrong entries"),
     (edit(fps=25.0), "does not belong"),
-    (lambda path: os.truncate(path / "landmarks.safetensors", 50), "damaged safetensors"),
-    (lambda path: (path / "landmarks.safetensors").unlink(), "landmarks.safetensors: missing"),
     (lambda path: (path / "frames/camera1/000002.png").unlink(), "000002.png: missing"),
     (lambda path: shutil.rmtree(path / "mattes/camera1"), "missing .3 of 3 are"),
-    (lambda path: os.truncate(path / "mattes/camera0/000001.png", 200), "000001.png: truncated"),
     (lambda path: flip(path / "frames/camera0/000002.png", 700), "000002.png: (damaged|its pixels have changed)"),
     (lambda path: shutil.copy(path / "frames/camera1/000001.png", path / "frames/camera0/000000.png"),
      "000000.png: its pixels have changed"),
@@ -132,20 +125,6 @@ def test_every_damage_is_named(stored, tmp_path):
         assert "\n" not in str(error.value), message
     with pytest.raises(UserError, match="no capture there"):
         read_capture(tmp_path / "nowhere")
-
-
-def test_flipped_bits_never_go_unseen(stored, tmp_path):
-    random = np.random.default_rng(1)
-    files = [path.relative_to(stored) for path in sorted(stored.rglob("*")) if path.is_file()]
-    for trial in range(20):
-        path = tmp_path / str(trial)
-        shutil.copytree(stored, path)  # times of change are kept, so the cache stays valid
-        target = path / files[trial % len(files)]
-        content = bytearray(target.read_bytes())
-        content[random.integers(len(content))] ^= 1 << random.integers(8)
-        target.write_bytes(content)
-        with contextlib.suppress(UserError):
-            assert_same_capture(random_capture(), read_capture(path))
 
 
 def test_only_captures_are_replaced(stored, tmp_path):

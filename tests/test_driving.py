@@ -1,4 +1,4 @@
-"""Drivers of every kind: how `mien drive --by` opens them, their sides, and the transfer to the avatar's own frame."""
+"""Drivers of every kind: how `mien drive --by` opens them, their sides, times, and transfer to the avatar's frame."""
 
 import math
 from dataclasses import replace
@@ -10,23 +10,32 @@ import torch
 
 from mien.avatar import neutral_of
 from mien.camera import camera_from_fov
-from mien.capture import Capture, read_capture_hash, write_capture
+from mien.capture import Capture
+from mien.capture.pace import frame_rate, pace_report
 from mien.capture.video import probe_video, write_video
 from mien.commands.stages import driving
 from mien.commands.stages.driving import open_driver, run_driving_stage
-from mien.driving import ARKIT_NAMES, drive, face_of_motion, read_blendshape_json, read_live_link_face
+from mien.driving import (
+    ARKIT_NAMES,
+    drive,
+    face_of_motion,
+    read_blendshape_json,
+    read_live_link_face,
+    read_tracked_driver,
+)
+from mien.driving.drivers import Driver
 from mien.driving.motion import Motion, gaze_of
-from mien.driving.sides import PAIRS, SOURCES
+from mien.driving.sides import PAIRS
 from mien.errors import UserError
 from mien.face import FaceParams, load_face_model
 from mien.render.camera_paths import orbit, turned_camera, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
+from mien.tracking import Tracking
 from mien.workspace import Workspace
 from recordings import LAYOUTS, row, write_csv
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model, toy_sequence
-from toy_workspace import write_toy_workspace
+from toy_workspace import write_sequence, write_toy_workspace
 
 
 def _face(timesteps: int, seed: int = 0, expressions: int = 6) -> FaceParams:
@@ -111,11 +120,7 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def run_capture_stage(workspace: Workspace, *_: object) -> list[str]:
         for number, (name, timesteps) in enumerate(PARTS.items(), 1):
             capture, tracking = part(number, timesteps)
-            folder = workspace.sequence_dir(name)
-            write_capture(folder / "capture", capture)
-            write_tracking(folder / "tracking", tracking)
-            crops = np.tile(np.array([4, 4, 20, 20], np.int64), (timesteps, 1, 1))
-            write_scoring(folder / "scoring", Scoring(capture.mattes, crops), read_capture_hash(folder / "capture"))
+            write_sequence(workspace.sequence_dir(name), capture, tracking)
         return list(PARTS)
 
     def run_tracking_stage(*_: object, **__: object) -> dict[str, Tracking]:
@@ -175,24 +180,12 @@ OBSERVERS = {"Live Link Face (.csv)": ("jawLeft", "jawRight", "mouthLeft", "mout
 SLIDES = ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
 
 
-def test_every_coefficient_with_a_side_is_in_the_table() -> None:
-    assert len(PERFORMERS) == len(set(PERFORMERS)) == 40
-    assert {name for name in ARKIT_NAMES if "Left" in name or "Right" in name} == set(PERFORMERS)
-    for source, sides in SOURCES.items():
-        observed = [name for name in PERFORMERS if sides.of(name).value == "observer"]
-        assert sorted(observed) == sorted(OBSERVERS.get(source, ()))
-    text = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text(encoding="utf-8")
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
-    told = {row[0]: row[1:4] for row in rows if row[0] in SOURCES}
-    assert told == {name: [sides.parts.value, sides.jaw.value, sides.mouth.value] for name, sides in SOURCES.items()}
-    assert told.keys() == LAYOUTS.keys()
-
-
 @pytest.mark.parametrize(("source", "write"), [(source, write) for source in LAYOUTS for write in LAYOUTS[source]])
 def test_coefficients_of_observers_change_their_side(source: str, write, tmp_path: Path) -> None:
     path = write(tmp_path, [{}, *({name: 1.0} for name in PERFORMERS)])
     motion = read_live_link_face(path) if path.suffix == ".csv" else read_blendshape_json(path)
     assert (motion.coefficients[0] == 0).all()
+    assert {name for name in ARKIT_NAMES if "Left" in name or "Right" in name} == set(PERFORMERS)
     other = {one: two for pair in PAIRS for one, two in (pair, pair[::-1])}
     for name, coefficients in zip(PERFORMERS, motion.coefficients[1:], strict=True):
         expected = other[name] if name in OBSERVERS.get(source, ()) else name
@@ -218,3 +211,71 @@ def test_each_coefficient_moves_its_side_of_a_face() -> None:
     for name, way in (("eyeLookInLeft", -1), ("eyeLookOutLeft", 1), ("eyeLookInRight", 1), ("eyeLookOutRight", -1)):
         irises = moved[PERFORMERS.index(name)][model.faces[model.region_mask("irises")].long().flatten()]
         assert way * irises[:, 0].sum() > 0, name
+
+
+# -- times of frames --------------------------------------------------------------------------------------------------
+
+
+def test_a_pause_does_not_change_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
+    """A pause of 20 s in a clip at 30 frames a second leaves 30, however the file states its rate."""
+    times = np.concatenate([np.arange(30), 600 + np.arange(30)]) / 30
+    for nominal in (30.0, 60 / times[-1], 1000.0):
+        assert frame_rate(times, nominal) == pytest.approx(30)
+    assert pace_report("clip", times)["pauses"] == 1
+    assert "clip: a pause of 19.0 s without a frame, after 1.0 s" in capsys.readouterr().err
+
+
+def test_dropped_and_odd_frames_do_not_change_the_rate() -> None:
+    random = np.random.default_rng(0)
+    kept = np.flatnonzero(random.uniform(size=300) > 0.2)
+    assert frame_rate((kept - kept[0]) / 25, 25.0) == 25
+    assert frame_rate((kept - kept[0]) / 25, 19.9) == pytest.approx(25)
+    assert frame_rate(np.cumsum([0, *[2, 3] * 20]) / 60, 60.0) == pytest.approx(24)  # a film
+    # Files of whole milliseconds say 33, 33 and 34 ms.
+    assert frame_rate(np.round(np.arange(100) / 30, 3), 30.0) == 30
+    for fps in (24.0, 29.97, 60.0):
+        times = np.arange(90) / fps
+        assert frame_rate(times, fps) == fps
+        assert frame_rate(times, 2 * fps) == (len(times) - 1) / times[-1]
+        assert "pauses" not in pace_report("clip", times)
+    assert frame_rate(np.zeros(3), 25.0) == frame_rate(np.zeros(1), 25.0) == frame_rate(np.zeros(0), 25.0) == 25
+
+
+def filmed_at(folder: Path, frames: np.ndarray, fps: float = 25.0) -> Driver:
+    """Return a driver with some frames of 25 a second. Its head turns by 0.01 radians a frame; grey is their index."""
+    _, sequence = toy_sequence(len(frames), 32)
+    turned = torch.zeros(len(frames), 3)
+    turned[:, 1] = 0.01 * torch.from_numpy(frames).float()
+    gray = np.zeros_like(sequence.capture.images) + np.arange(len(frames), dtype=np.uint8)[:, None, None, None, None]
+    tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, head_rotation=turned))
+    write_sequence(folder, replace(sequence.capture, timestamps=frames / 25, fps=fps, images=gray), tracking)
+    return read_tracked_driver([folder])
+
+
+def test_a_driver_moves_at_the_times_of_its_video(tmp_path: Path) -> None:
+    """Every second frame of the second half is missing, and the file states the mean rate."""
+    frames = np.concatenate([np.arange(20), 20 + 2 * np.arange(10)])
+    driver = filmed_at(tmp_path / "half", frames, float(25 * len(frames) / frames[-1]))
+    assert driver.fps == pytest.approx(25)
+    torch.testing.assert_close(driver.face.head_rotation[:, 1], 0.01 * torch.arange(39), atol=1e-6, rtol=0)
+    assert driver.pictures is not None
+    shown = [int(driver.pictures(index)[0, 0, 0]) for index in range(39)]
+    assert shown[:21] == list(range(21))
+    assert np.abs(frames[shown] - np.arange(39)).max() <= 1
+    assert shown[-1] == 29
+    steady = filmed_at(tmp_path / "steady", np.arange(9))
+    assert steady.fps == 25
+    assert torch.equal(steady.face.head_rotation[:, 1], 0.01 * torch.arange(9).float())
+
+
+def test_a_driver_waits_in_a_pause(tmp_path: Path) -> None:
+    """In a pause of two seconds, the face is held, and it moves on just before the next frame."""
+    angles = filmed_at(tmp_path, np.concatenate([np.arange(10), 60 + np.arange(10)])).face.head_rotation[:, 1]
+    assert len(angles) == 70
+    assert (angles[9:60] - angles[9]).abs().max() < 1e-6
+    torch.testing.assert_close(angles[60:], 0.01 * torch.arange(60, 70), atol=1e-6, rtol=0)
+
+
+def test_a_pause_that_never_ends_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="frame 5: comes 100 s after the one before"):
+        filmed_at(tmp_path, np.concatenate([np.arange(5), 2500 + np.arange(5)]))

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien import _native
 from mien.camera import camera_from_fov
 from mien.face import FaceModel, FaceParams, head_poses, load_face_model, part_boxes
 from mien.rotation import matrix_from_axis_angle
@@ -61,9 +60,11 @@ def test_vertices_and_gradients_equal_the_reference(isa, name: str, in_world: bo
 
 def test_the_last_persons_shape_is_not_taken_for_anothers() -> None:
     model = chained_model()
-    face = random_face(model, 1).detach()
+    many = random_face(model, 3).detach()
+    face = many[1]
     first = model(face)
     assert torch.equal(model(face), first)
+    assert torch.equal(model(many)[1], first[0])
     doubled = replace(face, identity=face.identity.clone())
     model(doubled)
     doubled.identity.mul_(2)
@@ -76,20 +77,6 @@ def test_the_last_persons_shape_is_not_taken_for_anothers() -> None:
         model(face)
     for gradient in torch.autograd.grad(model(face).square().sum(), shape):
         assert gradient.any()
-
-
-def test_the_same_bits_for_any_number_of_threads_and_any_batch() -> None:
-    model = load_face_model("anny")
-    face = random_face(model, 3).detach()
-    before, results = _native.thread_count(), []
-    for threads in (1, 2, 3):
-        _native.set_thread_count(threads)
-        leaf = replace(face, expression=face.expression.clone().requires_grad_())
-        vertices = model(leaf)
-        results.append((vertices.detach(), *torch.autograd.grad(vertices.square().sum(), [leaf.expression])))
-    _native.set_thread_count(before)
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
-    assert torch.equal(model(face[1])[0], results[0][0][1])
 
 
 def test_head_poses_and_gradients_equal_the_reference() -> None:

@@ -8,18 +8,17 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mien.avatar import METHODS, Avatar, Progress
+from mien.avatar import METHODS, Avatar
 from mien.face import FaceModel
 from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.training import Sequence, train
-from mien.training.density_control import density_strategy
 from mien.training.footage.frames import training_frames
 from mien.training.footage.hidden import hidden_triangles, inside_triangles
 from mien.training.footage.sequence import Targets
 from mien.training.whole_head.mouth_interior import Inside, cover_hidden, covered_reference
-from mien.training.whole_head.unseen import spare_fills, unseen_of
-from plain_settings import plain_config, plain_gaussian_avatars, plain_run
+from mien.training.whole_head.unseen import unseen_of
+from plain_settings import plain_gaussian_avatars, plain_run
 from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_face, toy_sequence
 
@@ -105,8 +104,6 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
     assert (prior.widening[~inside] == 1).all()
     surface_of(avatar).close(prior)
     store = avatar.gaussian_store()
-    density = density_strategy(spare_fills(avatar, avatar.density(), unseen), store)
-    density.adapt(store, avatar.pose(sequence.tracking.face[0]), Progress(39, 100, 0, 1.0), torch.Generator)
     own = inside[store["face_index"]]
     assert (store["opacity_logits"].sigmoid()[own] > 0.9).all()
     assert (rgb_from_sh(store["sh_constant"][own][:, 0]) < 0.4).all()
@@ -117,6 +114,7 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
     model, sequence = toy
     avatar, hidden = made(toy, degree), model.face_regions == 1
     posed = avatar.pose(sequence.tracking.face[0])
+    assert cover_hidden(posed, avatar, None, torch.Generator()) is posed
     changed = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(3))
     color = torch.rand(3, generator=torch.Generator().manual_seed(3))
     colors = rgb_from_sh(changed.gaussians.sh[hidden, 0])
@@ -141,14 +139,6 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
     expected = torch.autograd.grad(plain, (sh, opacities), factors)
     for one, other in zip((fast.sh, fast.opacities, *found), (*plain, *expected), strict=True):
         assert torch.equal(one, other)
-
-
-def test_other_methods_have_nothing_to_cover(toy: tuple[FaceModel, Sequence]) -> None:
-    avatar = METHODS["headgas"].avatar(plain_config("headgas"), toy[0], toy[1].tracking.face)
-    posed = avatar.pose(toy[1].tracking.face[0])
-    assert avatar.surface() is None
-    assert cover_hidden(posed, avatar, toy[0].face_regions == 1, torch.Generator()) is posed
-    assert cover_hidden(posed, made(toy), None, torch.Generator()) is posed
 
 
 def test_open_surface_is_closed_and_the_rest_stays(toy: tuple[FaceModel, Sequence]) -> None:

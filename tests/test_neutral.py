@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from mien.avatar import neutral_of
-from mien.capture import read_capture_hash, write_capture
 from mien.commands.options import check_neutral
 from mien.commands.stages.driving import open_driver
 from mien.driving import drive, facing, rest_of, with_neutral
@@ -18,10 +17,10 @@ from mien.driving.rest import kept_share
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import Scoring, write_scoring, write_tracking
 from small_face_model import make_small_face_model
 from test_motion import row, write_csv
 from toy_scene import toy_face_model, toy_sequence
+from toy_workspace import write_sequence
 
 NAMES = (
     "jawOpen", "browInnerUp", "browOuterUpLeft", "browOuterUpRight", "mouthSmileLeft", "mouthSmileRight",
@@ -122,11 +121,8 @@ def tracked(folder: Path, first: float, then: float) -> Path:
     _, sequence = toy_sequence(30, 32)
     expression = torch.zeros_like(sequence.tracking.face.expression)
     expression[:15, 0], expression[15:, 0] = first, then
-    write_capture(folder / "capture", sequence.capture)
     face = replace(sequence.tracking.face, expression=expression)
-    write_tracking(folder / "tracking", replace(sequence.tracking, face=face))
-    crops = np.tile(np.array([4, 4, 20, 20], np.int64), (30, 1, 1))
-    write_scoring(folder / "scoring", Scoring(sequence.capture.mattes, crops), read_capture_hash(folder / "capture"))
+    write_sequence(folder, sequence.capture, replace(sequence.tracking, face=face))
     return folder
 
 

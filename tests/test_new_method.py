@@ -1,8 +1,6 @@
 """A stranger adds a method: the steps of CONTRIBUTING.md, "Add a method", to the letter, then the suite on it."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 from forked import ForkServer
@@ -62,11 +60,3 @@ def test_the_suite_passes_as_it_is(fork_server: ForkServer, tmp_path: Path) -> N
     } <= passed
     for file in ("test_runtime", "test_settings"):
         assert re.search(rf"{file}\w*\.py::\w+\[{name}[^]]*\] PASSED", process.stdout)
-
-
-def test_it_is_written_as_the_project_is(tmp_path: Path) -> None:
-    file = tmp_path / f"{follow(tmp_path)}.py"
-    for words in (("check",), ("format", "--check")):
-        line = [sys.executable, "-m", "ruff", *words, "--config", str(ROOT / "pyproject.toml"), str(file)]
-        done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr

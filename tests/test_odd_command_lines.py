@@ -50,65 +50,40 @@ ODD = [
     (f"render W --out {'a' * 300}.png", "cannot be written"),
     ("render W --out a.mp4 --background transparent", "an .mp4 cannot be transparent"),
     ("render W --out a.png --background #12", "--background #12"),
-    ("render W --out a.mp4 --frames 0", "--frames 0: give 1 or more"),
     ("render W --out a.mp4 --fps nan", "--fps nan"),
-    ("render W --out a.mp4 --zoom 0", "--zoom 0: give a number from 0.01 to 100"),
     ("render W --out a.mp4 --path loop", "'loop'"),
     ("render W --out a.png --set drop=nan", "--set drop=nan: drop goes from 0 to 1"),
     ("render W --out a.png --set drop=0,5", "'0,5' is not a number"),
     ("render W --out a.png --set drop 0.5", "--set drop 0.5: write drop=0.5"),
-    ("render W --out a.png --set drop", "--set drop: write drop=0.6"),
     ("render W --out a.png --set dorp=1", "did you mean drop?"),
     ("render W --out a.png --run ../toy", "no run '../toy'; there are: toy"),
     ("render W --out a.png --sequence a/b", "no sequence 'a/b'; there are: clip"),
     ("render W --out a.png --cameras none.json", "none.json: no such file"),
     ("render W --out a.png --cameras cameras.json", "viewmat is not a rotation"),
     ("render W --out a.png --yaw 200", "--yaw 200: give degrees between -180 and 180"),
-    ("render W --out a.png --yaw 30 --path captured", "leave out --path captured"),
-    ("render W --out a.mp4 --sheet expressions", "a sheet is one picture; give --out NAME.png"),
     ("render W --out a.png --sheet filmed --strength nan", "--strength nan: give a number from 0 to 3"),
-    ("render W --out a.png --sheet filmed --background transparent", "a sheet has no transparency"),
-    ("render W --out a.png --sheet turntable --own-motion", "leave out --own-motion"),
-    ("render W --out a.png --sheet turntable --cameras cameras.json", "leave out --cameras"),
     ("render W/runs/toy --out a.png", "did you mean W --run toy?"),
     ("render 'not there' --out a.png", "--out 'not there'`"),
     ("drive W --by none.csv --out a.mp4", "none.csv: no such file or folder"),
     ("drive W --by empty.csv --out a.mp4", "empty.csv: has no frames"),
-    ("drive W --by list.json --out a.mp4", "list.json: is not a list of frames"),
-    ("drive W --by empty.mp4 --out a.mp4", "empty.mp4: is empty"),
-    ("drive W --by text.txt --out a.mp4", "text.txt: cannot be read as a video"),
     ("drive W --by W --out a.png", "one picture"),
     ("drive W --by W --out a.mp4 --fps 30", "--fps 30: is for the times of a .csv"),
     ("drive W --by empty.csv --out a.mp4 --fps 0", "--fps 0"),
     ("drive W --by list.json --out a.mp4 --sequence clip", "--sequence clip"),
-    ("view none", "none: no such folder"),
-    ("view text.txt", "text.txt: is no .mien file"),
     ("view W --port -1", "--port -1: give a number from 1 to 65535"),
-    ("view W --play none", "none: no such file or folder"),
     ("view W --host 256.1.1.1", "--host 256.1.1.1: is no address of this machine"),
     ("export W --out a.obj", "cannot write .obj; use .mien, .html, .packed, .glb, .vrm, .ply, .spz, .sog,"),
-    ("export W --out a.mien --every 3", "--every 3"),
     ("export W --out a.ply --series none", "--series none: no such sequence, file or folder; "),
     ("evaluate", "nothing to evaluate"),
     ("evaluate W W", "2 workspaces"),
     ("evaluate W --perceptual-frames -1", "--perceptual-frames -1"),
-    ("evaluate --images W", "belong together"),
-    ("evaluate W --compare", "no evaluated run to compare"),
     ("train W --run a/b", "'a/b' cannot be the name of a folder"),
-    ("train W --hold-out none", "--hold-out none: no such sequence"),
     ("track W --face-model none", "no face model 'none'"),
-    ("track W --tracking.photometric.sizes 0", "--tracking.photometric.sizes 0: give numbers from 16 to 8192"),
-    ("track W --tracking.photometric.sizes", "--tracking.photometric.sizes (nothing)"),
-    ("track W --tracking.photometric.focal-sigma 0", "--tracking.photometric.focal-sigma 0: give a number above 0"),
-    ("track W --tracking.paper.shrink 0", "--tracking.paper.shrink 0"),
     ("track W --tracking.paper.rates.focal nan", "--tracking.paper.rates.focal nan: give a number from 0 to 1e+09"),
-    ("track W --tracking.smoothness.rotation -1", "--tracking.smoothness.rotation -1: give a number above 0, or inf"),
     ("track W --scoring.cut line", "give --scoring.cut plane, or delete that folder"),
     ("capture empty.mp4 --out text.txt", "is a file, but a folder"),
     ("capture /dev/null --out new", "/dev/null: is not a file"),
-    ("create empty.mp4 --out new --capture.size 0", "--capture.size 0"),
     ("create empty.mp4 --out new --capture.landmarks none.csv", "--capture.landmarks none.csv: no such file"),
-    ("demo --out text.txt", "text.txt: is a file"),
     ("demo --out new --seconds nan", "--seconds nan"),
 ]
 
@@ -156,7 +131,6 @@ def test_an_avatar_of_another_version_says_train_again(
 ) -> None:
     changes: dict[str, Callable[[dict[str, Any]], object]] = {
         "version 2, expected 'mien.avatar' version 1": lambda content: content.update(version=2),
-        "lacks ['config'] (made by another version of mien?)": lambda content: content.pop("config"),
         "lacks ['photometric']": lambda content: content["config"].pop("photometric"),
         "unknown entries ['future']": lambda content: content.update(tensors_sha256="0", future=1),
     }
@@ -170,9 +144,6 @@ def test_an_avatar_of_another_version_says_train_again(
         told = capsys.readouterr().err
         assert words in told
         assert "train it again" in told
-    path.write_bytes(whole)
-    assert main(["render", str(tmp_path / "W"), "--out", str(tmp_path / "größer.png"), "--size", "16"]) == 0
-    assert (tmp_path / "größer.png").is_file()
 
 
 @pytest.mark.parametrize("value", ["-3", "0", "nan", "inf"])

@@ -16,18 +16,13 @@ import torch
 from mien.avatar import METHODS, GaussianAvatars, Progress, Rate
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.camera import Camera
-from mien.cli import main
-from mien.commands.stages import training
 from mien.training import PRESETS, TrainSettings
 from mien.training.adam import Adam
-from mien.training.density_control import density_strategy
 from mien.training.density_control.gradient import round_steps
 from mien.training.face_track import FaceTrack
 from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, camera_extent
-from mono_avatars import new_avatar
-from plain_settings import plain_gaussian_avatars, plain_mono_gaussian_avatar
-from test_density import random, rendering
+from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_face, toy_face_model, toy_sequence
 
 HERE = Path(__file__).parent
@@ -140,7 +135,7 @@ def check_section(section: str) -> None:
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize("section", ["GaussianAvatars", "HeadGaS", "MonoGaussianAvatar"])
+@pytest.mark.parametrize("section", ["GaussianAvatars", "HeadGaS"])
 def test_docs_have_all_values(section: str) -> None:
     check_section(section)
 
@@ -182,23 +177,6 @@ def test_the_run_of_every_method_has_the_settings_of_the_first_table() -> None:
         assert settings == replace(default, steps=settings.steps, **PRESETS["paper"].changes)
 
 
-def test_commands_of_the_page_give_what_they_are_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("capture/capture.json", "tracking/tracking.json"):
-        (tmp_path / "sequences" / "clip" / name).parent.mkdir(parents=True)
-        (tmp_path / "sequences" / "clip" / name).touch()
-    asked: list[tuple[Any, Any]] = []
-    monkeypatch.setattr(training, "run_training_stage", lambda *given, **_: asked.append((given[3], given[4])))
-    for line in re.findall(r"^    mien train \S+ ([^#\n]*)", PAGE, flags=re.MULTILINE):
-        assert main(["train", str(tmp_path), *line.replace("--split gaussian-avatars", "").split()]) == 0, line
-    (whole, whole_run), (_, short_run), (lower, _), (without, _), (small, small_run) = asked
-    assert (whole, whole_run) == (PAPER, PRESETS["paper"].settings_of("gaussian_avatars"))
-    assert short_run.steps == 3_000
-    assert lower.face_tuning == replace(PAPER.face_tuning, expression=Rate(1e-3)), "the paper's own rate"
-    assert without.photometric.perceptual.weight == 0
-    assert small == PRESETS["paper-cpu"].config("mono_gaussian_avatar")
-    assert small_run == PRESETS["paper-cpu"].settings_of("mono_gaussian_avatar")
-
-
 # -- schedules and rates ----------------------------------------------------------------------------------------------
 
 
@@ -209,30 +187,6 @@ def test_schedule() -> None:
     assert resets(PAPER, 3_000) == [50, *range(300, 3_000, 300)]
     headgas: Any = PRESETS["paper"].config("headgas")
     assert rounds(headgas, PRESETS["paper"].settings_of("headgas").steps) == list(range(600, 15_000, 100))
-
-
-@cache
-def moved_per_visit(frames: int, rate: float) -> float:
-    """How far a dense Adam moves a value between two visits of its frame, whose gradient is always 1 then."""
-    first = second = moved = 0.0
-    visits = max(4, 8_000 // frames)
-    for step in range(visits * frames):
-        gradient = 1.0 if step % frames == 0 else 0.0
-        first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
-        if step >= (visits - 1) * frames:
-            moved += rate * (first / (1 - 0.9 ** (step + 1))) / math.sqrt(second / (1 - 0.999 ** (step + 1)))
-    return moved
-
-
-def test_face_rates_do_per_visit_what_the_papers_dense_optimiser_does() -> None:
-    for frames in (30, 60, 100):
-        assert moved_per_visit(frames, 1) == pytest.approx(math.sqrt(frames), rel=0.05)
-    assert all(moved_per_visit(frames, 1) < 32 for frames in (1_000, 2_000, 8_000))
-    factor = round(moved_per_visit(2_000, 1))
-    papers = {"head_rotation": 1e-5, "joints": 1e-5, "head_translation": 1e-6, "expression": 1e-3}
-    for name, rate in papers.items():
-        ours = getattr(PAPER.face_tuning, name)
-        assert (ours.start, ours.end, ours.begin) == (pytest.approx(factor * rate), None, 0), name
 
 
 # -- MonoGaussianAvatar ------------------------------------------------------------------------------------------------
@@ -258,11 +212,6 @@ def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_po
     assert replace(config, max_points=100_000) == paper.config(method)
     assert replace(settings, steps=300_000) == paper.settings_of(method)
     assert [name for name in METHODS if "paper-cpu" in METHODS[name].presets] == [method]
-    own = PAGE.split("\n### On a processor\n")[1].split("\n## ")[0]
-    assert dict(re.findall(r"^\| `([a-z_]+)` \| (.*) \|$", own, flags=re.MULTILINE)) == {
-        "steps": f"300,000: 2,500 frames an epoch | {settings.steps:,}: {settings.steps // 120} frames an epoch",
-        "max_points": f"100,000 | {config.max_points:,}",
-    }
 
 
 # -- the extent of the cameras ----------------------------------------------------------------------------------------
@@ -317,25 +266,3 @@ def test_each_frame_has_moments_and_a_step_count_of_its_own() -> None:
     assert count.tolist() == [0, 0, 2, 0, 1, 0]
     moved = start.expression - torch.stack([track.face(index).expression[0].detach() for index in range(6)])
     torch.testing.assert_close(moved[:, 0], 0.01 * count)
-
-
-def test_moments_of_points_and_networks_outlive_a_round() -> None:
-    """In the published code, each round makes a new optimiser, without moments."""
-    mono = new_avatar(plain_mono_gaussian_avatar(points=40, max_points=60, own_rate=Rate(0.0)))
-    adam, network, first = Adam(), mono.attributes.outputs[0], Progress(0, 100)
-
-    def step(gradient: float, number: int) -> None:
-        for parameter in mono.parameters():
-            parameter.grad = torch.full_like(parameter, gradient)
-        adam.step(mono.parameter_groups(), Progress(number, 100))
-
-    step(1.0, 0)
-    strategy, posed = density_strategy(mono.density(), mono.store), mono.pose(toy_face(5)[0], first)
-    strategy.observe(posed, rendering([0.0] * len(mono.store)))
-    assert strategy.adapt(mono.store, posed, first, random)
-    moments: Any = mono.store.moments["means"]
-    assert (moments.step, len(moments.first)) == (1, len(mono.store))
-    assert (moments.first != 0).any()
-    before = [parameter.detach().clone() for parameter in network.parameters()]
-    step(0.0, 1)  # momentum goes on without a gradient
-    assert all((new != old).all() for new, old in zip(network.parameters(), before, strict=True))

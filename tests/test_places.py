@@ -116,14 +116,6 @@ def test_the_peak_of_memory_grows_with_what_is_taken():
     assert system.peak_memory_mb() > before + 20
 
 
-def test_bytes_are_written_and_read_at_an_offset(tmp_path):
-    with (tmp_path / "file").open("w+b", buffering=0) as file:
-        assert system.write_at(file.fileno(), b"abcdef", 0) == 6
-        assert system.write_at(file.fileno(), memoryview(b"XY"), 2) == 2
-        assert system.read_at(file.fileno(), 3, 1) == b"bXY"
-        assert system.read_at(file.fileno(), 9, 6) == b""
-
-
 def test_links_and_pipes_are_kept_out_with_and_without_a_flag_of_the_system(tmp_path, monkeypatch):
     assert system.NO_WAIT
     assert system.NO_LINK

@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from instruction_sets import ISAS, by_threads
+from instruction_sets import ISAS
 from known import known
 from mien import _native
 from mien.camera import camera_from_fov
@@ -25,13 +25,11 @@ from needs import use_instructions
 from rasterize_scenes import (
     GSPLAT,
     Scene,
-    WeightedSum,
     assert_matches_reference,
     gradients,
     leaves,
     random_scene,
     rasterize_anywhere,
-    relative_error,
     render,
 )
 
@@ -83,25 +81,6 @@ def test_any_size_number_and_shape_matches_the_reference(backend: Backend, monke
         assert_matches_reference(scene, monkeypatch, backend)
 
 
-@pytest.mark.parametrize("loss", ["image", "alpha"])
-def test_gradient_of_one_output_only(loss: str) -> None:
-    scene = random_scene(8)
-    _, expected = gradients(scene.to(torch.float64), "reference", lambda r: getattr(r, loss).mean())
-    _, found = gradients(scene, "native", lambda r: getattr(r, loss).mean())
-    for name, value in expected.items():
-        assert relative_error(found[name], value) < 1e-3, name  # a pixel at a cutoff may be among them
-
-
-@pytest.mark.exact
-def test_threads_do_not_change_a_bit() -> None:
-    scene, loss = random_scene(9, 5000, 9, 200, 170), WeightedSum(torch.ones(170, 200), seed=1)
-    first, *others = by_threads(lambda: gradients(scene, "native", loss), (1, 2, 3, 7))
-    for found, found_gradients in others:
-        assert torch.equal(found.image, first[0].image)
-        assert torch.equal(found.alpha, first[0].alpha)
-        assert all(torch.equal(found_gradients[name], value) for name, value in first[1].items())
-
-
 def test_several_forwards_before_their_backwards() -> None:
     scenes = [random_scene(seed, count=100 + 50 * seed) for seed in range(6)]
     expected = [gradients(scene, "native", lambda r: (r.image**2).sum())[1]["means"] for scene in scenes]
@@ -127,7 +106,7 @@ def test_reference_gradients_match_finite_differences() -> None:
 
 
 def test_the_environment_chooses_the_level() -> None:
-    """`MIEN_ISA` chooses the instruction set. If it does not exist, the message lists those that do."""
+    """`MIEN_ISA` chooses the instruction set."""
 
     def ask(isa: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-c", "from mien import _native; print(_native.rasterize_isa())"]
@@ -135,9 +114,6 @@ def test_the_environment_chooses_the_level() -> None:
 
     for name in ISAS:
         assert not _native.set_rasterize_isa(name) or ask(name).stdout.strip() == name
-    wrong = ask("mmx")
-    assert "MIEN_ISA=mmx: this machine has " in wrong.stderr
-    assert wrong.returncode == 1
 
 
 @pytest.mark.parametrize("backend", ["reference", "native", GSPLAT])

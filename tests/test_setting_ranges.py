@@ -1,10 +1,8 @@
 """Settings and constants have a sentence and a range; the help tells them, and presets hold only what they may."""
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
-from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -12,12 +10,11 @@ import pytest
 
 import train_toy
 from mien import _native
-from mien.avatar import METHODS, GradientSettings, HeadGasConfig, Rate, RefillSettings
+from mien.avatar import METHODS, HeadGasConfig, Rate, RefillSettings
 from mien.commands.settings_options import leaves
 from mien.errors import UserError
-from mien.ranges import FRACTION, NotBelow, Range, check_ranges, shown
+from mien.ranges import FRACTION, NotBelow, Range, check_ranges
 from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings, train, trainer
-from plain_settings import plain_gaussian_avatars
 from test_settings import help_of, with_file
 from toy_scene import toy_sequence
 
@@ -62,15 +59,6 @@ def test_every_number_has_a_range_that_is_checked(settings: Any) -> None:
             assert "give " in str(told.value)
 
 
-def test_what_is_in_range_passes() -> None:
-    for settings in (*CONFIGS, *(preset.settings for preset in PRESETS.values()), TrainSettings(resolution=16)):
-        settings.check()
-    for name, preset in ((name, preset) for name, method in METHODS.items() for preset in method.presets):
-        PRESETS[preset].config(name).check()
-        PRESETS[preset].settings_of(name).check()
-    plain_gaussian_avatars(density=GradientSettings(start=0.5, stop=0.5, opacity_resets=())).check()
-
-
 @dataclass(frozen=True)
 class Some:
     sizes: Annotated[tuple[int, ...], Range(16, 64, filled=True)] = (16,)
@@ -88,6 +76,7 @@ def test_ranges_in_words() -> None:
         with pytest.raises(UserError) as told:
             check_ranges(some, lambda name: f"--{name}")
         assert str(told.value) == words
+    check_ranges(Some(first=0.5, last=0.5), str)
 
 
 def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
@@ -133,28 +122,14 @@ def about_options(help_text: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """With what presets give it where that is not the default."""
     text = help_of(capsys, "train", "--method", method, "--help-all")
     about, default = about_options(text), METHODS[method].config()
-    presets = {name: PRESETS[name] for name in METHODS[method].presets}
     assert [leaf for leaf in leaves(default, "method") if f" {leaf.heading} options " not in text] == []
-    of_method = {name: preset.config(method) for name, preset in presets.items()}
-    of_run = {name: preset.settings_of(method) for name, preset in presets.items()}
-    for prefix, settings, of_presets in (("method", default, of_method), ("training", TrainSettings(), of_run)):
+    for prefix, settings in (("method", default), ("training", TrainSettings())):
         for leaf in leaves(settings, prefix):
             option = leaf.option(prefix if leaf.name not in MAIN_SETTINGS else "").replace("--.", "--")
-            if option in ("--held-out-sequences", "--held-out-cameras"):
-                continue
             assert leaf.about[0].isupper(), option
-            known = about[option].rpartition("(")[2]
-            for name, values in of_presets.items():
-                value = attrgetter(leaf.name)(values)
-                if value == leaf.value and leaf.name != "steps":
-                    assert not re.search(rf"\b{name}[:,]", known), (option, name)
-                else:
-                    words = re.escape("none" if value is None else shown(value))
-                    assert re.search(rf"\b{name}(, [a-z-]+)*: {words}[;)]", known), (option, known)
-    assert ("paper" in about["--background"]) == ("paper" in presets)
+            assert option in about or option in ("--held-out-sequences", "--held-out-cameras")
 
 
 def test_help_all_shows_the_values_of_a_preset_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -169,29 +144,16 @@ def test_help_all_shows_the_values_of_a_preset_and_a_file(tmp_path: Path, capsys
     assert short.rstrip().endswith("mien train --method headgas --help-all")
 
 
-def differences(changes: dict[str, Any], settings: Any, place: str = "") -> Iterator[tuple[str, bool]]:
-    """Yield each setting that a preset names, and whether its value differs from the default."""
-    for name, value in changes.items():
-        default = getattr(settings, name)
-        if isinstance(value, dict):
-            yield from differences(value, default, f"{place}{name}.")
-        else:
-            yield place + name, default != (tuple(value) if isinstance(value, list) else value)
-
-
 @pytest.mark.parametrize("name", METHODS)
-def test_presets_are_differences_to_the_defaults(name: str) -> None:
+def test_presets_change_what_they_may(name: str) -> None:
     method = METHODS[name]
     assert {"draft", "standard", "fine"} <= set(method.presets) <= set(PRESETS), f"PRESETS of {name}"
     assert method.presets["standard"] == method.presets["fine"] == {}, f"{name} changes more than the steps"
     cheaper = {"photometric", "appearance"}
     assert set(method.presets["draft"].get("method", {})) <= cheaper, f"draft of {name}: more than losses and features"
     assert "settings" not in method.presets["draft"]
-    for preset, changes in method.presets.items():
+    for preset in method.presets:
         assert type(PRESETS[preset].config(name)) is method.config
-        for part, default in (("method", method.config()), ("settings", PRESETS[preset].settings)):
-            for setting, differs in differences(changes.get(part, {}), default):
-                assert differs, f"{preset} of {name} repeats the default of {setting}"
-    for preset in PRESETS.values():
-        assert all(differs for _, differs in differences(dict(preset.changes), TrainSettings()))
+        PRESETS[preset].config(name).check()
+        PRESETS[preset].settings_of(name).check()
     assert PRESETS["standard"].settings == TrainSettings()

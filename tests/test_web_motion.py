@@ -119,22 +119,17 @@ CSV = "Timecode,BlendshapeCount,JawOpen\n"
 BROKEN = [
     ("a.csv", "hello", "is no csv of Live Link Face"),
     ("a.csv", CSV + "0:0:0:1,61,wide\n", "has wide for jawopen in line 2"),
-    ("a.csv", CSV + "noon,61,0\n", 'has the timecode "noon" in line 2'),
     ("a.csv", CSV + "0:0:0:5,61,0\n0:0:0:4,61,0\n", "has times that do not increase"),
     ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:2:0:5,0\n", "has a gap of more than 60 s"),
-    ("a.csv", "frame,jawOpen\n,0.1\n", 'has the time "" in line 2'),
     ("a.csv", "time,jawOpen,HeadYaw\n0,0.1,2.9\n",
      "has 2.9 for headyaw in line 2; angles are in radians, so divide degrees by 57.3"),
     ("a.json", "[{", "is no json"),
-    ("a.json", "[]", "has no frame with blend shapes"),
-    ("a.json", frames(blendshapes={"jawOpen": "wide"}), "has a value that is no number in frame 0"),
     ("a.json", frames(3, timestamp_ms=lambda i: i / 30),
      'has 30000 frames in a second; give milliseconds, or call seconds "time"'),
     ("a.json", frames(3, time=lambda i: 33 * i),
      'has frames of 33 s; give seconds, or call milliseconds "timestamp_ms"'),
     ("a.json", json.dumps([{"face_blendshapes": [[]], "facial_transformation_matrixes": [[[1] * 4] * 4]}]),
      "has a matrix whose last row is not 0 0 0 1 in frame 0"),
-    ("a.json", '{"names": ["jawOpen"], "frames": [{"weights": []}]}', "has other numbers of names and weights"),
     ("a.json", frames(blendshapes={"smile": 1}), "has none of this avatar's expressions"),
 ]  # fmt: skip
 

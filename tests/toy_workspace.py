@@ -6,21 +6,27 @@ from pathlib import Path
 import numpy as np
 
 import train_toy
-from mien.capture import read_capture_hash, write_capture
+from mien.capture import Capture, read_capture_hash, write_capture
 from mien.evaluation import EvaluationSettings, evaluate
-from mien.tracking import Scoring, write_scoring, write_tracking
+from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
 from mien.training import read_sequence, train
 from toy_scene import toy_sequence
+
+
+def write_sequence(folder: Path, capture: Capture, tracking: Tracking, masks: np.ndarray | None = None) -> None:
+    """Write a sequence's folders. Without `masks`, the capture's mattes are the scoring masks."""
+    write_capture(folder / "capture", capture)
+    write_tracking(folder / "tracking", tracking)
+    crops = np.tile(np.array([4, 4, 20, 20], np.int64), (capture.timesteps, 1, 1))
+    scoring = Scoring(capture.mattes if masks is None else masks, crops)
+    write_scoring(folder / "scoring", scoring, read_capture_hash(folder / "capture"))
 
 
 def write_toy_workspace(root: Path, timesteps: int = 5) -> None:
     """Write `root/sequences/clip` and `root/runs/toy` as `mien create` leaves them. The last fifth is held out."""
     face_model, sequence = toy_sequence(timesteps, 32)
     folder = root / "sequences" / "clip"
-    write_capture(folder / "capture", sequence.capture)
-    write_tracking(folder / "tracking", sequence.tracking)
-    crops = np.tile(np.array([4, 4, 20, 20], np.int64), (timesteps, 1, 1))
-    write_scoring(folder / "scoring", Scoring(sequence.scoring, crops), read_capture_hash(folder / "capture"))
+    write_sequence(folder, sequence.capture, sequence.tracking, sequence.scoring)
     settings = replace(train_toy.SETTINGS, split="tail")
     train([read_sequence(folder)], face_model, train_toy.CONFIG, settings, root / "runs" / "toy")
 
