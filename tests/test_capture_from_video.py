@@ -169,7 +169,6 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
         (face_clip, "out", CaptureSettings(start=60.0), "no frame after 60 s"),
         (face_clip, "out", CaptureSettings(start=0.08, end=0.04), "--capture.end 0.04: give a time after"),
         (face_clip, "out", CaptureSettings(stride=0), "--capture.stride 0: give 1 for every frame"),
-        (face_clip, "out", CaptureSettings(size=4), "--capture.size 4: too small"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=message) as error:
             capture_video(tmp_path / source, tmp_path / out, settings)

@@ -168,9 +168,8 @@ def test_a_confidence_that_does_not_fit_is_refused(method: str, tmp_path: Path) 
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize("unseen", ["trained", "filled"])
-def test_a_mien_file_and_the_viewer_have_the_confidence_of_the_run(unseen: str, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, steps=2, unseen=unseen))
+def test_a_mien_file_and_the_viewer_have_the_confidence_of_the_run(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, steps=2, unseen="filled"))
     write_toy_workspace(tmp_path / "me")
     run, path = tmp_path / "me" / "runs" / "toy", tmp_path / "me.mien"
     covered = read_coverage(run, load_avatar(run).face_model)
@@ -192,10 +191,6 @@ CAMERA = toy_camera(32)
 
 
 workspace = pytest.fixture(toy_workspace)
-
-
-def _turntable(span: float = 90.0) -> list[Tile]:
-    return turntable_tiles(make_small_face_model().neutral(), CAMERA, torch.zeros(3), span)
 
 
 def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
@@ -228,7 +223,8 @@ def test_strengths_relative_to_what_was_filmed() -> None:
 
 
 def test_a_turntable_ends_at_half_of_its_angle_on_either_side() -> None:
-    tiles, around = _turntable(120.0), _turntable(360.0)
+    face, center = make_small_face_model().neutral(), torch.zeros(3)
+    tiles, around = (turntable_tiles(face, CAMERA, center, span) for span in (120.0, 360.0))
     assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "front", "+60 degrees"]
     assert len(tiles) == TURNTABLE_TILES
     torch.testing.assert_close(tiles[-1].camera.viewmat, orbit(CAMERA, torch.zeros(3), torch.pi / 3).viewmat)

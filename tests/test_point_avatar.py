@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from mien.avatar import PointAvatar, PointAvatarConfig, Progress
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.point_avatar.avatar import was_drawn
-from mien.avatar.point_avatar.networks import SurfaceNet, slopes_of_encoding
+from mien.avatar.point_avatar.networks import SurfaceNet
 from mien.errors import UserError
 from mien.face import FaceParams, head_poses
 from mien.gaussians import Gaussians
@@ -69,11 +68,8 @@ def test_slopes_are_the_gradients_of_the_distance() -> None:
     network, points = SurfaceNet(16, 3, 2).double(), torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
-    found, encoding = network(points), positional_encoding(points, 2)
+    found = network(points)
     torch.testing.assert_close(found.slope, torch.autograd.grad(found.distance.sum(), points)[0])
-    for column, slopes in zip(encoding.unbind(1), slopes_of_encoding(points, 2).unbind(1), strict=True):
-        (expected,) = torch.autograd.grad(column.sum(), points, retain_graph=True)
-        torch.testing.assert_close(slopes.detach(), expected)
 
 
 def test_a_color_is_albedo_times_light_on_the_normal() -> None:

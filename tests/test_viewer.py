@@ -15,7 +15,7 @@ from mien.export.pixels import to_rgb
 from mien.face import load_face_model
 from mien.runtime.posing import rig_points
 from mien.viewer import Clip, Mesh, Session, View
-from mien.viewer.drawing import beside, words_about_view
+from mien.viewer.drawing import words_about_view
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
 from mien.viewer.session import center_of
 from shared_things import MadeOnce, toy_workspace
@@ -183,9 +183,6 @@ def test_the_filmed_frame_is_beside_the_avatar(session: Session) -> None:
     assert (both[32, 1] == 255).all()
     assert (both[:, 48:] != 255).any()
     assert (session.picture(view, timestep=0)[32, 24] == 0).all()
-    frame = beside(np.zeros((10, 40, 3), np.uint8), np.full((30, 20, 3), 7, np.uint8), "grey")
-    assert frame.shape == (30, 40, 3)
-    assert [np.unique(frame[row, :20]).tolist() for row in (15, 2)] == [[0], [128]]
     avatar, clip = session.avatar, clip_of(session.avatar)
     # Both heads have one size.
     rest = to_rgb(runtime.render(runtime.pose(avatar.portable.baked, clip.motion.face(0)), avatar.camera)[0])
@@ -241,7 +238,6 @@ def test_mistakes_are_told_in_one_line(
     cut.write_bytes(file.read_bytes()[:5000])
     for words, *arguments in (
         ("no such file", tmp_path / "gone.mien"),
-        ("no such folder", tmp_path / "gone"),
         ("is no .mien file", __file__),
         ("cut.mien: is damaged", cut),
         ("leave --run out", file, "--run", "toy"),

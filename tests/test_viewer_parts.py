@@ -153,13 +153,6 @@ def test_two_clients_take_turns_until_one_vanishes() -> None:
     assert stage.shown == []
 
 
-def test_the_loop_wakes_for_what_plays() -> None:
-    times = iter((None, 100.7))
-    stage = Stage(advance=lambda now: next(times))
-    assert stage.loop.step() is None
-    assert stage.loop.step() == pytest.approx(0.7)
-
-
 def test_a_picture_that_fails_concerns_its_client_alone() -> None:
     failures: list[Exception] = []
 
