@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from dataset_checks import decoded
-from dataset_scene import SIDE, NoDetector, Scene, drawn_person, head_view, projected
-from dataset_writers import BENCHMARK_SCALE, UNEQUAL, benchmark_vertices, write_benchmark
+from dataset_scene import NoDetector, Scene, drawn_person
+from dataset_writers import BENCHMARK_SCALE, write_benchmark
 from mien.avatar import DEFAULT_METHOD, FaceTuning
 from mien.capture.video import probe_video
 from mien.cli import main
 from mien.datasets import overlay
-from mien.datasets.submission import monocular_tasks
 from mien.face import add_face_model, load_face_model
 from mien.training import read_sequence, train
 from plain_settings import plain_config, plain_run
@@ -65,19 +64,6 @@ def inside(pictures: np.ndarray, mattes: np.ndarray, shift: int = 0) -> list[flo
     dark, solid = pictures.min(-1) < 205, np.roll(mattes[..., 0] > 127, shift, axis=2)
     assert dark.sum((1, 2)).min() > 300
     return [float((a & b).sum() / a.sum()) for a, b in zip(dark, solid, strict=True)]
-
-
-def test_faces_and_cameras_are_those_of_the_benchmark(scene: Scene, person: Path) -> None:
-    """Vertices that the benchmark's forward pass gives are seen at the same pixels by all four cameras."""
-    (task,) = monocular_tasks(person, scene.model, (SIDE, SIDE))
-    assert (task.sequence, task.fps, tuple(task.cameras)) == ("FREE", 24.3, TESTED)
-    truth = np.load(person / "truth.npz")
-    for index, serial in enumerate(TESTED):
-        for timestep in range(len(scene)):
-            vertices = benchmark_vertices(scene, timestep, truth["angles"][timestep], truth["shifts"][timestep])
-            wanted = projected(vertices, UNEQUAL, *head_view(2 + index, 1.0))
-            found = task.cameras[serial].project(scene.model(task.face[timestep])[0])[0].numpy()
-            assert np.abs(found - wanted).max() < 0.02, serial
 
 
 def export(workspace: Path, benchmark: Path, out: Path) -> int:

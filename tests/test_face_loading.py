@@ -126,7 +126,7 @@ def test_without_a_home_folder_nothing_is_promised(homeless, monkeypatch, tmp_pa
     monkeypatch.setattr(driving, "run_tracking_stage", lambda *_, **__: {"clip": None})
     (tmp_path / "clip.mp4").write_bytes(b"a video")
     assert not cache.cache_is_kept()
-    driving.tracked_video(tmp_path / "clip.mp4", "small")
+    driving.tracked_film(tmp_path / "clip.mp4", "small")
     said = capsys.readouterr().err
     assert "next time" not in said
     assert "for this command only; set MIEN_CACHE to keep it" in said
@@ -135,5 +135,5 @@ def test_without_a_home_folder_nothing_is_promised(homeless, monkeypatch, tmp_pa
     assert "there is no folder to keep it in" in capsys.readouterr().err
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     assert cache.cache_is_kept()
-    driving.tracked_video(tmp_path / "clip.mp4", "small")
+    driving.tracked_film(tmp_path / "clip.mp4", "small")
     assert "kept for the next time" in capsys.readouterr().err

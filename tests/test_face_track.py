@@ -51,6 +51,7 @@ def test_face_track_moves_only_the_timestep_that_was_used() -> None:
         (face.expression.sum() + face.head_translation.sum()).backward()
         adam.step(track.parameter_groups(2), Progress(step, 10))
     tuned = track.params()
+    assert track.state()["expression.step"].tolist() == [0, 0, 4, 0, 0, 0], "each timestep has its own count"
     # Adam moves by its rate in each step while the gradient keeps its sign.
     torch.testing.assert_close(tuned.expression[2], start.expression[2] - 0.04)
     for other in (0, 1, 3, 4, 5):
@@ -124,10 +125,6 @@ def test_a_field_that_is_not_tuned_keeps_no_correction_from_the_others(still: st
     tuned = track.params()
     torch.testing.assert_close(getattr(tuned, moving)[2], torch.tensor([0.0, 0.0, -0.01]))
     assert torch.equal(getattr(tuned, still), getattr(face, still))
-    steady = FaceTrack(face, replace(tuning, keep_mean_pose=True), (2, 1))
-    push(steady, 0, 1.0, (2,), moving)
-    steady.steady_pose()
-    torch.testing.assert_close(getattr(steady.params(), moving), getattr(face, moving), atol=1e-8, rtol=0)
 
 
 @pytest.mark.parametrize("keeps", [True, False])

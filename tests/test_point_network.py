@@ -1,4 +1,4 @@
-"""The network of points: the ends of its activations, and gradients that nobody needs. test_training_native has its twin."""
+"""The network of points: ends of activations, and gradients that nobody needs. test_training_native has its twin."""
 
 import torch
 from torch import Tensor

@@ -124,32 +124,21 @@ def test_face_tuning_has_two_options_that_agree(line: str, choices: Any) -> None
     [
         ("--method.sh-degre 2", "gaussian_avatars has no such setting; did you mean --method.sh-degree? there are: "),
         ("--method.max-gaussians 2", "did you mean --method.density.max-gaussians?"),
-
         ("--method.density 2", "--method.density: is a group of settings of gaussian_avatars; there are: --method.de"),
         ("--method headgas --method.sh-frame head", "headgas has no such setting"),
-        ("--method.sh-degree 4", "--method.sh-degree 4: give a number from 0 to 3"),
         ("--method.sh-degree 1.5", "--method.sh-degree"),
         ("--method.sh-frame upside-down", "world"),
-
         ("--method.density.start 0.8", "--method.density.stop 0.7: give at least as much as --method.density.start"),
         ("--method.density.opacity-resets 0.4 0.1", "opacity-resets 0.4 0.1: give numbers from 0 to 1, ascending"),
-        ("--training.resolution 3", "--training.resolution 3: give 0, or a number from 16 to 8192"),
         ("--seed 99999999999999999999", "--seed 99999999999999999999: give a number from -9223372036854775808"),
     ],
 )  # fmt: skip
 def test_options_that_make_no_sense_are_refused_before_any_work(line: str, words: str, workspace, capsys) -> None:
-    assert words in complaint(capsys, ["train", str(workspace), *line.split()])
+    new = workspace / "new"
+    for command in (["train", str(workspace)], ["create", str(workspace), "--out", str(new)]):
+        assert words in complaint(capsys, [*command, *line.split()])
     assert not (workspace / "runs").exists()
-
-
-def test_create_refuses_them_as_train_does(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = with_file(workspace, '{"settings": {"steps": -1}}')[-2:]
-    for words, told in (
-        (["--method.sh-degre", "2"], "did you mean --method.sh-degree?"),
-        (file, "settings.steps -1: give a number from 1"),
-    ):
-        assert told in complaint(capsys, ["create", str(workspace), "--out", str(workspace / "new"), *words])
-        assert not (workspace / "new").exists()
+    assert not new.exists()
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
@@ -185,34 +174,22 @@ def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) ->
     ("content", "words"),
     [
         ("", "cannot be read as json"),
-
         ('{"method": {"sh_degree": NaN}}', "it holds the number NaN"),
         ('{"method": {"sh_degree": 1, "sh_degree": 2}}', "it holds 'sh_degree' twice"),
         ('{"format": "mien.capture"}', "has format 'mien.capture' version 1; give a run's config.json"),
-
         ('{"methods": {}}', "methods: a file of settings has no such setting; did you mean method?"),
         ('{"method": {"kind": "nerf"}}', "method.kind nerf: give the name of a method: gaussian_avatars"),
-
         ('{"method": 3}', "method is not an object of settings"),
         ('{"settings": {"stepps": 3}}', "settings.stepps: a run has no such setting; did you mean steps? there are"),
-
         ('{"settings": {"steps": "many"}}', "settings.steps 'many': give a whole number"),
-
         ('{"settings": {"split": "half"}}', "settings.split 'half': give one of blocks, tail, none"),
-
         ('{"settings": {"held_out_sequences": "a"}}', "settings.held_out_sequences 'a': give a list, each entry a"),
-
         ('{"method": {"density": {"round": 3}}}', "method.density.round: gaussian_avatars has no such setting; did"),
         ('{"method": {"density": 3}}', "method.density 3: give an object of settings"),
         ('{"method": {"density": {"kind": "RefillSettings"}}}', "method.density.kind 'RefillSettings'"),
-
-        ('{"method": {"density": {"stop": 0.05}}}', "--method.density.stop 0.05: give at least as much as"),
-        ('{"method": {"means_rate": {"end": null, "start": 1e999}}}', "method.means_rate.start inf: give a number"),
-
         (f'{{"settings": {{"steps": 1{"0" * 4000}}}}}', "settings.steps 1000"),
         ("[" * 100_000, "cannot be read as json"),
         ('{"' + "x" * 3000 + '": 1}', "xxx...: a file of settings has no such setting"),
-
         ('{"settings": {"held_out_sequences": ["nobody"]}}', "--hold-out nobody: no such sequence"),
         ('{"method": {"face_tuning": {"enabled": 1}}}', "method.face_tuning.enabled 1: give true or false"),
     ],

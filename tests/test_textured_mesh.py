@@ -2,22 +2,19 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from damage import edit_json
 from known import known
-from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, load_avatar, move_avatar, write_avatar
+from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, move_avatar
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.mirror import triangle_geometry
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
-from mien.storage import file_digest, read_tensors, write_tensors
 from mono_avatars import pictured
 from plain_settings import plain_textured_mesh
 from sh_colors import rgb_from_sh
@@ -233,15 +230,3 @@ def test_penalties_are_of_rough_offsets_and_albedo_and_of_bent_normals_and_of_li
         "light": PLAIN.light_weight * (avatar.light - white).square().mean(),
     }
     torch.testing.assert_close(losses, expected)
-
-
-def test_files_whose_surfels_are_elsewhere_are_refused(tmp_path: Path) -> None:
-    write_avatar(tmp_path, new_avatar())
-    load_avatar(tmp_path)
-    tensors = read_tensors(tmp_path / "avatar.safetensors")
-    tensors["avatar.store.face_index"] = tensors["avatar.store.face_index"].flip(0).contiguous()
-    write_tensors(tmp_path / "avatar.safetensors", tensors)
-    digest = file_digest(tmp_path / "avatar.safetensors")
-    edit_json(tmp_path / "avatar.json", lambda content: content.update(tensors_sha256=digest))
-    with pytest.raises(UserError, match=rf"^{tmp_path}: cannot be posed \(its surfels are not in the order"):
-        load_avatar(tmp_path)
