@@ -123,6 +123,7 @@ def test_without_a_home_folder_models_are_baked_for_this_process(why, bakes, hom
 def test_without_a_home_folder_nothing_is_promised(homeless, monkeypatch, tmp_path, capsys):
     """A driver's tracking is not kept for the next time then, and a face model that is added would be lost."""
     monkeypatch.setattr(driving, "run_capture_stage", lambda *_: None)
+    monkeypatch.setattr(driving, "is_picture", lambda _: False)
     monkeypatch.setattr(driving, "run_tracking_stage", lambda *_, **__: {"clip": None})
     (tmp_path / "clip.mp4").write_bytes(b"a video")
     assert not cache.cache_is_kept()
