@@ -68,12 +68,6 @@ def test_nerface(scene: Scene, tmp_path: Path) -> None:
     view = writers.rigid(*head_view(1))
     pose = np.linalg.inv(view) @ writers.rigid(writers.MIRROR, np.zeros(3))
     assert np.abs(viewmats_from_nerface(pose[None], 100.0)[0] - view).max() < 1e-12
-    (folder / "bg").mkdir(exist_ok=True)
-    (tmp_path / "secret.png").write_bytes((folder / "train/f_0000.png").read_bytes())
-    (folder / "bg/00000.png").unlink(missing_ok=True)
-    (folder / "bg/00000.png").symlink_to(tmp_path / "secret.png")
-    with pytest.raises(UserError, match=r"bg/00000\.png: leads out of the dataset"):
-        checks.read(folder, "nerface")
 
 
 def test_nerf_blendshape(scene: Scene, tmp_path: Path) -> None:

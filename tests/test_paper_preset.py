@@ -19,7 +19,6 @@ from mien.camera import Camera
 from mien.training import PRESETS, TrainSettings
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import round_steps
-from mien.training.face_track import FaceTrack
 from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, camera_extent
 from plain_settings import plain_gaussian_avatars
@@ -251,18 +250,3 @@ def test_extent_reaches_rates_in_its_unit_only() -> None:
             Adam().step(avatar.parameter_groups(), Progress(0, 10, extent=extent))
             moved.append([float(store[name].detach().abs().max()) for name in ("means", "log_scales")])
         assert moved[1] == [pytest.approx(factor * moved[0][0]), moved[0][1]]
-
-
-# -- rates, moments and networks ---------------------------------------------------------------------------------------
-
-
-def test_each_frame_has_moments_and_a_step_count_of_its_own() -> None:
-    start, adam = toy_face(6), Adam()
-    track = FaceTrack(start, replace(PAPER.face_tuning, expression=Rate(0.01)))
-    for step, frame in enumerate((2, 2, 4)):
-        track.face(frame).expression.sum().backward()
-        adam.step(track.parameter_groups(frame), Progress(step, 10))
-    count = track.state()["expression.step"]
-    assert count.tolist() == [0, 0, 2, 0, 1, 0]
-    moved = start.expression - torch.stack([track.face(index).expression[0].detach() for index in range(6)])
-    torch.testing.assert_close(moved[:, 0], 0.01 * count)

@@ -4,9 +4,6 @@ All draw the same picture as another program (gsplat).
 """
 
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,17 +100,6 @@ def test_reference_gradients_match_finite_differences() -> None:
         return torch.cat([rendering.image, rendering.alpha[..., None]], -1)
 
     assert torch.autograd.gradcheck(rgba, tuple(tensors.values()), eps=1e-6, atol=1e-6, rtol=1e-4)
-
-
-def test_the_environment_chooses_the_level() -> None:
-    """`MIEN_ISA` chooses the instruction set."""
-
-    def ask(isa: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-c", "from mien import _native; print(_native.rasterize_isa())"]
-        return subprocess.run(command, env={**os.environ, "MIEN_ISA": isa}, capture_output=True, text=True, check=False)
-
-    for name in ISAS:
-        assert not _native.set_rasterize_isa(name) or ask(name).stdout.strip() == name
 
 
 @pytest.mark.parametrize("backend", ["reference", "native", GSPLAT])

@@ -155,13 +155,9 @@ def test_priors_weigh_as_much_in_the_cost_as_in_the_equations(case):
         there, back = (term.cost(own.state + way * step, subject, own.cameras).sum() for way in (1, -1))
         found = float(there - back) / 4e-5
         assert found == pytest.approx(float(equations.gradient[2, column]), rel=1e-4, abs=1e-4 * pull)
-
-
-def test_the_prior_alone_is_quadratic_with_the_layout_s_precision(case):
-    term, own, subject = case
-    blind = term.at(torch.arange(5))
+    # Alone, it has the layout's precision.
+    blind, precision = term.at(torch.arange(5)), term.model.layout.precision
     blind = type(term)(blind.model, blind.views, torch.zeros_like(blind.weights), blind.sigma, blind.outlier)
-    precision = term.model.layout.precision
     wanted = ((own.state @ precision) * own.state).sum(-1)
     assert float(wanted.min()) > 0.1
     torch.testing.assert_close(blind.cost(own.state, subject, own.cameras), wanted)
