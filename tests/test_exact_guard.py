@@ -8,9 +8,8 @@ import torch
 from exact_guard import InexactError, exact_guard
 from mien import exact
 from mien.avatar import DEFAULT_METHOD
-from mien.files import file_digest, write_json
 from mien.training import trainer
-from mien.training.footage.frames import FrameOrder, background_at, training_frames
+from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from plain_settings import plain_config, plain_run
 from toy_scene import toy_sequence
@@ -49,14 +48,3 @@ def test_a_step_of_training_adds_up_by_itself():
     trainer.step(state, data, settings)
     with exact_guard():
         trainer.step(state, data, settings)
-
-
-def test_digests_and_splits_compute_with_integers(tmp_path):
-    _, sequence = toy_sequence(timesteps=12, size=32)
-    with exact_guard():
-        settings = plain_run(steps=100, split="blocks", background="random")
-        frames = training_frames([sequence], settings)
-        FrameOrder(frames, settings.seed)
-        background_at(settings, 7)
-        write_json(tmp_path / "a.json", "mien.test", 1, {"frames": len(frames)})
-        assert len(file_digest(tmp_path / "a.json")) == 64

@@ -1,9 +1,8 @@
-"""The network of points: ends of activations, and gradients that nobody needs. test_training_native has its twin."""
+"""The network of points has the right softplus everywhere. tests/test_training_native.py compares it with its twin."""
 
 import torch
 from torch import Tensor
 
-from known import known
 from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
 from toy_scene import random
 
@@ -59,15 +58,3 @@ def test_softplus_over_its_whole_range(isa: str) -> None:
     expected = torch.nn.functional.softplus(inputs.double(), beta=100)
     torch.testing.assert_close(outputs.double(), expected, atol=2e-8, rtol=1e-6)
     torch.testing.assert_close(slope.double(), (100 * inputs.double()).sigmoid(), atol=2e-5, rtol=0)
-
-
-def test_what_needs_no_gradient_gets_none() -> None:
-    sizes = NETWORKS[0]
-    inputs, *parameters = arguments(sizes)
-    expected = results(sizes, [inputs, *parameters], native=True)
-    with torch.no_grad():
-        assert torch.equal(point_network(inputs, layers_of(sizes, parameters)), expected[0])
-    parameters = [tensor.requires_grad_() for tensor in parameters]
-    point_network(inputs, layers_of(sizes, parameters)).backward(gradient_of(sizes))
-    assert inputs.grad is None
-    assert all(torch.equal(known(own.grad), truth) for own, truth in zip(parameters, expected[2:], strict=True))

@@ -45,25 +45,19 @@ found.append([torch.get_num_threads(), []])
 print(json.dumps(found), file=sys.__stdout__)
 """
 WRONG_VALUES = """
-capture gone.mp4 --out w; capture a.mp4 --out w --capture.size 3; capture a.mp4 --out a.csv;
-capture a.mp4 --out w --capture.mattes gone; create gone.mp4 --out w; create a.mp4 a.mp4 --out w;
-create a.mp4 --out w --steps -3; create a.mp4 --out w --method nerf; create a.mp4 --out w --method.sh-degree 9;
-create a.mp4 --out w --method.no-such-setting 1; create a.mp4 --out w --config gone.json;
-create a.mp4 --out w --run a/b; create a.mp4 --out a.csv; track gone; track .; train gone; train w --hold-out nobody;
-train w --sequences nobody; evaluate; evaluate gone; evaluate w --run nobody; evaluate w w;
+capture gone.mp4 --out w; capture a.mp4 --out w --capture.size 3; capture a.mp4 --out w --capture.mattes gone;
+create gone.mp4 --out w; create a.mp4 --out w --steps -3; create a.mp4 --out w --method nerf;
+create a.mp4 --out w --method.sh-degree 9; create a.mp4 --out w --config gone.json; create a.mp4 --out a.csv;
+track gone; track .; train gone; train w --hold-out nobody; evaluate; evaluate w --run nobody; evaluate w w;
 evaluate --images gone --truth gone; evaluate w --perceptual-frames -1; analyze gaussian-avatars gone;
-analyze gaussian-avatars w --run nobody; analyze gaussian-avatars w --parts hair; analyze gaussian-avatars w --steps 0;
-analyze nerf w; import gone --out n; import w --out n; import w --out n --dataset nobody; render gone --out a.png;
-render w --out a.gif; render w --out b.png --size 9999; render w --out b.png --background pinkish;
-render w --out b.mp4 --frames 0; render w --out b.mp4 --sequence nobody; drive gone --by a.csv --out b.mp4;
-drive w --by gone --out b.mp4; drive w --by a.csv --out b.gif; drive w --by a.csv --out b.mp4 --fps 0;
-drive w --by a.csv --port 99999; drive w --by camera:/dev/video99; drive w --by camera: --out b.mp4;
-drive w --by camera --port 99999; view gone; view gone.mien; view a.csv; view w --port 99999; view w --play nobody;
-export w --out a.obj; export w --out gone.ply --series nobody; face-models --name x; face-models --add gone.npz;
-bench scaling --plot a.txt; bench quality --steps -1; bench compare; bench compare gone;
-bench compare w --minutes 2 --steps 3; bench compare w --methods nerf; study make gone --out a.html;
-study make w --out a.html; study make w --out a.mp4; study make w --out a.html --side 100;
-study tally gone.json gone.json; demo --seconds 9999; demo --out a.csv
+analyze gaussian-avatars w --run nobody; analyze gaussian-avatars w --parts hair; import gone --out n;
+import w --out n --dataset nobody; render gone --out a.png; render w --out a.gif; render w --out b.png --size 9999;
+render w --out b.png --background pinkish; render w --out b.mp4 --sequence nobody; drive gone --by a.csv --out b.mp4;
+drive w --by gone --out b.mp4; drive w --by a.csv --out b.mp4 --fps 0; drive w --by camera:/dev/video99;
+drive w --by camera --port 99999; view gone.mien; view w --port 99999; view w --play nobody; export w --out a.obj;
+export w --out gone.ply --series nobody; face-models --name x; face-models --add gone.npz; bench scaling --plot a.txt;
+bench quality --steps -1; bench compare gone; bench compare w --methods nerf; study make gone --out a.html;
+study make w --out a.html --side 100; study tally gone.json gone.json; demo --seconds 9999; demo --out a.csv
 """
 """Command lines with a mistake in a value or a path, for a workspace `w` and files `a.*`."""
 
