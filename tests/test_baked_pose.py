@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from instruction_sets import by_threads
 from known import known
-from mien import _native, runtime
+from mien import runtime
 from mien.avatar import Avatar, HeadGas, load_avatar
 from mien.avatar.files import write_avatar
 from mien.avatar.headgas.settings import HeadGasConfig
-from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, DeformationNet
 from mien.avatar.schedules import Progress
 from mien.face import FaceParams
 from mien.runtime import posing
@@ -96,20 +94,6 @@ def test_outputs_alone_have_the_bits_of_those_with_gradients(isa: str, sizes: Si
     assert torch.equal(alone, point_network(inputs.requires_grad_(), layers_of(sizes, parameters)).detach())
 
 
-def test_zeros_of_joined_layers_cost_no_bit(isa: str) -> None:
-    """The networks' last layers have blocks of zeros, which the outputs alone leave out."""
-    torch.manual_seed(0)
-    points = torch.randn(500, 3)
-    deformation = DeformationNet(32, 5, 9, 4)
-    for last in (deformation.directions, deformation.skinning):
-        torch.nn.init.normal_(last.weight)
-    for network in (AttributeNet(64, 4, 3), AttributeChangeNet(32), lambda given: deformation.whole(given).expression):
-        with torch.no_grad():
-            alone = network(points)
-        assert alone.abs().max() > 0
-        assert torch.equal(alone, network(points).detach())
-
-
 def baked_avatar(points: int) -> BlendSkinned:
     return new_avatar(plain_mono_gaussian_avatar(points=points)).bake()
 
@@ -136,19 +120,3 @@ def test_other_avatars_keep_the_path_of_numpy() -> None:
         {"attributes": replace(baked.attributes, sh=np.zeros((20, 4, 3), np.float32))},
     ):
         assert not posing.has_native_activations(replace(baked, **change)), change
-
-
-def test_a_bone_that_is_no_joint_adds_its_share() -> None:
-    random = np.random.default_rng(0)
-    sizes = ((2500, 3), (2500,), (3, 4), (2500, 3))
-    shaped, weights, transform, posed = (random.normal(size=size).astype(np.float32) for size in sizes)
-    expected = posed + weights[:, None] * (shaped.astype(np.float64) @ transform[:, :3].T + transform[:, 3])
-
-    def added() -> np.ndarray:
-        found = posed.copy()
-        _native.add_bone(shaped, weights, transform, found)
-        return found
-
-    found = by_threads(added)
-    np.testing.assert_allclose(found[0], expected, atol=1e-5)
-    np.testing.assert_array_equal(found[0], found[1])

@@ -231,18 +231,16 @@ def test_the_driver_imports_neither_torch_nor_what_only_rows_need(table: Path, t
 
 
 def test_datasets_are_imported_trained_and_scored(tmp_path: Path):
-    """Ten people of IMavatar's layout."""
-    for number in range(10):
-        clip = tmp_path / f"subject{number}" / f"subject{number}" / "MVI_1810"
-        clip.mkdir(parents=True)
-        (clip / "flame_params.json").write_text('{"frames": [{"world_mat": []}]}')
+    """A person of IMavatar's layout."""
+    clip = tmp_path / "subject3" / "subject3" / "MVI_1810"
+    clip.mkdir(parents=True)
+    (clip / "flame_params.json").write_text('{"frames": [{"world_mat": []}]}')
     table = tmp_path / "people.csv"
     head = "dataset,face_model,method,split,protocol,steps,training.resolution,age\n"
-    table.write_text(head + "".join(f"subject{n},flame,headgas,dataset,imavatar,30,96,{n}\n" for n in range(10)))
-    rows = read_table(table)
-    assert [row.name for row in rows] == [f"subject{n}" for n in range(10)]
-    assert rows[3].labels == {"age": "3"}
-    assert rows[3].steps == (
+    table.write_text(head + "subject3,flame,headgas,dataset,imavatar,30,96,3\n")
+    (row,) = read_table(table)
+    assert (row.name, row.labels) == ("subject3", {"age": "3"})
+    assert row.steps == (
         ("import", str(tmp_path / "subject3"), "--out", "{workspace}", "--resume", "--face-model", "flame"),
         ("train", "{workspace}", "--method", "headgas", "--split", "dataset", "--steps", "30",
          "--training.resolution", "96"),

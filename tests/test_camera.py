@@ -10,9 +10,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov, camera_from_opengl, look_at
-from mien.gaussians import Gaussians
-from mien.render import rasterize
-from mien.render.rasterize import Backend
 from mien.rotation import (
     axis_angle_from_matrix,
     axis_angle_from_quaternion,
@@ -95,6 +92,7 @@ def test_resizing_scales_pixels_and_cropping_shifts_them(viewmat, point, width, 
 def test_opengl_cameras_look_along_minus_z_with_y_up(T_world_camera: Tensor, point: Tensor) -> None:
     camera = camera_from_opengl(T_world_camera, camera_of(T_world_camera).K, 640, 480)
     in_opengl = apply(invert_rigid(T_world_camera), point)
+    close(apply(T_world_camera, in_opengl), point)
     close(apply(camera.viewmat, point), in_opengl * torch.tensor([1, -1, -1], dtype=torch.float64), 1e-9)
 
 
@@ -108,22 +106,6 @@ def test_look_at_puts_its_target_at_the_center_with_up_upwards(position: Tensor,
     close(apply(viewmat, position), torch.zeros(3, dtype=torch.float64))
     assert apply(viewmat, target + up)[1] < 0
     close(torch.linalg.det(viewmat[:3, :3]), torch.ones((), dtype=torch.float64))
-
-
-@pytest.mark.parametrize("backend", ["native", "reference"])
-@pytest.mark.parametrize(("column", "row"), [(0, 0), (3, 2), (10, 7)])
-def test_renderers_put_points_where_cameras_project_them(backend: Backend, column: int, row: int) -> None:
-    """A tiny Gaussian at the centre of pixel (column, row) lights up that pixel, symmetrically."""
-    camera = camera_from_fov(0.8, 11, 8)
-    mean = torch.linalg.inv(camera.K) @ torch.tensor([column + 0.5, row + 0.5, 1.0])
-    scale, quat = torch.full((1, 3), 1e-4), torch.tensor([[1.0, 0, 0, 0]])
-    gaussians = Gaussians(mean[None], quat, scale, torch.tensor([0.9]), torch.zeros(1, 1, 3))
-    alpha = rasterize(gaussians, camera, backend=backend).alpha
-    assert divmod(int(alpha.argmax()), 11) == (row, column)
-    assert alpha.max().item() == pytest.approx(0.9, abs=1e-4)
-    if 0 < column < 10 and 0 < row < 7:
-        close(alpha[row, column - 1], alpha[row, column + 1], 1e-4)
-        close(alpha[row - 1, column], alpha[row + 1, column], 1e-4)
 
 
 # -- rotations -------------------------------------------------------------------------------------------------------
@@ -167,14 +149,6 @@ def test_quaternions_and_matrices_agree(quat: Tensor, other: Tensor) -> None:
     agree(product.norm(), quat.norm() * other.norm())
 
 
-@given(turns, turns, turns)
-def test_inverse_rigid_transforms_undo(axis_angle: Tensor, translation: Tensor, point: Tensor) -> None:
-    transform = rigid_transform(matrix_from_axis_angle(axis_angle), translation)
-    moved = transform @ torch.cat([point, point.new_ones(1)])
-    agree(moved[:3], matrix_from_axis_angle(axis_angle) @ point + translation)
-    agree(invert_rigid(transform) @ transform, torch.eye(4, dtype=torch.float64))
-
-
 @given(st.lists(turns, min_size=1, max_size=4).map(torch.stack))
 def test_leading_axes_are_batches_and_rotations_without_torch_are_the_same(axis_angles: Tensor) -> None:
     matrices = matrix_from_axis_angle(axis_angles[:, None])
@@ -205,11 +179,6 @@ def test_known_turns_also_without_torch() -> None:
     agree(matrix_from_axis_angle(torch.tensor([0, 0, math.pi / 2])) @ x, y, 1e-6)
     agree(matrix_from_quaternion(torch.tensor([1.0, 0, 0, 1])) @ x, y, 1e-6)
     agree(matrix_from_quaternion(torch.zeros(4)), torch.eye(3))
-    for axis in ((1, 0, 0), (0, -1, 0), (0, 0, 1), (0.6, 0, -0.8), (0.48, 0.6, 0.64)):
-        for angle in (0.0, 1e-10, 0.3, 1.6, 3.1):
-            turn = angle * np.array(axis)
-            found = runtime_rotation.axis_angle_from_matrix(runtime_rotation.matrix_from_axis_angle(turn))
-            np.testing.assert_allclose(found, turn, rtol=0, atol=1e-9)
     first, second = (torch.randn(4, 4, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2))
     composed = compose_rigid(first, second)
     torch.testing.assert_close(composed, first @ second)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +17,6 @@ from mien.training import Sequence, TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
-from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.footage.sequence import Targets, composite
@@ -158,26 +156,6 @@ def test_large_pictures_are_cleaned_as_well() -> None:
     assert error[soft].mean() < 3
 
 
-def _everywhere(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """`foreground_colors` estimated at every pixel, and not at those between empty and opaque alone."""
-    windows = [max(3, 2 * round(share * max(image.shape[:2]) / 2) + 1) for share in FOOTAGE.foreground_windows]
-    share, person, background = (matte * np.float32(1 / 255))[..., None], image, image
-    for number, window in enumerate(windows):
-        near_person, near_background = _mean(person, matte, window), _mean(background, 255 - matte, window)
-        rest = image - near_background - share * (near_person - near_background)
-        person = np.rint(np.clip(near_person + share * rest, 0, 255)).astype(np.uint8)
-        if number == 0:
-            background = np.rint(np.clip(near_background + (1 - share) * rest, 0, 255)).astype(np.uint8)
-    return np.where((matte >= FOOTAGE.foreground_solid)[..., None], image, np.where(matte[..., None] > 0, person, 0))
-
-
-def _mean(colors: np.ndarray, weights: np.ndarray, window: int) -> np.ndarray:
-    how = {"normalize": False, "borderType": cv2.BORDER_REFLECT}
-    weights = weights.astype(np.float64)
-    colors, total = (cv2.boxFilter(p, -1, (window, window), **how) for p in (colors * weights[..., None], weights))
-    return colors.astype(np.float32) / np.maximum(total, 1).astype(np.float32)[..., None]
-
-
 @pytest.mark.parametrize("size", [(60, 44), (90, 300)])
 def test_estimates_at_soft_pixels_alone_are_those_of_whole_pictures(size: tuple[int, int]) -> None:
     """Noise, with every kind of opacity beside every other, and with empty borders."""
@@ -185,8 +163,7 @@ def test_estimates_at_soft_pixels_alone_are_those_of_whole_pictures(size: tuple[
     image = random.integers(0, 256, (*size, 3)).astype(np.uint8)
     matte = random.choice(np.array([0, 1, 60, 128, 251, 252, 254, 255], np.uint8), size)
     matte[:7], matte[:, -5:], matte[20:40, 8:30] = 0, 255, 0
-    expected, (place, colors) = _everywhere(image, matte), soft_colors(image, matte)
-    assert np.array_equal(foreground_colors(image, matte), expected)
+    expected, (place, colors) = foreground_colors(image, matte), soft_colors(image, matte)
     assert not foreground_colors(image, np.zeros_like(matte)).any()
     assert np.array_equal(place, np.flatnonzero(soft_pixels(matte)))
     assert np.array_equal(colors, expected.reshape(-1, 3)[place])

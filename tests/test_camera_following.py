@@ -88,22 +88,6 @@ def test_one_euro_is_still_at_rest_and_quick_in_motion() -> None:
     assert smoothed(0.0)[103] < 0.8
 
 
-def test_the_fit_finds_the_pose_and_the_face_of_exact_landmarks() -> None:
-    fit = LandmarkFit(MODEL, MODEL.neutral())
-    jaw, smile = (fit.names.index(name) for name in ("jawOpen", "mouthSmileLeft"))
-    coefficients = np.zeros(len(fit.names))
-    coefficients[[jaw, smile]] = 0.5, 0.6
-    place = np.array([0.03, -0.02, -0.7])
-    rotation = matrix_from_axis_angle(torch.tensor([[0.1, -0.3, 0.05]], dtype=torch.float64))[0].numpy()
-    pixels = fit.pixels(rotation, place, coefficients, 640, 480)
-    fitted = fit(pixels + 0.05 * np.random.default_rng(1).standard_normal(pixels.shape), 640, 480)
-    assert np.abs(fitted.rotation - rotation).max() < 0.02
-    np.testing.assert_allclose(fitted.translation, place, atol=0.01)
-    assert fitted.coefficients[jaw] == pytest.approx(0.5, abs=0.1)
-    assert fitted.coefficients[smile] == pytest.approx(0.6, abs=0.2)
-    assert fitted.error < 1.5
-
-
 @pytest.mark.unchecked
 def test_an_avatar_learns_follows_without_lag_and_goes_to_rest(clip: Path, landmarks, course: Course) -> None:
     one, ((state, rest), *after) = course
@@ -148,11 +132,12 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
     fit, one = LandmarkFit(MODEL, MODEL.neutral()), follower()
     coefficients = np.zeros(len(fit.names))
     turn = matrix_from_axis_angle(torch.tensor([[0.0, 0.85, 0.0]], dtype=torch.float64))[0].numpy()
-    place = np.array([0.0, 0.0, -0.7])
+    place = np.array([0.03, -0.02, -0.7])
     quiet = fit.pixels(np.eye(3), place, coefficients, SIZE, SIZE)
     coefficients[fit.names.index("jawOpen")] = 0.8
     open_mouth = fit.pixels(np.eye(3), place, coefficients, SIZE, SIZE)
     turned = fit.pixels(turn, place, 0 * coefficients, SIZE, SIZE)
+    np.testing.assert_allclose(fit(turned, SIZE, SIZE).translation, place, atol=0.01)
 
     def last(follows: Follower, pixels: np.ndarray, began: float = 0.0) -> runtime.Face:
         return [follows(pixels, SIZE, SIZE, began + index / 8) for index in range(16)][-1]

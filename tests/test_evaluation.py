@@ -77,11 +77,9 @@ def test_an_avatar_that_white_shines_through_is_told_over_dark_blue() -> None:
     assert "over_dark" not in evaluate_frames(replace(experiment, edges="filmed"), QUICK).scores
 
 
-def test_baselines_are_the_mean_training_target_and_a_mesh_in_the_colors_it_saw(experiment: Experiment) -> None:
+def test_the_baseline_mesh_has_the_colors_it_saw_and_beats_the_mean_picture(experiment: Experiment) -> None:
     baselines, frame, model = make_baselines(experiment), experiment.held_out_frames[0], experiment.avatar.face_model
-    stack = torch.stack([target_image(experiment, each) for each in experiment.training_frames])
     mean = baselines.mean_frame_image(experiment, frame)
-    torch.testing.assert_close(mean, stack.mean(0), atol=1e-5, rtol=0)
     template = model.template
     paint = (template / template[model.faces].mean(1).abs().max() * 0.5 + 0.5).clamp(0, 1)
     front = (template[:, 2] > 0.05) & (template[:, 0].abs() < 0.04)

@@ -72,29 +72,6 @@ def test_the_rate_is_the_lowest_that_has_the_frame_numbers(tmp_path: Path) -> No
     assert motion.lost == 1
 
 
-REAL_LOOKS = (
-    # LookDown, In, Out, Up of the left eye, then of the right; yaw, pitch, roll of the left eye, then of the right.
-    ((0, 0, 0.9879, 0.6407), (0, 1.0528, 0, 0.6236), (-0.6158, -0.3355, 0.1987), (-0.5769, -0.3355, 0.1879)),
-    ((0, 0, 0.4733, 0.3900), (0, 0.5690, 0, 0.3827), (-0.3425, -0.1774, 0.0601), (-0.2848, -0.1774, 0.0503)),
-    ((0.2948, 0.0970, 0, 0), (0.2953, 0.0095, 0, 0), (-0.0057, 0.1804, -0.0010), (0.0583, 0.1804, 0.0106)),
-)
-"""Rounded rows of real takes that give the gaze both as coefficients and as angles."""
-
-
-def test_angles_have_the_signs_of_real_takes(tmp_path: Path) -> None:
-    columns = ("EyeLookDown", "EyeLookIn", "EyeLookOut", "EyeLookUp")
-    for left, right, left_angles, right_angles in REAL_LOOKS:
-        looks, angles = {}, {}
-        for side, coefficients, turns in (("Left", left, left_angles), ("Right", right, right_angles)):
-            looks |= {f"{name}{side}": value for name, value in zip(columns, coefficients, strict=True)}
-            angles |= {f"{side}Eye{name}": value for name, value in zip(("Yaw", "Pitch", "Roll"), turns, strict=True)}
-        by_looks, by_angles = (read_rows(tmp_path, row("0:0:0:0", **given)).eyes[0] for given in (looks, angles))
-        # The calibration decides where the eyes look straight ahead. On these takes it differs by up to 7 degrees.
-        assert np.abs(by_looks - by_angles).max() < math.radians(9)
-        # A gaze up and to the side has hardly any torsion, once its roll is taken the right way.
-        assert np.abs(by_angles[:, 2]).max() < 0.12
-
-
 def rows_of(*timecodes: str) -> list[list[str]]:
     """Rows with these timecodes, whose jaw opens by a tenth from one to the next."""
     return [row(timecode, JawOpen=index / 10) for index, timecode in enumerate(timecodes)]

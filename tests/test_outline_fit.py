@@ -14,7 +14,7 @@ from mien.training import Sequence, TrainSettings
 from mien.training.footage import Frame
 from mien.training.trainer import start
 from mien.training.whole_head import fitted_faces
-from mien.training.whole_head.outline_fit import fit_to_outlines, smooth_weights, spread_points
+from mien.training.whole_head.outline_fit import fit_to_outlines
 from plain_settings import plain_config, plain_run
 from test_hair import _TIMESTEPS, _sequence
 from toy_scene import toy_sequence
@@ -71,15 +71,6 @@ def test_hair_draws_nothing_and_offsets_that_tracking_found_are_kept(anny: FaceM
     sequence, own = _sequence(anny, 0.03), torch.full_like(anny.template, 0.001)
     tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, vertex_offsets=own))
     assert float((_fitted(anny, replace(sequence, tracking=tracking)) - own).norm(dim=1).max()) < _SLACK
-
-
-def test_smooth_weights_are_shares_of_near_points() -> None:
-    line = torch.linspace(0, 0.1, 101)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-    weights = smooth_weights(line, line[spread_points(line, 0.008)], reach=0.01)
-    torch.testing.assert_close(weights.sum(1), torch.ones(101))
-    shift = weights @ torch.linspace(0, 1, weights.shape[1])[torch.randperm(weights.shape[1])]
-    assert float((shift[1:] - shift[:-1]).abs().max()) < 0.2, "neighbours move alike"
-    assert weights.shape[1] < 30
 
 
 @pytest.mark.parametrize(("mesh", "unseen", "bound", "fits"), [

@@ -30,7 +30,6 @@ from photometric_case import (
     make_textured_model,
     smooth_noise,
 )
-from tracking_case import make_tracking_case
 
 LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
 FAST = replace(
@@ -75,14 +74,6 @@ def test_pixels_calm_what_landmarks_leave(case, by_landmarks, monkeypatch):
 
 
 @pytest.mark.unchecked
-def test_a_face_without_texture_stays_where_landmarks_put_it():
-    capture, model = make_tracking_case(timesteps=6).capture, make_textured_model()
-    found = [track(capture, model, settings) for settings in (LANDMARKS, FAST)]
-    marks = [model.landmark_positions(model(tracking.face), "mediapipe") for tracking in found]
-    assert (marks[0] - marks[1]).norm(dim=-1).median() < 0.0008
-
-
-@pytest.mark.unchecked
 def test_pictures_that_show_something_else_fall_back_to_landmarks_and_say_so(case, by_landmarks, capsys):
     images = np.array(case.capture.images)
     images[5] = np.random.default_rng(0).integers(0, 256, images[5].shape, np.uint8)
@@ -113,15 +104,6 @@ def test_sequences_of_one_subject_share_texture_and_identity(case):
         assert wobble(own, tracking) < 0.2
         assert tracking.pixel_residuals is not None
         assert tracking.pixel_residuals.median() < 0.06
-
-
-@pytest.mark.unchecked
-def test_a_model_without_texture_coordinates_is_tracked_by_landmarks_and_says_so(capsys):
-    case = make_tracking_case(timesteps=4)
-    expected, found = (track(case.capture, case.model.to(torch.zeros(())), each) for each in (LANDMARKS, FAST))
-    assert found.pixel_residuals is None
-    assert "the fit to landmarks is kept" in capsys.readouterr().err
-    assert torch.equal(found.face.head_rotation, expected.face.head_rotation)
 
 
 def test_derivatives_of_the_surface_are_those_of_the_face_model():
@@ -293,14 +275,6 @@ def test_cost_gradient_and_hessian_are_those_of_the_pixels():
     assert cost == pytest.approx(float(expected_cost), rel=1e-4)
     for found, expected in ((gradient, expected_gradient), (hessian, expected_hessian)):
         torch.testing.assert_close(found.double(), expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
-    arrays, few = seen.arrays(), torch.zeros(3, 3)
-    for wrong, how, kind in (
-        (arrays._replace(vertices=few, normals=few), None, IndexError),
-        (arrays._replace(mask=torch.zeros(5, 5)), None, ValueError),
-        (arrays, (jacobian, None, gradient), TypeError),
-    ):
-        with pytest.raises(kind):
-            _native.align_mesh(surface, wrong, 0, how, None, None)  # pyright: ignore[reportArgumentType]
 
 
 def test_high_pass_leaves_out_a_smooth_light_but_not_texture():

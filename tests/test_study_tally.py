@@ -8,20 +8,6 @@ from mien.lab.analysis.study.files import QUESTIONS, Answer, Answers, KeyClip, S
 from mien.lab.analysis.study.tally import interval, student_quantile, tally_text, wilson
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """Participants differ in their taste, so that their judgements are not independent."""
-    random, held, naive, rounds = np.random.default_rng(0), 0, 0, 800
-    for _ in range(rounds):
-        taste = random.beta(0.6 * 4, 0.4 * 4, 15)
-        shares = random.binomial(10, taste) / 10
-        low, high = interval(shares, 10)
-        held += low <= 0.6 <= high
-        low, high = wilson(float(shares.mean()), 150.0, 1.96)
-        naive += low <= 0.6 <= high
-    assert 0.93 <= held / rounds <= 0.98
-    assert naive / rounds < 0.85
-
-
 def test_few_participants_have_wider_intervals_by_student_s_factor() -> None:
     """Three people, 12.5 judgements' worth of evidence: (1.96 / 4.30)^2 of it counts, which leaves 2.6."""
     shares = np.array([0.4, 0.5, 0.75])

@@ -63,19 +63,14 @@ def test_a_few_landmarks_will_do():
     assert (few.face.expression - same.face.expression).abs().median() < 0.01
 
 
-def _still_then_turn(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return true yaw, tracked yaw and tracked landmarks (metres) of a head that rests, then turns 0.4 rad in 0.3 s."""
+def _turned() -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the true and the tracked yaw of a head that rests, then turns 0.4 rad in 0.3 s."""
     case = make_tracking_case(timesteps=50, noise=0)
     yaw = 0.2 * torch.tanh((torch.arange(50, dtype=torch.float64) - 33) / 2.0)
     moving = replace(case.face[[0] * 50], head_rotation=yaw[:, None] * torch.tensor([0.0, 1.0, 0.0]))
     pixels = case.camera.project(case.model.landmark_positions(case.model(moving), "mediapipe"))[0]
-    generator = torch.Generator().manual_seed(5)
-    # As with detectors, neighbours err alike: the picture shifts in each frame, and each point errs a little more.
-    shake = noise * torch.randn(50, 1, 2, generator=generator, dtype=torch.float64)
-    own = noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
-    model = make_small_face_model()
-    tracking = track(capture_of(pixels + shake + own), model, KNOWN_FOCAL)
-    return yaw, tracking.face.head_rotation[:, 1], model.landmark_positions(model(tracking.face), "mediapipe")
+    tracking = track(capture_of(pixels), make_small_face_model(), KNOWN_FOCAL)
+    return yaw, tracking.face.head_rotation[:, 1].double()
 
 
 @pytest.mark.unchecked
@@ -114,12 +109,7 @@ def test_expression_stays_in_bounds():
 
 @pytest.mark.unchecked
 def test_fast_turns_neither_lag_nor_shrink():
-    still = _still_then_turn(noise=0.3)[2][2:26]
-    shake = (still[2:] - 2 * still[1:-1] + still[:-2])[..., :2].norm(dim=-1).median()
-    # The shake of the whole picture alone is 0.3 px * sqrt(6) * sqrt(pi / 2) in second differences, or 1.06 mm.
-    assert shake < 0.0006
-    yaw, tracked_yaw, _ = _still_then_turn(noise=0.0)
-    tracked_yaw = tracked_yaw.double()
+    yaw, tracked_yaw = _turned()
     range_ratio = (tracked_yaw.max() - tracked_yaw.min()) / (yaw.max() - yaw.min())
     assert 0.95 < range_ratio < 1.05
     # The yaw crosses the middle of its way less than half a frame late or early.
@@ -334,14 +324,3 @@ def test_what_a_ring_of_cameras_tells(ring, tmp_path):
     again = read_tracking(tmp_path)
     assert torch.equal(again.residuals.isnan(), tracking.residuals.isnan())
     assert torch.equal(again.cameras[2].viewmat, tracking.cameras[2].viewmat)
-
-
-@pytest.mark.unchecked
-@pytest.mark.slow
-def test_rings_and_videos_share_an_identity(ring):
-    face, capture, _ = ring
-    case = make_tracking_case(timesteps=20, noise=0)
-    points = _landmarks(_model_with_sizes(), replace(case.face, identity=face.identity))
-    video = capture_of(_noisy(case.camera.project(points)[0], 0.3, 3))
-    _, of_video = track_subject([capture, video], _model_with_sizes(), replace(FEW, focal=FOCAL))
-    assert abs(float(of_video.face.identity[-1]) - 1.2) < 0.05, "the ring tells the video's metric scale"
