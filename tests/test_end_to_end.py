@@ -61,6 +61,17 @@ def test_everybody_can_read_the_reports(demo: Path, tmp_path: Path) -> None:
             assert violations(page, size, device) == [], (page, device)
 
 
+def test_the_avatar_turns_and_follows_blend_shapes(demo: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('[{"blendshapes": {"jawOpen": 0.5}}, {"blendshapes": {}}]')
+    for line in (
+        "render {me} --out {out}/still.png --size 64",
+        "render {me} --out {out}/aside.png --size 64 --yaw 30",
+        "drive {me} --by {out}/a.json --out {out}/d.webm --background transparent --size 64",
+    ):
+        assert main(line.format(me=demo, out=tmp_path).split()) == 0, line
+    assert (tmp_path / "aside.png").read_bytes() != (tmp_path / "still.png").read_bytes()
+
+
 OF_A_VIDEO = {
     "capture": "{video} --out {out}/captured",
     "track": "{out}/captured " + " ".join(TRACK),
