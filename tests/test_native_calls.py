@@ -198,12 +198,9 @@ CASES: dict[str, tuple[Callable[[], Any], str, str]] = {
         TYPE, "FaceArrays.joint_rest has the wrong type or shape"),
     "group without an array": (
         lambda: call("ride", 4, log_scales=None), TYPE, "LocalGaussians.log_scales has the wrong type or shape"),
-    "list for a group": (lambda: call("pose_face", 1, list(arguments("pose_face")[1])), TYPE, "pose_face()"),
     "no frame": (
         lambda: backward_with(frame=None),
         TYPE, "RasterizeGradients.frame must be a frame that `rasterize_views` returned"),
-    "number for a frame": (
-        lambda: backward_with(frame=3), TYPE, "RasterizeGradients.frame has the wrong type or shape"),
     "one frame twice": (one_frame_twice, "accepted", "one after the other"),
     "other coefficients": (other_coefficients, VALUE, "not the Gaussians of the forward pass"),
     "another model's ride": (a_ride_of_another_model, VALUE, "another model"),
