@@ -113,9 +113,6 @@ def test_the_mixed_half_keeps_what_is_rare() -> None:
     assert len(chosen) == len(set(chosen)) == 11
     assert {20, 21} <= set(chosen)
     assert ranges(whole, chosen)["yaw_range"] > ranges(whole, list(range(20)))["yaw_range"] == 0
-    # The frontal quarter has the views that are nearest to the median.
-    yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
-    assert frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))) == [3, 7]
     # Subsets are chosen among the frames of the training.
     _, sequence = toy_sequence(10, 32)
     frames = training_frames([sequence], TrainSettings(split="tail"))
@@ -125,3 +122,8 @@ def test_the_mixed_half_keeps_what_is_rare() -> None:
     (mask,) = masks([sequence], found, [0, 3])
     assert mask.nonzero()[:, 0].tolist() == [0, 3]
     assert ranges(found, list(range(8)))["expression_spread"] == pytest.approx(1)
+
+
+def test_the_frontal_quarter_has_the_views_nearest_to_the_median():
+    yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
+    assert frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))) == [3, 7]

@@ -13,7 +13,7 @@ from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar import motion
 from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.mono_gaussian_avatar.motion import canonical_face, nearest_vertices
-from mien.avatar.mono_gaussian_avatar.networks import AttributeNet, Deformation, DeformationNet
+from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.surface_places import at_places, random_places
@@ -237,11 +237,16 @@ def test_paper_has_adams_own_epsilon_and_the_published_skinning_branch() -> None
     torch.testing.assert_close(baked.sh, trained.sh, atol=1e-5, rtol=0)
 
 
-def test_gray_translucent_points_start_on_a_sphere_or_on_the_canonical_face() -> None:
+def test_starts_on_a_sphere_with_gray_translucent_points() -> None:
     avatar = new_avatar(disturbed=False)
     gaussians = avatar.pose(toy_face(5)[0], Progress(0, 100)).gaussians
     torch.testing.assert_close(avatar.store["means"].norm(dim=-1), torch.full((30,), 0.125))
     assert ((gaussians.opacities > 0.1) & (gaussians.opacities < 0.9)).all()
+    # 0.0844 in the paper's lengths, which are four times ours, and the networks' share.
+    assert ((gaussians.scales > 0.0211) & (gaussians.scales < 0.0211 + 0.00625)).all()
+
+
+def test_points_start_on_the_canonical_face() -> None:
     avatar = new_avatar(replace(SMALL, start="face", points=200), disturbed=False)
     vertices, means = avatar.face_model.head_vertices(avatar.canonical_face())[0], avatar.store["means"]
     middles, _, normals = triangle_geometry(vertices, avatar.face_model.faces)
@@ -291,6 +296,24 @@ def trunk_of(network: AttributeNet, encoding: Tensor) -> Tensor:
     for index, layer in enumerate(network.trunk):
         values = softplus(layer(torch.cat([values, encoding], -1) / 2**0.5 if index == 3 else values))
     return values
+
+
+def test_rounds_grow_to_the_limit_and_no_further() -> None:
+    settings = new_avatar(plain_mono_gaussian_avatar(max_points=5000)).density().settings
+    targets = dict(zip(settings.times, settings.targets, strict=True))
+    assert len(targets) == 99
+    assert (targets[0.04], targets[0.05], targets[0.19], targets[0.2], targets[0.99]) == (400, 800, 3200, 5000, 5000)
+    assert settings.prune_opacity == 0.1
+
+
+def test_change_network_has_the_published_layers() -> None:
+    torch.manual_seed(0)
+    network, values = AttributeChangeNet(16), torch.randn(9, 3)
+    first, second, third = network.trunk
+    trunk = third(second(first(values).relu()).relu())  # no activation after the third
+    heads = zip(network.heads, network.outputs, strict=True)
+    expected = torch.cat([output(head(trunk).relu()) for head, output in heads], dim=-1)
+    torch.testing.assert_close(network(values), expected)
 
 
 def test_attribute_network_has_the_published_layers() -> None:

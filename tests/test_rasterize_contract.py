@@ -72,6 +72,12 @@ def test_batches_equal_their_single_pictures(backend: Backend) -> None:
     batch = rasterize(stacked(scenes), cameras, background, backend)
     for name in ("image", "radii", "alpha"):
         assert torch.equal(getattr(batch, name), torch.stack([getattr(single, name) for single in singles]))
+    shared = replace(stacked(scenes), sh=scenes[0].gaussians.sh)
+    for index, entry in enumerate(shared.timesteps()):
+        assert all(
+            torch.equal(known(a), known(b))
+            for a, b in zip(vars(entry).values(), vars(shared.timestep(index)).values(), strict=True)
+        )
     one_camera = rasterize(stacked(scenes), cameras[1], background, backend)
     assert torch.equal(one_camera.image[1], singles[1].image)
     one_scene = rasterize(scenes[1].gaussians, cameras, background, backend)

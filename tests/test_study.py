@@ -17,7 +17,7 @@ from mien.avatar import METHODS
 from mien.capture.video import read_video_frames
 from mien.cli import main
 from mien.errors import UserError
-from mien.lab.analysis.study import read_key
+from mien.lab.analysis.study import StudySettings, read_key
 from mien.lab.analysis.study.clips import spans
 from mien.lab.analysis.study.drawing import encode
 from mien.lab.analysis.study.files import QUESTIONS, read_all_answers
@@ -300,3 +300,9 @@ def test_everybody_can_take_part_under_a_name_of_their_own(page: Path) -> None:
     name = 'document.getElementById("participant").textContent'
     first, other = (browse(page, [START, name])["results"][1] for _ in range(2))
     assert first != other
+
+
+def test_defaults_are_the_paper_s() -> None:
+    settings = StudySettings()
+    settings.check()
+    assert settings.clips == 10
