@@ -75,7 +75,7 @@ def test_the_gains_are_learned_and_the_background_stays(rig, right: str):
         seen = colors.seen_by(shown, BACKGROUND, Frame(0, 0, step % 3))
         assert torch.equal(seen.image[:, :4], shown.image[:, :4]), "only the background is there"
         (seen.image - (shown.image - behind) * wanted[step % 3] - behind).abs().mean().backward()
-        adam.step(colors.parameter_groups(), Progress(step, 900, 0))
+        adam.step(colors.learned.parameter_groups(), Progress(step, 900, 0))
     changes = colors.changes().detach()
     torch.testing.assert_close(changes[:, :, :3], torch.diag_embed(wanted - 1), atol=0.03, rtol=0)
     assert changes[:, :, 3].abs().max() < 0.02
@@ -88,7 +88,7 @@ def test_each_camera_has_one_map_in_all_sequences(rig):
     colors, shown = colors_of(replace(SETTINGS, held_out_cameras=("b",)), rig[1], other), drawing()
     assert colors.ids == ("a", "c", "d")
     with torch.no_grad():
-        colors.state()["changes"][1, 0, 3] = 0.25
+        colors.learned.state()["changes"][1, 0, 3] = 0.25
     places = (Frame(0, 0, 0), Frame(0, 0, 2), Frame(1, 0, 0), Frame(1, 0, 1), Frame(1, 0, 2))
     seen = [colors.seen_by(shown, BACKGROUND, place).image.detach() for place in places]
     assert [float((one - shown.image).max()) > 0.1 for one in seen] == [False, True, True, False, False]

@@ -13,7 +13,7 @@ from mien.capture.faces import LandmarkDetector, second_difference_jitter
 from mien.capture.given import read_landmarks
 from mien.capture.matte import refine_matte
 from mien.capture.plate import plate_matte
-from mien.capture.quality import measure_face, quality_report, relative_quality, skin_colors
+from mien.capture.quality import measure_face, quality_report, relative_quality
 from mien.capture.tone import srgb_signal
 from mien.capture.video import read_lazily, write_video
 from mien.errors import UserError
@@ -217,7 +217,7 @@ def check_light(picture: np.ndarray, corners: np.ndarray) -> None:
         (lit(picture, 0.3, 1.0, 0.4), "green", None), (lit(picture, 0.15, 0.4, 1.5), "blue", None),
     ):  # fmt: skip
         measured = measure_face(seen, corners)[None]
-        report = quality_report("clip", relative_quality(measured), skin_colors(measured))
+        report = quality_report("clip", relative_quality(measured), measured)
         assert (report["color_cast"] or None) == cast
         assert dark is None or report["dark"] == dark
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mien.capture.capture import Capture
     from mien.capture.from_cameras import capture_cameras
     from mien.capture.from_video import capture_video, capture_video_parts
-    from mien.capture.quality import FrameQuality
+    from mien.capture.quality import FrameQuality, is_light_changing
     from mien.capture.settings import CaptureSettings
     from mien.capture.store import read_capture, read_capture_hash, write_capture
 else:
@@ -41,6 +41,7 @@ __all__ = [
     "capture_cameras",
     "capture_video",
     "capture_video_parts",
+    "is_light_changing",
     "read_capture",
     "read_capture_hash",
     "write_capture",

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import UInt8
 
-_GROUND = 128
+GROUND = 128
 """Grey level that replaces what is transparent. Faces are found before it, and soft edges are cleaned of it as of any
 even background."""
 _TRANSPARENT = 128
@@ -24,7 +24,7 @@ def over_ground(colors: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h 
     brighter = colors[soft].max(axis=-1, initial=0) > alpha[soft].astype(np.int16) + _NOISE
     share = alpha[..., None].astype(np.float32) / 255
     front = colors * (share > 0 if soft.any() and brighter.mean() < _FEW else share)
-    return np.rint(np.minimum(front + (1 - share) * _GROUND, 255)).astype(np.uint8)
+    return np.rint(np.minimum(front + (1 - share) * GROUND, 255)).astype(np.uint8)
 
 
 def as_matte(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"] | None:

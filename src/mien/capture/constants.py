@@ -185,6 +185,30 @@ class CaptureConstants:
     motion by 4 % of the face's width causes that, or by 5 pixels in a face of 130. Turned heads and closed eyes stay
     above it (log)."""
 
+    least_light_change: float = 1.35
+    """Factor by which the face's brightness changes over time from which the light counts as changing, and training
+    learns a gain for each frame. Measured: seven clips in steady light have up to 1.17 (log)."""
+
+    # screen.py; all set by eye
+    screen_least_level: float = 0.2
+    """Least level of a screen's brightest channel, 0..1."""
+    screen_most_red: float = 0.7
+    """Most red of a screen, relative to its brightest channel. Skin has most of red."""
+    screen_least_saturation: float = 0.45
+    """Least difference of a screen's channels, relative to the brightest."""
+    screen_most_difference: float = 0.15
+    """Largest difference of a screen's channels, relative to the brightest one, from their median."""
+    screen_least_share: float = 0.8
+    """Part of the border that has the screen's tint at least."""
+    screen_levels: tuple[float, float] = (0.08, 0.9)
+    """Shares of what is not screen that become 0 and 1. Skin at the edges has some of the screen's light."""
+    screen_inside_most: float = 0.6
+    """Share of screen up to which a pixel inside the person's mask is opaque: green eyes and stripes make no holes."""
+    screen_spill: float = 1 / 40
+    """Width of the edge that loses the screen's light, as a fraction of the longer side; at twice that nothing does."""
+    screen_window: float = 1 / 6
+    """Side of the window in which the screen's light is averaged, as a fraction of the longer side."""
+
     # survey.py
     survey_side: int = 512
     """Longest side in pixels of the pictures in which faces are searched. The detectors see at most 192 pixels. Chosen

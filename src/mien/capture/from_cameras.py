@@ -34,7 +34,7 @@ from mien.capture.pace import frame_rate, tell_pauses
 from mien.capture.parts import Part, check_one_size
 from mien.capture.people import Person, choose_person
 from mien.capture.process import Chunk, Reel, process_part
-from mien.capture.quality import MEASURES, FrameQuality, quality_report, relative_quality, skin_colors
+from mien.capture.quality import MEASURES, FrameQuality, quality_report, relative_quality
 from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
@@ -324,7 +324,7 @@ def _finish(
         "faces_by_camera": dict(zip(layout.camera_ids, found.tolist(), strict=True)),
         "kind_by_camera": {view.camera_id: kind_report(view.job.frames, view.survey) for view in views},
         **tell_pauses(whole.name, timestamps),
-        **quality_report(whole.name, quality, skin_colors(_joined_arrays(chunks, "quality").reshape(-1, MEASURES))),
+        **quality_report(whole.name, quality, _joined_arrays(chunks, "quality").reshape(-1, MEASURES)),
     }
     digests = {FRAMES: _joined_arrays(chunks, "frame_digests"), MATTES: _joined_arrays(chunks, "matte_digests")}
     digests = {kind: array.reshape(array.shape[:2]) for kind, array in digests.items()}

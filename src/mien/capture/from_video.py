@@ -35,7 +35,7 @@ from mien.progress import say
 from mien.storage import cannot_write, file_digest, read_json, write_json
 from mien.terminal import plain_name
 
-RECIPE = 6
+RECIPE = 7
 """Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
 STATE, _CHUNKS = "state.json", "chunks"
 

@@ -1,4 +1,4 @@
-"""Step 4, mattes: made by segmentation, made with a clean plate, or read from files that were made elsewhere.
+"""Step 4, mattes: made by segmentation, with a clean plate or a screen, or read from files that were made elsewhere.
 
 The segmentation is MediaPipe's network at 256x256, stabilised over time and refined at the picture's full size.
 """
@@ -19,6 +19,7 @@ from mien.capture.crop import Crop
 from mien.capture.given import GivenMattes
 from mien.capture.plate import plate_matte
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+from mien.capture.screen import screen_matte, screen_of
 
 _MODEL_SIZE = 256
 
@@ -133,6 +134,11 @@ def _affine_fit(
     return mean(slope), mean(offset)
 
 
+def _screen_or_edges(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    screen = screen_of(image)
+    return refine_matte(image, mask) if screen is None else screen_matte(image, mask, screen)
+
+
 MakeMatte = Callable[[], UInt8[np.ndarray, "h w"]]
 """Computes a matte; the caller chooses when and on which thread."""
 
@@ -192,5 +198,5 @@ def choose_matting(
     if mattes is not None:
         return ReadMattes(mattes, crop)
     segmenter = stack.enter_context(Segmenter(detector))
-    refine = refine_matte if plate is None else partial(plate_matte, plate=crop.apply(plate))
+    refine = _screen_or_edges if plate is None else partial(plate_matte, plate=crop.apply(plate))
     return SegmentedMattes(segmenter, refine)

@@ -11,7 +11,7 @@ from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.capture.pace import frame_rate, pace_report
 from mien.capture.parts import Part
 from mien.capture.process import Chunk
-from mien.capture.quality import quality_report, relative_quality, skin_colors
+from mien.capture.quality import quality_report, relative_quality
 from mien.capture.source import FrameSource
 from mien.capture.store import CaptureData, finish_capture
 from mien.capture.survey import no_face
@@ -89,7 +89,7 @@ def finish_part(
     }
     if not valid.all():
         say(f"{part.name}: no face in {report['frames_without_face']} of {len(valid)} frames; they are left out")
-    report |= quality_report(part.name, quality, skin_colors(measured))
+    report |= quality_report(part.name, quality, measured)
     for name in scaffolding:
         path = layout.folder / name
         remove_tree(path)

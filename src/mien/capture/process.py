@@ -23,10 +23,11 @@ from mien.capture.matte_owner import held, without_others
 from mien.capture.parts import Part
 from mien.capture.people import Person
 from mien.capture.quality import MEASURES, measure_face
+from mien.capture.screen import screen_of, without_screen
 from mien.capture.source import FrameSource, SourceFrame
 from mien.capture.survey import Survey
 from mien.errors import UserError
-from mien.progress import Advance, progress_bar
+from mien.progress import Advance, progress_bar, say
 from mien.storage import expect_whole, read_arrays, write_arrays
 
 CHUNK = 256
@@ -143,10 +144,13 @@ class PartProcessor:
         self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
         self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=CAPTURE.lead_in)
         """Timesteps and pictures of the latest frames; before the first frame, of the next ones in reverse order."""
+        self._keys = given.plate is None and given.mattes is None
         if begin == 0:
             ahead = [self._cropped(frame) for frame in itertools.islice(self._stream, CAPTURE.lead_in + 1)]
             self._recent.extend((index, image) for index, (_, image) in reversed(list(enumerate(ahead))[1:]))
             self._pictures = itertools.chain(ahead, map(self._cropped, self._stream))
+            if self._keys:
+                _tell_screen(part.name, screen_of(ahead[0][1]))
         else:
             self._pictures = map(self._cropped, self._stream)
         before = itertools.islice(self._pictures, done - begin)
@@ -177,7 +181,8 @@ class PartProcessor:
                 make_matte = matting.prepare(number, image)
                 if self._given.mattes is None and found is not None:
                     make_matte = partial(_own_matte, make_matte, found, self._others[timestep], taken_off[index:][:1])
-                make = partial(_finish, image, make_matte, landmarks[index], quality[index])
+                screen = screen_of(image) if self._keys else None
+                make = partial(_finish, image, make_matte, landmarks[index], quality[index], screen)
                 writer.submit(timestep, make)
                 self._recent.append((timestep, image))
                 advance()
@@ -254,6 +259,15 @@ def process_part(
     return chunks
 
 
+def _tell_screen(name: str, screen: np.ndarray | None) -> None:
+    if screen is not None:
+        red, green, blue = (round(255 * float(level)) for level in screen)
+        say(
+            f"{name}: the background is an even screen (red {red}, green {green}, blue {blue} of 255); it gives the "
+            "mattes, and its light is taken off the edges; give --capture.mattes if they are wrong"
+        )
+
+
 def _own_matte(make: MakeMatte, landmarks: np.ndarray, others: np.ndarray, taken_off: np.ndarray) -> np.ndarray:
     """Make the matte of the person with these landmarks, and write how many pixels that takes off."""
     matte = make()
@@ -263,9 +277,17 @@ def _own_matte(make: MakeMatte, landmarks: np.ndarray, others: np.ndarray, taken
 
 
 def _finish(
-    image: np.ndarray, make_matte: MakeMatte, landmarks: np.ndarray, quality: np.ndarray
+    image: np.ndarray,
+    make_matte: MakeMatte,
+    landmarks: np.ndarray,
+    quality: np.ndarray,
+    screen: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return picture and matte for the disk, and write the picture's quality into `quality`."""
+    """Return picture and matte for the disk, and write the picture's quality into `quality`.
+
+    A picture before a screen is stored without it.
+    """
     if np.isfinite(landmarks[0, 0]):
         quality[:] = measure_face(image, landmarks)
-    return image[None], make_matte()[None]
+    matte = make_matte()
+    return (image if screen is None else without_screen(image, matte, screen))[None], matte[None]

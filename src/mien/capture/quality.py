@@ -1,5 +1,6 @@
 """Step 4: measure how sharp and how well lit the face is in every frame."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from mien.progress import say
 _DIRECTIONS = 4
 """Directions in which detail is measured: across, down and both diagonals. Motion removes it only along itself."""
 _CHANNELS = 3
-MEASURES = _DIRECTIONS + 2 + _CHANNELS
+MEASURES = _DIRECTIONS + 3 + _CHANNELS
 """Number of values that `measure_face` returns."""
 _CLIPPED_LEVEL = 250
 """Level (of 255) from which a channel counts as clipped."""
@@ -28,6 +29,12 @@ _CELLS = 8
 _MAX_CAST = 0.92
 """Level of green or blue, relative to red, from which skin counts as tinted. Skin has up to 0.85 of green and 0.83 of
 blue in seven clips, and up to 0.77 and 0.67 in ten drawn people (docs/log.md)."""
+_MAX_NOISE = 0.025
+"""Noise relative to the face's mean level from which a clip counts as noisy. Seven clips have up to 0.008."""
+_LIGHT_RANGE = (5, 95)
+"""Percentiles of the face's brightness over time that are compared, so that single frames do not count."""
+_NOISE_KERNEL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)
+"""Leaves out edges and shading. Its answer to noise of deviation 1 has deviation 6 (Immerkaer, 1996)."""
 _MIN_COLOR = 0.05
 """Relative difference of the channels below which a picture counts as grey: black and white film has no cast."""
 
@@ -50,7 +57,9 @@ class FrameQuality:
 
 
 def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " m"]:
-    """Return detail in each direction (arbitrary units), brightness, clipped part, and the skin's colour (0..1, sRGB).
+    """Return detail in each direction (arbitrary units), brightness, clipped part, noise, and the skin's colour.
+
+    Brightness, noise (a standard deviation) and colours are 0..1, sRGB.
 
     They are NaN if the face lies outside the picture.
     """
@@ -61,7 +70,15 @@ def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray,
         return np.full(MEASURES, np.nan)
     face = image[top:bottom, left:right]
     clipped = float((face.max(axis=-1) >= _CLIPPED_LEVEL).mean())
-    return np.array([*_detail(face), float(face.mean()) / 255, clipped, *_skin_color(face)])
+    return np.array([*_detail(face), float(face.mean()) / 255, clipped, _noise(face), *_skin_color(face)])
+
+
+def _noise(face: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Return the standard deviation of what no edge or shading explains, in the median cell of the skin's part."""
+    gray = cv2.cvtColor(_skin(face), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    rough = np.abs(cv2.filter2D(gray, cv2.CV_32F, _NOISE_KERNEL))
+    cells = cv2.resize(rough, (_CELLS, _CELLS), interpolation=cv2.INTER_AREA)
+    return float(np.median(cells)) * math.sqrt(math.pi / 2) / 6 / 255
 
 
 def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
@@ -78,11 +95,15 @@ def _detail(face: UInt8[np.ndarray, "h w 3"]) -> list[float]:
     return [float(np.abs(bend).mean()) / contrast for bend in (across, down, diagonal + mixed, diagonal - mixed)]
 
 
-def _skin_color(face: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
+def _skin(face: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "p q 3"]:
     height, width = face.shape[:2]
     top, bottom = (int(part * height) for part in _SKIN_ROWS)
     left, right = (int(part * width) for part in _SKIN_COLUMNS)
-    cells = cv2.resize(face[top:bottom, left:right], (_CELLS, _CELLS), interpolation=cv2.INTER_AREA)
+    return face[top : max(bottom, top + 1), left : max(right, left + 1)]
+
+
+def _skin_color(face: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
+    cells = cv2.resize(_skin(face), (_CELLS, _CELLS), interpolation=cv2.INTER_AREA)
     return np.median(cells.reshape(-1, _CHANNELS), axis=0) / 255
 
 
@@ -96,29 +117,52 @@ def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
     return FrameQuality(sharpness, others[:, :1], others[:, 1:2])
 
 
-def skin_colors(measured: Float[np.ndarray, "t m"]) -> Float[np.ndarray, "t 3"]:
-    """Return the skin's colour in every frame (0..1, sRGB) from the results of `measure_face`; NaN for no face."""
-    return measured[:, -_CHANNELS:]
+def light_change(brightness: Float[np.ndarray, " n"]) -> float:
+    """Return by what factor the brightness of the face changes over pictures, 1 or more. NaN counts nowhere.
+
+    The darkest and the brightest twentieth of the pictures do not count.
+    """
+    known = brightness[brightness > 0]  # NaN compares as not brighter.
+    if not len(known):
+        return 1.0
+    low, high = np.percentile(known, _LIGHT_RANGE)
+    return float(high / low)
 
 
-def quality_report(name: str, quality: FrameQuality, skin: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+def is_light_changing(brightness: Float[np.ndarray, " n"]) -> bool:
+    """Return whether the brightness of the face, 0..1, says that the light changes. NaN counts nowhere."""
+    return light_change(brightness) > CAPTURE.least_light_change
+
+
+def quality_report(name: str, quality: FrameQuality, measured: Float[np.ndarray, "n m"]) -> dict[str, Any]:
     """Return figures for the capture's report, and tell the user what is wrong with the clip.
 
     Args:
         name: name of the capture, for messages.
         quality: quality of all frames.
-        skin: colours of the skin in all pictures (`skin_colors`).
+        measured: results of `measure_face` for all pictures.
     """
     seen = np.isfinite(quality.brightness)
     brightness, clipped = (
         float(np.median(values[seen])) if seen.any() else 0.0 for values in (quality.brightness, quality.clipped)
     )
     blurred = np.flatnonzero(quality.blurred.any(axis=1)).tolist()
-    known = skin[np.isfinite(skin).all(axis=1)]
-    color = np.median(known, axis=0) if len(known) else np.zeros(_CHANNELS)
+    known = measured[np.isfinite(measured).all(axis=1)]
+    color = np.median(known[:, -_CHANNELS:], axis=0) if len(known) else np.zeros(_CHANNELS)
+    noise = float(np.median(known[:, _DIRECTIONS + 2])) if len(known) else 0.0
     cast = find_cast(color)
     is_dark, is_overexposed = brightness < _MIN_BRIGHTNESS, clipped > _MAX_CLIPPED
-    hints = _hints(brightness if is_dark else None, clipped if is_overexposed else None, cast, color)
+    is_noisy = noise > _MAX_NOISE * brightness
+    changing = max(quality.brightness.T, key=light_change)
+    change = light_change(changing)
+    hints = _hints(
+        brightness if is_dark else None,
+        clipped if is_overexposed else None,
+        cast,
+        color,
+        noise if is_noisy else None,
+        changing if is_light_changing(changing) else None,
+    )
     for hint in hints:
         say(f"warning: {name}: {hint}")
     if blurred:
@@ -129,10 +173,14 @@ def quality_report(name: str, quality: FrameQuality, skin: Float[np.ndarray, "n 
         "frames_blurred": len(blurred),
         "blurred_frames": blurred,
         "face_brightness": round(brightness, 4),
+        "face_brightness_change": round(change, 3),
+        "face_noise": round(noise, 4),
         "face_clipped": round(clipped, 4),
         "skin_color": [round(float(level), 4) for level in color],
         "dark": is_dark,
         "overexposed": is_overexposed,
+        "noisy": is_noisy,
+        "changing_light": is_light_changing(changing),
         "color_cast": cast or None,
         "hints": hints,
     }
@@ -151,8 +199,19 @@ def find_cast(color: Float[np.ndarray, " 3"]) -> str:
     return "green" if green >= blue else "blue"
 
 
-def _hints(dark: float | None, white: float | None, cast: str, color: Float[np.ndarray, " 3"]) -> list[str]:
-    """Return a line with a remedy for each fault: a dark face's level, an over-exposed face's white part, a cast."""
+def _hints(
+    dark: float | None,
+    white: float | None,
+    cast: str,
+    color: Float[np.ndarray, " 3"],
+    noise: float | None,
+    changing: Float[np.ndarray, " t"] | None,
+) -> list[str]:
+    """Return a line with a remedy for each fault.
+
+    The faults are a dark face's level, an over-exposed face's white part, a cast, the noise, and the brightness of each
+    frame where it changes.
+    """
     hints = []
     if dark is not None:
         hints.append(
@@ -170,5 +229,18 @@ def _hints(dark: float | None, white: float | None, cast: str, color: Float[np.n
             f"the skin is {cast} (red {red}, green {green}, blue {blue} of 255), and the avatar's will be; record the "
             "video again in white light with the camera's white balance set on white paper, or correct the colours in "
             "a video program"
+        )
+    if noise is not None:
+        hints.append(
+            f"the pictures are noisy (a deviation of {255 * noise:.1f} of 255 levels in the skin); fine detail will be "
+            "missing; record the video again with more light on the face, and with the camera's gain (ISO) lower"
+        )
+    if changing is not None:
+        darkest, brightest = int(np.nanargmin(changing)), int(np.nanargmax(changing))
+        hints.append(
+            f"the light on the face changes by a factor of {light_change(changing):.1f} (mean level "
+            f"{changing[darkest]:.0%} in frame {darkest}, {changing[brightest]:.0%} in frame {brightest}); training "
+            "evens it out with a gain for each frame, which is less good than steady light; record the video again "
+            "with the camera's exposure and white balance locked"
         )
     return hints

@@ -26,7 +26,7 @@ from mien.locks import hold
 from mien.perceptual.lpips import load_lpips
 from mien.ranges import check_ranges
 from mien.storage import file_digest, write_json
-from mien.training import read_coverage, read_curves, read_run_config, read_training_summary, run_camera
+from mien.training import GAINS, read_coverage, read_curves, read_run_config, read_training_summary, run_camera
 
 _RECIPE = 4
 """Version of the scoring. It is raised whenever the same frame would get other figures."""
@@ -144,6 +144,8 @@ def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings:
         file_digest(run_dir / "face_track.safetensors"), experiment.digests, experiment.held_out_frames,
         settings.baselines, settings.perceptual, settings.perceptual_frames, settings.backbone, settings.edges,
     ]  # fmt: skip
+    if experiment.gains:
+        content.append(file_digest(run_dir / GAINS))
     if settings.perceptual_of != "all":
         content.append(settings.perceptual_of)
     if settings.protocol is not None:

@@ -15,8 +15,10 @@ from mien.face import FaceParams, part_boxes
 from mien.gaussians import Gaussians
 from mien.pictures import Box
 from mien.render import close_holes, rasterize
+from mien.render.rendering import Rendering
 from mien.render.validation import drawable
 from mien.tracking import Scoring
+from mien.training import lit
 from mien.training.footage import Frame, Sequence, clothes_mask, composite, foreground_colors
 
 FaceSource = Literal["as_tracked", "corrected"]
@@ -54,6 +56,8 @@ class Experiment:
     """Whether the scored pixels are those of the capture's mattes, without mien's cut at the neck."""
     clothes: tuple[UInt8[np.ndarray, "t h p"] | None, ...] = ()
     """Packed masks of clothes of each sequence, where its dataset has some. Empty if no protocol asks for them."""
+    gains: tuple[Float[Tensor, "t 3"], ...] = ()
+    """Gain of each timestep of each sequence, by which renderings are multiplied. Empty if the light is steady."""
     digests: tuple[dict[str, str], ...] = ()
     """The hashes of the `pictures` and the `mask` of each sequence. Empty if nothing was read from disk."""
 
@@ -81,6 +85,12 @@ class Experiment:
         """Return where a picture shows clothes, or None if nothing tells."""
         packed = self.clothes[frame.sequence] if self.clothes else None
         return None if packed is None else clothes_mask(packed, frame.timestep, self.camera(frame).width)
+
+    def lit(self, rendering: Rendering, background: Float[Tensor, " 3"], frame: Frame) -> Rendering:
+        """A rendering of the avatar in the light of a frame. The background keeps its colour."""
+        if not self.gains:
+            return rendering
+        return lit(rendering, background, self.gains[frame.sequence][frame.timestep].to(background))
 
     def face(self, frame: Frame) -> FaceParams:
         """The face parameters of one timestep."""
@@ -160,5 +170,6 @@ def drawn_image(
     """
     color = (torch.tensor(background) / 255).to(gaussians.means)
     with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
-        image = rasterize(gaussians, experiment.camera(frame), color).image.clamp(0, 1)
+        drawn = rasterize(gaussians, experiment.camera(frame), color)
+    image = experiment.lit(drawn, color, frame).image.clamp(0, 1)
     return close_holes(image, experiment.avatar.extras.closing).cpu()

@@ -60,16 +60,18 @@ def fit_face(experiment: Experiment, frames: list[Frame], steps: int) -> FacePar
         steps: Number of optimiser steps.
     """
     avatar = experiment.avatar
-    targets = [(experiment.camera(frame), target_image(experiment, frame)) for frame in frames]
+    targets = [(frame, target_image(experiment, frame)) for frame in frames]
     track = FaceTrack(experiment.face(frames[0]), _RATES, bounds=avatar.face_model.expression_bounds)
     adam = Adam()
     with torch.enable_grad(), frozen(avatar):
         for step in range(steps):
             gaussians = avatar.pose(track.face(0)).gaussians.timestep(0)
             white = torch.ones(3).to(gaussians.means)
+            drawn = [(frame, rasterize(gaussians, experiment.camera(frame), white)) for frame, _ in targets]
+            images = [experiment.lit(picture, white, frame).image for frame, picture in drawn]
             losses = [
-                photometric_loss(rasterize(gaussians, camera, white).image, target, l1_weight=1.0, ssim_weight=0.0)
-                for camera, target in targets
+                photometric_loss(image, target, l1_weight=1.0, ssim_weight=0.0)
+                for image, (_, target) in zip(images, targets, strict=True)
             ]
             torch.autograd.backward(losses)
             adam.step(track.parameter_groups(0), Progress(step, steps))

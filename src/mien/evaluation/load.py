@@ -16,7 +16,7 @@ from mien.evaluation.experiment import Edges, Experiment, FaceSource
 from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
 from mien.tracking import read_scoring, read_scoring_hash
-from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_run_config
+from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_gains, read_run_config
 from mien.training.footage import Frame, clothes_digest, held_out_of, read_clothes, sequence_of, training_frames
 
 
@@ -70,6 +70,7 @@ def load_experiments(
         edges=edges,
         whole_mattes=whole,
         clothes=clothes,
+        gains=tuple(read_gains(run_dir, [sequence.capture.timesteps for sequence in sequences])),
         digests=_scored_digests(digests, whole, clothes),
     )
     found = held_out_by_protocol(sequences, settings)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         with_own_split,
         write_own_split,
     )
+    from mien.training.frame_gains import GAINS, lit, read_gains
     from mien.training.run import (
         check_data,
         check_run,
@@ -59,6 +60,7 @@ else:
 
 __all__ = [
     "AlignmentSettings",
+    "GAINS",
     "BENCHMARK_SPLIT",
     "HIDDEN_CAMERAS",
     "MAIN_SETTINGS",
@@ -84,11 +86,13 @@ __all__ = [
     "filmed_range",
     "filmed_words",
     "held_out",
+    "lit",
     "outdated_sequences",
     "ranges_of",
     "read_coverage",
     "read_curves",
     "read_face_track",
+    "read_gains",
     "read_own_split",
     "read_run_config",
     "read_sequence",

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from mien.avatar import DEFAULT_METHOD, Avatar, FaceTuning, Moments, ParameterGroup, Rate, frozen, move_avatar
@@ -27,6 +28,7 @@ from mien.training.alignment_settings import AlignmentSettings
 from mien.training.constants import TRAINING
 from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
 from mien.training.footage import Frame, Sequence, Target, Targets, evenly_spread, training_frames
+from mien.training.frame_gains import lit, read_gains
 from mien.training.photometric import photometric_loss
 from mien.training.run import read_face_track
 from mien.training.settings import PRESETS, TrainSettings
@@ -51,6 +53,8 @@ class _View:
     targets: Targets
     timestep: int
     camera: int
+    gain: Float[Tensor, " 3"] | None
+    """The light of its timestep. None if it is steady."""
 
 
 def align(
@@ -106,7 +110,10 @@ def align(
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     starts = _split(read_face_track(folder, face_model), lengths)
     known = training_frames(sequences, how)
-    aligned = align_faces(template, sequences, starts, known, settings, training.held_out_cameras, folder, progress)
+    gains = read_gains(folder, lengths)
+    aligned = align_faces(
+        template, sequences, starts, known, settings, training.held_out_cameras, folder, progress, gains
+    )
     return [steadier(sequence.tracking.face, face) for sequence, face in zip(sequences, aligned, strict=True)]
 
 
@@ -132,6 +139,7 @@ def align_faces(
     held_out_cameras: Items[str] = (),
     folder: Path | None = None,
     progress: ProgressBar = progress_bar,
+    gains: Items[Float[Tensor, "t 3"]] = (),
 ) -> list[FaceParams]:
     """Return the face parameters of each sequence with which a fixed avatar looks most like the pictures.
 
@@ -147,6 +155,7 @@ def align_faces(
         held_out_cameras: Ids of cameras that are not looked at.
         folder: Where timesteps that are aligned are kept, for this call and no other. A stopped call continues there.
         progress: Makes progress bars.
+        gains: Gain of each timestep of each sequence (`read_gains`). Default: steady light.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
     tuning, bounds = _tuning(settings, single), avatar.face_model.expression_bounds
@@ -156,12 +165,14 @@ def align_faces(
     trained = {frame[:2] for frame in known}
     judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, TRAINING.aligned_judged)
     with one_torch_thread(), frozen(avatar):
-        descent = FaceDescent(_sizes([_Batch.of(part, track, targets) for part in _batches(judged)], avatar, track))
+        descent = FaceDescent(
+            _sizes([_Batch.of(part, track, targets, gains) for part in _batches(judged)], avatar, track)
+        )
         indices = [track.index_of(*timestep[:2]) for timestep in timesteps]
         done = _take_up(folder, track, indices)
         with progress("aligning frames", len(timesteps), done) as advance:
             for part in _batches(timesteps[done:]):
-                batch = _Batch.of(part, track, targets)
+                batch = _Batch.of(part, track, targets, gains)
                 for _ in range(settings.iterations):
                     batch.find_gradients(avatar, track)
                     descent.step(batch.groups(track))
@@ -234,10 +245,10 @@ class _Batch:
     """The picture of each view."""
 
     @staticmethod
-    def of(timesteps: list[_Timestep], track: FaceTrack, targets: Items[Targets]) -> "_Batch":
+    def of(timesteps: list[_Timestep], track: FaceTrack, targets: Items[Targets], gains: Items[Tensor]) -> "_Batch":
         """The batch of some timesteps."""
         views = [
-            _View(place, targets[sequence], timestep, camera)
+            _View(place, targets[sequence], timestep, camera, gains[sequence][timestep] if gains else None)
             for place, (sequence, timestep, cameras) in enumerate(timesteps)
             for camera in cameras
         ]
@@ -255,6 +266,10 @@ class _Batch:
             [(posed[view.place], view.targets.camera(view.camera)) for view in self.views],
             [target.background for target in self.shown],
         )
+        pictures = [
+            picture if view.gain is None else lit(picture, target.background, view.gain)
+            for picture, view, target in zip(pictures, self.views, self.shown, strict=True)
+        ]
         losses = [
             photometric_loss(picture.image, target.picture, box=target.box, drawn=picture.alpha)
             for picture, target in zip(pictures, self.shown, strict=True)

@@ -20,6 +20,48 @@ from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
 
 
+class LearnedColors:
+    """Numbers of colours that are learned beside the avatar, with their own state of the optimiser.
+
+    Args:
+        name: Name of their parameter group.
+        values: The numbers before the first step.
+        rate: Learning rate at the first step.
+    """
+
+    def __init__(self, name: str, values: Tensor, rate: float):
+        self.values = values.detach().clone().requires_grad_()
+        self._name, self._rate = name, Rate(rate, TRAINING.camera_colors_last_rate * rate)
+        self._moments = {"changes": Moments.zeros(values)}
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """One group of all numbers."""
+        return [ParameterGroup(self._name, {"changes": self.values}, self._rate, {**self._moments})]
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that a checkpoint has to save. They share memory with the numbers."""
+        moments = self._moments["changes"]
+        return {
+            "changes": self.values.detach(), "changes.first": moments.first, "changes.second": moments.second,
+            "changes.step": moments.step,
+        }  # fmt: skip
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        for name, own in self.state().items():
+            own.copy_(state[name])
+
+
+def recolored(rendering: Rendering, background: Float[Tensor, " 3"], change: Float[Tensor, "3 4"]) -> Rendering:
+    """The rendering with other colours: `change` adds a matrix times the colour, and an offset.
+
+    The background keeps its colour.
+    """
+    alpha = rendering.alpha[..., None]
+    foreground = rendering.image - (1 - alpha) * background
+    return replace(rendering, image=rendering.image + foreground @ change[:, :3].T + alpha * change[:, 3])
+
+
 class CameraColors:
     """An affine map of colours for each camera id that is trained on. All start as the identity.
 
@@ -44,40 +86,18 @@ class CameraColors:
         self._first_is_right = settings.camera_colors == "first"
         self.ids = tuple(ids)
         """The cameras, in the order of the maps."""
-        self._changes = like.new_zeros(len(ids), 3, 4).requires_grad_()
-        self._rate = Rate(settings.camera_color_rate, TRAINING.camera_colors_last_rate * settings.camera_color_rate)
-        self._moments = {"changes": Moments.zeros(self._changes.detach())}
+        self.learned = LearnedColors("camera_colors", like.new_zeros(len(ids), 3, 4), settings.camera_color_rate)
         places = {camera_id: place for place, camera_id in enumerate(ids)}
         self._places = [[places.get(camera_id, 0) for camera_id in one.capture.camera_ids] for one in sequences]
 
     def changes(self) -> Float[Tensor, "c 3 4"]:
         """What each camera's map adds to a colour: a matrix, then an offset. That of the right one is zero."""
-        right = self._changes[:1] if self._first_is_right else self._changes.mean(0, keepdim=True)
-        return self._changes - right
+        changes = self.learned.values
+        return changes - (changes[:1] if self._first_is_right else changes.mean(0, keepdim=True))
 
     def seen_by(self, rendering: Rendering, background: Float[Tensor, " 3"], frame: Frame) -> Rendering:
         """The rendering of a training frame in its camera's colours. The background keeps its colour."""
-        change = self.changes()[self._places[frame.sequence][frame.camera]]
-        alpha = rendering.alpha[..., None]
-        foreground = rendering.image - (1 - alpha) * background
-        return replace(rendering, image=rendering.image + foreground @ change[:, :3].T + alpha * change[:, 3])
-
-    def parameter_groups(self) -> list[ParameterGroup]:
-        """One group of all maps."""
-        return [ParameterGroup("camera_colors", {"changes": self._changes}, self._rate, {**self._moments})]
-
-    def state(self) -> dict[str, Tensor]:
-        """Tensors that a checkpoint has to save. They share memory with the maps."""
-        moments = self._moments["changes"]
-        return {
-            "changes": self._changes.detach(), "changes.first": moments.first, "changes.second": moments.second,
-            "changes.step": moments.step,
-        }  # fmt: skip
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore what `state` returned."""
-        for name, own in self.state().items():
-            own.copy_(state[name])
+        return recolored(rendering, background, self.changes()[self._places[frame.sequence][frame.camera]])
 
 
 def camera_colors(
@@ -105,7 +125,7 @@ def camera_colors_part(
     return TrainingPart(
         "colors",
         seen=lambda rendering, one: colors.seen_by(rendering, one.target.background, one.frame),
-        parameter_groups=colors.parameter_groups,
-        state=colors.state,
-        load_state=colors.load_state,
+        parameter_groups=colors.learned.parameter_groups,
+        state=colors.learned.state,
+        load_state=colors.learned.load_state,
     )

@@ -33,13 +33,18 @@ class TrainingConstants:
 
     # camera_colors.py
     camera_colors_last_rate: float = 0.1
-    """Learning rate of the cameras' colours at the last step, as a share of that at the first. Not varied."""
+    """Learning rate of the cameras' colours, and of gains, at the last step, as a share of that at the first. Not
+    varied."""
 
     # face_track.py
     still_turns: float = 0.02
     """Standard deviation of a head's turns at which half of what follows them is removed, in radians. Less is removed
     of what follows smaller turns, which explain less. Measured: 0 is as good on three clips that turn (log, 11-26);
     it would take all corrections from a head that hardly turns."""
+
+    # frame_gains.py
+    gain_interval: float = 0.1
+    """Time in seconds between knots of the gains of timesteps. Automatic exposure takes longer. Not varied."""
 
     # trainer.py
     steady_every: int = 25

@@ -131,6 +131,10 @@ def _no_state() -> dict[str, Tensor]:
 def _stateless(state: dict[str, Tensor]) -> None: ...
 
 
+def _no_results() -> dict[str, dict[str, Tensor]]:
+    return {}
+
+
 def _weights(weights: Photometric) -> Photometric:
     return weights
 
@@ -179,6 +183,8 @@ class TrainingPart:
     """Tensors that a checkpoint has to save."""
     load_state: Callable[[dict[str, Tensor]], None] = _stateless
     """Restores what `state` returned. Names, types and shapes were checked."""
+    results: Callable[[], dict[str, dict[str, Tensor]]] = _no_results
+    """Tensors by name that a finished run keeps, by the name of their file in its folder."""
 
 
 def passed(before: int, now: int, every: int) -> bool:

@@ -238,6 +238,9 @@ def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> Non
     """Write everything that is kept after training. training.json is last and marks the run as finished."""
     write_avatar(run_dir / "avatar", state.avatar)
     write_tensors(run_dir / _TRACK, state.track.params().tensors())
+    for part in state.parts:
+        for name, tensors in part.results().items():
+            write_tensors(run_dir / name, tensors)
     write_coverage(run_dir, covered)
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     write_tensors(run_dir / "curves.safetensors", curves)

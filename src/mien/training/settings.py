@@ -51,8 +51,13 @@ class TrainSettings:
     """Whether a change of colours is learned for each camera, for rigs whose cameras differ in exposure or white
     balance. It is used only in training: the avatar has the colours of the first camera (first), or those between all
     cameras (mean). A step takes longer with it."""
+    light: Literal["steady", "changing", "auto"] = "auto"
+    """Whether a gain of three numbers is learned for each timestep, for videos whose exposure, white balance or lamps
+    change. It is used only in training and in scores: the avatar has the mean light. The gain of a held-out timestep
+    is interpolated in time from those that are trained on. Auto: changing if one camera filmed and the brightness of
+    the face changes by a factor of more than 1.35, else steady."""
     camera_color_rate: Annotated[float, POSITIVE] = 1e-3
-    """Learning rate of these changes, per step. It ends at a tenth."""
+    """Learning rate of these changes and gains, per step. It ends at a tenth."""
     unseen: Literal["trained", "filled", "auto"] = "auto"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
     broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
@@ -181,7 +186,14 @@ class Preset:
         return presets[self.name]
 
 
-_OPEN = {"background": "white", "edges": "filmed", "inside": "free", "mesh": "tracked", "unseen": "trained"}
+_OPEN = {
+    "background": "white",
+    "edges": "filmed",
+    "inside": "free",
+    "light": "steady",
+    "mesh": "tracked",
+    "unseen": "trained",
+}
 """Heads stay as they were filmed, as in the papers."""
 PRESETS = {
     preset.name: preset
