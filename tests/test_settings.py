@@ -18,7 +18,9 @@ from test_training_resume import RESULTS
 from toy_scene import toy_face_model
 
 RUN, STANDARD = TrainSettings(), GaussianAvatarsConfig()
-OPEN = TrainSettings(background="white", edges="filmed", inside="free", mesh="tracked", unseen="trained")
+OPEN = TrainSettings(
+    background="white", edges="filmed", inside="free", light="steady", mesh="tracked", unseen="trained"
+)
 """Settings of a run by the preset `paper`."""
 
 Choices = tuple[MethodConfig, TrainSettings]

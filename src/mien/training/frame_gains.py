@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.capture import is_light_changing
@@ -50,25 +50,41 @@ class FrameGains:
         self._starts = [sum(lengths[:index]) for index in range(len(lengths))]
         used = [sorted({one.timestep for one in frames if one.sequence == index}) for index in range(len(lengths))]
         times = [sequence.capture.timestamps for sequence in sequences]
-        weights = torch.block_diag(*map(_interpolation, times, used)).numpy()
+        parts = [_between(*each) for each in zip(times, used, strict=True)]
+        counts = [count for *_, count in parts]
+        firsts = np.cumsum([0, *counts])
+        # The knots before and after each timestep, and their shares. Both shares are 0 in sequences without knots.
+        places = np.concatenate([first + place for first, (place, _, _) in zip(firsts, parts, strict=False)])
+        shares = np.concatenate([share for _, share, _ in parts])
+        places = np.minimum(places, firsts[-1] - 1)
         trained = sorted({self._starts[frame.sequence] + frame.timestep for frame in frames})
         levels = np.log(_brightness(sequences, frames, sum(lengths))[trained])
-        own, known = weights[trained], np.isfinite(levels)
+        known = np.isfinite(levels)
+        differences = np.where(known, levels - (levels[known].mean() if known.any() else 0), 0)
+        usual, around, seen = np.zeros(firsts[-1]), np.zeros(firsts[-1]), np.zeros(firsts[-1])
+        np.add.at(usual, places[trained], shares[trained] / len(trained))
         # A knot starts from the mean of the frames around it.
-        near = own[known].T @ (levels[known] - levels[known].mean()) if known.any() else np.zeros(weights.shape[1])
-        knots = near / np.maximum(own[known].sum(0), 1e-9)
-        lit = weights.sum(1, keepdims=True)  # 0 in sequences that are not trained on, else 1
-        self._weights = torch.from_numpy(weights - lit * own.mean(0)).to(like)
-        self.learned = LearnedColors("frame_gains", torch.from_numpy(knots).to(like)[:, None].repeat(1, 3), rate)
+        np.add.at(around, places[trained], shares[trained] * differences[:, None])
+        np.add.at(seen, places[trained], shares[trained] * known[:, None])
+        knots = torch.from_numpy(around / np.maximum(seen, 1e-9)).to(like)
+        self._places, self._shares = torch.from_numpy(places).to(like.device), torch.from_numpy(shares).to(like)
+        self._usual = torch.from_numpy(usual).to(like)
+        self._trained = torch.from_numpy(shares.sum(1, keepdims=True)).to(like)
+        self.learned = LearnedColors("frame_gains", knots[:, None].repeat(1, 3), rate)
+
+    def _at(self, index: int | slice) -> Float[Tensor, "n 3"]:
+        """The logarithms of the gains of some timesteps."""
+        values, some = self.learned.values, [index] if isinstance(index, int) else index
+        own = (values[self._places[some]] * self._shares[some][..., None]).sum(1)
+        return own - self._trained[some] * (self._usual @ values)
 
     def gains(self) -> Float[Tensor, "t 3"]:
         """The gain of each timestep."""
-        return (self._weights @ self.learned.values).exp()
+        return self._at(slice(None)).exp()
 
     def seen_by(self, rendering: Rendering, background: Float[Tensor, " 3"], frame: Frame) -> Rendering:
         """The rendering of a training frame in its light. The background keeps its colour."""
-        row = self._weights[self._starts[frame.sequence] + frame.timestep]
-        return lit(rendering, background, (row @ self.learned.values).exp())
+        return lit(rendering, background, self._at(self._starts[frame.sequence] + frame.timestep)[0].exp())
 
 
 def lit(rendering: Rendering, background: Float[Tensor, " 3"], gain: Float[Tensor, " 3"]) -> Rendering:
@@ -137,11 +153,22 @@ def _brightness(sequences: Items[Sequence], frames: Items[Frame], timesteps: int
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
-def _interpolation(times: Float[np.ndarray, " t"], used: Items[int]) -> Float[Tensor, "t k"]:
-    """The weights of knots at each timestep. Knots are at some of the `used` timesteps, a certain time apart."""
+def _between(
+    times: Float[np.ndarray, " t"], used: Items[int]
+) -> tuple[Int[np.ndarray, "t 2"], Float[np.ndarray, "t 2"], int]:
+    """The two knots around each timestep, their shares, and the number of knots.
+
+    Knots are at some of the `used` timesteps, a certain time apart. Before the first and after the last, only that one
+    counts. Without any, all shares are 0.
+    """
     knots: list[int] = []
     for timestep in used:
         if not knots or times[timestep] - times[knots[-1]] >= TRAINING.gain_interval:
             knots.append(timestep)
-    weights = [np.interp(times, times[knots], own) for own in np.eye(len(knots))]
-    return torch.from_numpy(np.stack(weights, 1)) if knots else torch.zeros(len(times), 0, dtype=torch.float64)
+    if not knots:
+        return np.zeros((len(times), 2), np.int64), np.zeros((len(times), 2)), 0
+    position = np.interp(times, times[knots], np.arange(len(knots)))
+    before = np.floor(position).astype(np.int64)
+    after = np.minimum(before + 1, len(knots) - 1)
+    share = position - before
+    return np.stack([before, after], 1), np.stack([1 - share, share], 1), len(knots)
