@@ -6,7 +6,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -148,6 +150,19 @@ def test_rows_stop_with_their_driver_and_the_same_command_continues(tmp_path: Pa
     assert ended(pid)
     assert batch_progress(batch)["rows"][0]["status"] == "interrupted"
     assert run_stubs(batch, [stub_row("long", ("sleep", "0"))]) == {"long": "done"}
+
+
+def test_what_runs_is_shown_before_a_row_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    batch, row = Batch(tmp_path), stub_row("ann", ("wait", "shown"))
+    batch.write_plan([row])
+
+    @contextmanager
+    def bar(*_: object) -> Iterator[Callable[..., None]]:
+        yield lambda amount=1, status="": (tmp_path / "shown").touch() if "ann: running" in status else None
+
+    monkeypatch.setattr("mien.batch.drive.progress_bar", bar)
+    replace(driver(batch), look_seconds=0.05).run([row])
+    assert batch.is_done(row)
 
 
 def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Holder):

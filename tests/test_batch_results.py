@@ -16,7 +16,7 @@ from mien.batch.steps import write_strip
 from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands import batch as batch_command
-from mien.commands.stages.batch_table import read_table
+from mien.commands.stages.batch_table import for_all_rows, read_table
 from mien.errors import UserError
 from test_startup import HEAVY, modules_after
 from web_case import violations
@@ -181,6 +181,48 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
     table.write_bytes("name,video\nJosé,ann.mp4\n".encode("latin-1"))
     with pytest.raises(UserError, match="save it as UTF-8"):
         read_table(table)
+
+
+def test_options_of_create_count_for_all_rows_and_a_cell_goes_first(table: Path, tmp_path: Path):
+    typed = ["people.csv", "--steps", "30", "--out", "people", "--no-face-tuning", "--capture.size=256"]
+    others, for_all = for_all_rows([*typed, "--method", "textured_mesh", "--training.resolution", "96"])
+    assert others == ["people.csv", "--out", "people"]
+    ann, bob = (row.steps[0] for row in read_table(table, for_all))
+    more = ("--no-face-tuning", "--capture.size", "256", "--training.resolution", "96")
+    made = ("--out", "{workspace}", "--method")
+    assert ann == ("create", str(tmp_path / "ann.mp4"), *made, "gaussian_avatars", "--steps", "60", *more)
+    assert bob == ("create", str(tmp_path / "bob.mp4"), *made, "textured_mesh", "--steps", "30", *more)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--preset best", "row 1: --preset: give one of 'draft', "),
+        ("--view", "'view' cannot be set; nobody watches"),
+        ("--steps 3 --steps 4", "--steps is given twice"),
+        ("--capture.sizes 3", "row 1: unknown: --capture.sizes; did you mean --capture.size"),
+        ("--name ann", "unknown: --name"),
+    ],
+)
+def test_wrong_options_of_all_rows_are_named(table: Path, capsys: Any, options: str, words: str):
+    assert main(["batch", str(table), "--out", str(table.parent / "out"), *options.split()]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("column", "typed"),
+    [
+        (("face_tuning", "no"), ("--no-face-tuning",)),
+        (("face_tuning", "yes"), ()),
+        (("capture.cuts", "no"), ("--capture.no-cuts",)),
+        (("track_apart", "no"), ()),
+        (("method.face-tuning.enabled", "no"), ("--method.face-tuning.enabled", "False")),
+    ],
+)
+def test_cells_with_yes_and_no_are_flags(table: Path, column: tuple[str, str], typed: tuple[str, ...]):
+    table.write_text(f"video,{column[0]}\nann.mp4,{column[1]}\n")
+    (row,) = read_table(table)
+    assert row.steps[0][6:] == typed
 
 
 MISTAKES = [

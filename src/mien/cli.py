@@ -13,6 +13,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import mien
@@ -157,6 +158,11 @@ def _run(name: str, rest: list[str]) -> int:
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
+    for_all = None
+    if name == "batch":
+        from mien.commands.stages.batch_table import for_all_rows
+
+        rest, for_all = for_all_rows(rest)
     for option in list_options(module.Command):
         if sum(argument.partition("=")[0].replace("_", "-") == option for argument in rest) > 1:
             # The first of its values would be dropped without a word.
@@ -196,6 +202,8 @@ def _run(name: str, rest: list[str]) -> int:
         raise UserError(f"{complaint}; see mien {name} --help{every}") from None
     sys.stderr.write(printable(complaints.getvalue(), lines=True))
     asked_threads()
+    if for_all:
+        command = replace(command, for_all=for_all)
     command.check()
     with orderly_stops():
         use_one_torch_thread()

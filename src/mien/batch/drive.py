@@ -1,19 +1,21 @@
 """Drives a batch: hands its rows to an engine, tries failed ones again, and keeps what comes back."""
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from mien.batch.engines import EngineOptions, Work, engine_named
 from mien.batch.plan import Batch, Row, State
+from mien.batch.progress import running_words
 from mien.batch.row import PROGRAM, attempt
 from mien.batch.store import Returned, attempt_in_store
 from mien.errors import UserError
 from mien.files import write_atomically
 from mien.locks import BeingWrittenError, hold, holder_of
-from mien.progress import progress_bar, say
+from mien.progress import Advance, progress_bar, say
 from mien.terminal import counted
 
 
@@ -44,6 +46,8 @@ class Driver:
     """The command of a row's process. Empty means this Python with `-m mien.batch_row`."""
     work: Work | None = None
     """A function that runs a row in place of `attempt`, for trials of the engines."""
+    look_seconds: float = 5.0
+    """Time between two looks at what runs, for the progress."""
 
     def run(self, rows: Sequence[Row]) -> None:
         """Run the rows until each is done, has failed too often, or is run by another command."""
@@ -51,7 +55,10 @@ class Driver:
         engine.wait_for_earlier(self.options.root)
         left = [row for row in rows if not self.batch.is_done(row)]
         say(f"{counted(len(rows), 'row')}: {len(rows) - len(left)} done before, {len(left)} to do on {self.engine}")
-        with progress_bar("batch", len(rows), len(rows) - len(left)) as advance:
+        with (
+            progress_bar("batch", len(rows), len(rows) - len(left)) as advance,
+            self._telling(lambda: left, advance) as advance,
+        ):
             for turn in range(self.retry + 1):
                 with ExitStack() as claims:
                     taken = self._taken(left, claims)
@@ -65,6 +72,28 @@ class Driver:
                 if not left:
                     break
         self.batch.remove_leftovers(rows)
+
+    @contextmanager
+    def _telling(self, left: Callable[[], Sequence[Row]], advance: Advance) -> Iterator[Advance]:
+        """Show now and then what runs, also before a row has ended. Yields `advance` for the ends of rows."""
+        ended, one_at_a_time = threading.Event(), threading.Lock()
+
+        def move(amount: int = 1, status: str = "") -> None:
+            with one_at_a_time:
+                advance(amount, status)
+
+        def look() -> None:
+            while not ended.wait(self.look_seconds):
+                with suppress(UserError, OSError):  # a file is being written, or damaged; the row's end tells of it
+                    move(0, running_words(self.batch, left()))
+
+        looking = threading.Thread(target=look, daemon=True)
+        looking.start()
+        try:
+            yield move
+        finally:
+            ended.set()
+            looking.join()
 
     def _taken(self, rows: Sequence[Row], claims: ExitStack) -> list[Row]:
         """The rows that no other command runs. With a store, this process claims them, since nodes see no locks."""

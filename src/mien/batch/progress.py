@@ -4,7 +4,7 @@ import gc
 import re
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,6 +16,8 @@ from mien.terminal import counted, printable
 
 _STAGE = re.compile(r"stage (\d+) of (\d+) \(([\w -]+)\)")
 _PART = re.compile(r": (\d+)/(\d+) in ")
+_IN_LINE = 4
+"""Number of running rows that a line of progress names."""
 _SHOWN = 40
 """Number of rows of each kind that the text lists."""
 
@@ -37,6 +39,17 @@ def batch_progress(batch: Batch) -> dict[str, Any]:
         mean = sum(row["seconds"] for row in done) / len(done)
         found["seconds_left"] = round(left * mean / max(counts["running"], 1)) if counts["running"] else None
     return found
+
+
+def running_words(batch: Batch, rows: Sequence[Row]) -> str:
+    """What runs now, in one line: the stage of each of the first running rows, and its percentage.
+
+    Only the first 100 rows are looked at, because each costs a read.
+    """
+    found = (_row(batch, row, batch.read_state(row.name)) for row in rows[:100])
+    running = [row for row in found if row["status"] == "running"]
+    words = [f"{row['name']}: {row['stage'] or 'running'}{_percent(row)}" for row in running[:_IN_LINE]]
+    return printable("; ".join(words + ["..."] * (len(running) > _IN_LINE)))
 
 
 @contextmanager
@@ -108,5 +121,8 @@ def _words(row: dict[str, Any]) -> str:
     host = f" on {row['host']}" if row["host"] else ""  # nobody can read it from a damaged file
     where = f"{row['status']}{host}{seconds}, try {row['tries']}"
     stage = f", {row['stage']}" if row.get("stage") else ""
-    percent = f", {row['percent']} %" if row.get("percent") is not None else ""
-    return f"{where}{stage}{percent}" + (f": {row['error']}" if row.get("error") else "")
+    return f"{where}{stage}{_percent(row)}" + (f": {row['error']}" if row.get("error") else "")
+
+
+def _percent(row: dict[str, Any]) -> str:
+    return "" if row.get("percent") is None else f", {row['percent']} %"

@@ -6,7 +6,7 @@ import shlex
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -22,7 +22,7 @@ _TASKS = {
     "table": ("what", "rows", "columns", "as_json"),
 }
 """Options that a task has. Elsewhere they would change nothing."""
-_OF_ENGINES = ("out", "on", "shard", "retry", "jobs", "threads", "program")
+_OF_ENGINES = ("out", "for_all", "on", "shard", "retry", "jobs", "threads", "program")
 """Options that a batch has on every engine. `mien.batch.Engine` names others."""
 
 
@@ -30,7 +30,8 @@ _OF_ENGINES = ("out", "on", "shard", "retry", "jobs", "threads", "program")
 class Command:
     """Make an avatar from each row of a table, here, on a Slurm cluster, or on a Ray cluster (docs/scale.md).
 
-    mien batch TABLE --out DIR: run all rows that are not done. The same command continues.
+    mien batch TABLE --out DIR: run all rows that are not done. The same command continues. Options of `mien create`,
+    such as --preset draft, count for all rows; a cell of the table goes first.
 
     mien batch status DIR: how far each row is, what failed and why, and when it will be done.
 
@@ -71,6 +72,8 @@ class Command:
     """For table: column of the results whose values are its lines."""
     columns: str = "psnr,ssim,lpips"
     """For table: columns of the results whose means it shows, separated by commas."""
+    for_all: Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress] = None
+    """Options of `mien create`, as `for_all_rows` finds them in what was typed."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -125,6 +128,7 @@ class Command:
         known = _TASKS.get(task) or (*_OF_ENGINES, *engine_named(task).options)
         for each in fields(self):
             value, name = getattr(self, each.name), each.name.removeprefix("as_").replace("_", "-")
+            name = ", --".join(self.for_all) if each.name == "for_all" and self.for_all else name
             if each.name != "what" and each.name not in known and value != each.default:
                 where = f"`mien batch {task}`" if task in ("status", "table") else f"a batch that runs on {task}"
                 raise UserError(f"--{name}: changes nothing for {where}; leave it out")
@@ -145,7 +149,7 @@ class Command:
         from mien.terminal import counted
 
         assert self.out is not None
-        batch, rows = Batch(self.out), read_table(Path(self.what[0]))
+        batch, rows = Batch(self.out), read_table(Path(self.what[0]), self.for_all)
         labels = dict.fromkeys(label for row in rows for label in row.labels)
         if labels:
             say(f"labels, which come back in the results: {', '.join(labels)}")

@@ -6,7 +6,7 @@ import difflib
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,15 @@ _SETTINGS = {
     )
 }
 """Group of options -> names of its settings."""
+_ON = {
+    prefix + one.name.replace("_", "-")
+    for prefix, kind in (("", TrainOptions), ("capture.", CaptureSettings), ("tracking.", TrackingSettings))
+    for one in fields(kind)
+    if one.default is True
+}
+"""Flags that are on unless they are turned off."""
+_NO = re.compile(r"(^|\.)no-")
+"""Marks a flag that is turned off: --no-face-tuning, --capture.no-cuts."""
 _NUMBER = re.compile(r"-[0-9.]+(e[+-]?[0-9]+)?", re.IGNORECASE)
 _DECIMAL = re.compile(r"-?[0-9]+,[0-9]+")
 """A number with a decimal comma."""
@@ -59,8 +68,33 @@ _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 """Memory of a row in megabytes: at least, and for each frame. 10 minutes of video take less than 3 GiB."""
 
 
-def read_table(path: Path) -> list[Row]:
+def for_all_rows(arguments: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
+    """Take the options of `mien create` out of the arguments of `mien batch`: they count for all rows.
+
+    Returns:
+        The other arguments, and the words of each option by its column.
+    """
+    options: dict[str, list[str]] = {}
+    words = others = list[str]()
+    for argument in arguments:
+        typed, equals, value = argument.partition("=")
+        if argument.startswith("--"):
+            column, words = _NO.sub(r"\1", _column(typed)), others
+            if column in (*_options(), "method", "memory-gb", "view") or column.partition(".")[0] in _GROUPS:
+                if column in options:
+                    raise UserError(f"--{column} is given twice; give it once, followed by all of its values")
+                words = options[column] = [value] if equals else ["no"] if column != _column(typed) else []
+                continue
+        words.append(argument)
+    return others, {column: words or ["yes"] for column, words in options.items()}
+
+
+def read_table(path: Path, for_all: Mapping[str, Sequence[str]] | None = None) -> list[Row]:
     """The rows of a table.
+
+    Args:
+        path: A csv, a json, or a folder of videos.
+        for_all: Options of all rows, as `for_all_rows` returns them. A cell of the table goes first.
 
     Raises:
         UserError: the table cannot be read, or a row names a file that is missing, or options that do not exist.
@@ -69,8 +103,10 @@ def read_table(path: Path) -> list[Row]:
     if not entries:
         raise UserError(f"{path}: has no rows; give a table of captures, or a folder of videos")
     rows, kinds = [], set[str]()
+    usual = {column: _from_here(column, words) for column, words in (for_all or {}).items()}
+    _check_names(usual, "options of all rows")
     for number, entry in enumerate(entries, 1):
-        row = _row(path.parent if path.is_file() else path, entry, f"{path}, row {number}", kinds)
+        row = _row(path.parent if path.is_file() else path, entry, f"{path}, row {number}", kinds, usual)
         rows.append(row)
     names = [row.name for row in rows]
     twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
@@ -112,13 +148,14 @@ def _lines(text: bytes, path: Path) -> list[dict[Any, Any]]:
     ]
 
 
-def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Row:
+def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str], usual: Mapping[str, Sequence[str]]) -> Row:
     if None in entry:
         raise UserError(f"{where}: has more cells than the heading has columns; put texts with commas in quotes")
     _check_names(map(str, entry), where)
     cells = {_column(key): _words(value, key, where) for key, value in entry.items()}
-    original = {_column(key): str(key).strip() for key in entry}
+    original = {key: f"--{key}" for key in usual} | {_column(key): str(key).strip() for key in entry}
     cells = {key: words for key, words in cells.items() if words}
+    cells |= {key: [*words] for key, words in usual.items() if not {key, "methods" * (key == "method")} & {*cells}}
     videos = cells.get("video", []) + cells.get("videos", [])
     dataset = cells.get("dataset", [])
     if videos and dataset:
@@ -156,6 +193,11 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str]) -> Ro
     files = [Path(word) for words in (inputs, *options.values()) for word in words if not is_url(word)]
     row = Row(name, tuple(map(tuple, steps)), labels, _memory(cells, inputs, where))
     return with_fingerprint(row, [path for path in files if path.exists()])
+
+
+def _from_here(name: str, words: Sequence[str]) -> list[str]:
+    """The words of an option that was typed: paths are relative to the current folder, not to the table."""
+    return [str(Path(word).resolve()) if name in _PATHS and Path(word).exists() else word for word in words]
 
 
 def _column(name: str) -> str:
@@ -279,10 +321,16 @@ def _steps(inputs: list[str], dataset: bool, methods: Sequence[str], options: di
 
 
 def _typed(key: str, words: list[str]) -> list[str]:
-    """An option as it is typed. A cell with yes or true is a flag without a value; no or false leaves it out."""
-    if [word.lower() for word in words] in (["true"], ["yes"]):
-        return [f"--{key}"]
-    return [] if [word.lower() for word in words] in (["false"], ["no"]) else [f"--{key}", *words]
+    """An option as it is typed. Flags have no value: a cell with yes or true turns one on, no or false turns it off."""
+    if [word.lower() for word in words] not in (["true"], ["yes"], ["false"], ["no"]):
+        return [f"--{key}", *words]
+    is_on = words[0].lower() in ("true", "yes")
+    if key.startswith(("training.", "method.")):  # their flags take a value
+        return [f"--{key}", str(is_on)]
+    if key in _ON:
+        group, dot, flag = key.rpartition(".")
+        return [] if is_on else [f"--{group}{dot}no-{flag}"]
+    return [f"--{key}"] if is_on else []
 
 
 def _check(steps: list[list[str]], where: str, kinds: set[str]) -> None:
