@@ -11,6 +11,7 @@ import pytest
 
 from mien.capture.calibration import CalibratedCamera, match_sources, read_calibration
 from mien.capture.source import list_images
+from mien.cli import main
 from mien.commands.stages import driving
 from mien.commands.stages.batch_table import read_table
 from mien.datasets.live_link_face_take import LIVE_LINK_FACE
@@ -190,6 +191,17 @@ def test_what_systems_leave_is_skipped(
     tmp_path: Path, names: tuple[str, ...], read: Callable[[Path], list[Path]]
 ) -> None:
     assert [path.name for path in read(given(tmp_path / "people", *names))] == list(names)
+
+
+@pytest.mark.parametrize("command", ["create", "capture", "batch"])
+def test_a_workspace_is_no_folder_of_videos(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    """Its films show the avatar, from which no other one is made."""
+    given(tmp_path / "ann", "me.mp4", "runs/headgas/film.mp4")
+    assert main([command, str(tmp_path / "ann"), "--out", str(tmp_path / "out")]) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert "is a workspace" in told
+    assert f"mien train {tmp_path / 'ann'}" in told
+    assert "me.mp4" not in told
 
 
 def test_a_take_with_what_systems_leave_is_recognised(tmp_path: Path) -> None:

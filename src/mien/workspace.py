@@ -87,6 +87,24 @@ class Workspace:
         return _pick("run", name, names, self.root, "--run")
 
 
+def is_workspace(folder: Path) -> bool:
+    """Whether a folder holds captures or runs."""
+    return any((folder / name).is_dir() for name in _FOLDERS)
+
+
+def check_no_workspace(folder: Path) -> None:
+    """Check that a folder of which pictures or videos are wanted is no workspace, whose films show an avatar.
+
+    Raises:
+        UserError: it is one.
+    """
+    if is_workspace(folder):
+        raise UserError(
+            f"{folder}: is a workspace, and not a folder of pictures or videos; give the video that it was made from, "
+            f"or train on its captures: {shlex.join(['mien', 'train', str(folder)])}"
+        )
+
+
 def open_workspace(root: Path) -> Workspace:
     """Open an existing workspace, and check that nothing in it leads out of it.
 

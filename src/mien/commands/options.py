@@ -18,7 +18,7 @@ from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
 from mien.training import MAIN_SETTINGS, NAMED_SPLIT, PRESETS, Split, TrainSettings, doubly_held_out
-from mien.workspace import open_workspace
+from mien.workspace import is_workspace, open_workspace
 
 if TYPE_CHECKING:
     PresetName = str
@@ -328,7 +328,7 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
 
 def holds_pictures(folder: Path) -> bool:
     """Whether a folder is one of pictures, and no workspace."""
-    if not folder.is_dir() or (folder / "sequences").exists() or (folder / "runs").exists():
+    if not folder.is_dir() or is_workspace(folder):
         return False
     from mien.capture.source import list_images
 

@@ -23,6 +23,7 @@ from mien.inside import is_plain_name, listed
 from mien.tables import table_rows, text_of, with_point
 from mien.tracking import ScoringSettings, TrackingSettings
 from mien.training import AlignmentSettings, TrainSettings
+from mien.workspace import check_no_workspace
 
 _MAX_TABLE_BYTES = 64 << 20
 _VIDEOS = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"})
@@ -117,6 +118,7 @@ def read_table(path: Path, for_all: Mapping[str, Sequence[str]] | None = None) -
 
 def _entries(path: Path) -> Iterator[dict[str, Any]]:
     if path.is_dir():
+        check_no_workspace(path)
         for video in (each for each in listed(path) if each.suffix.lower() in _VIDEOS):
             yield {"video": video.name}
         return

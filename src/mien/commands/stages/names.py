@@ -9,6 +9,7 @@ from mien.errors import UserError
 from mien.files import file_digest
 from mien.inside import is_plain_name
 from mien.terminal import plain_name
+from mien.workspace import check_no_workspace
 
 
 def sequence_name(video: Path, name: str | None) -> str:
@@ -78,9 +79,10 @@ def check_videos(videos: Sequence[Path]) -> None:
     """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture.
 
     Raises:
-        UserError: a file is no video, or one that cannot be opened, or a picture.
+        UserError: a file is no video, or one that cannot be opened, or a picture; or a folder is a workspace.
     """
     for video in videos:
+        check_no_workspace(video)
         if video.is_file() and is_picture(video):
             raise UserError(f"{video}: is a picture; give a video, or the folder of a video's pictures")
 
