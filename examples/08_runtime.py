@@ -1,4 +1,4 @@
-"""Load, pose and render a .mien file without torch, by numpy and the native core alone.
+"""Load, pose and render a .mien file with the base install alone: numpy and the native core.
 
 mien export out/examples/subject --out out/examples/avatar.mien
 python examples/08_runtime.py out/examples/avatar.mien --out out/examples/frames
@@ -9,10 +9,10 @@ import math
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from mien import runtime
+from mien.export import png_bytes, to_rgb
 
 
 def main() -> None:
@@ -38,8 +38,7 @@ def main() -> None:
         )
         image, _alpha = avatar.render(gaussians, camera, background=(1, 1, 1))
         seconds += time.perf_counter() - began
-        picture = (image.clip(0, 1)[:, :, ::-1] * 255 + 0.5).astype(np.uint8)
-        cv2.imwrite(str(options.out / f"{frame:06d}.png"), picture)
+        (options.out / f"{frame:06d}.png").write_bytes(png_bytes(to_rgb(image)))
     print(f"wrote {options.out}: {options.frames} pictures, {1000 * seconds / options.frames:.1f} ms per frame")
 
 

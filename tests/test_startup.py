@@ -156,7 +156,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_create_needs_no_package_of_another_extra():
-    missing = {module for module, extra in extras.EXTRA_OF.items() if extra != "create"}
+    missing = {module for module, extra in extras.EXTRA_OF.items() if extra not in ("create", "video")}
     assert "mien.commands.stages.training" in python_without(missing, STAGES).split()
 
 
@@ -177,7 +177,8 @@ WORKING = {
 }
 LACKING = {
     "export {file} --out {out}/me.ply": ("torch", "create"),
-    "render {file} --out {out}/me.mp4": ("av", "create"),
+    "render {file} --out {out}/me.mp4": ("av", "video"),
+    "capture {file} --out {out}/me": ("av", "create"),
     "view {file}": ("viser", "viewer"),
     "demo --out {out}/demo": ("torch", "create"),
 }
@@ -195,6 +196,18 @@ def test_a_file_is_drawn_and_exported_without_any_extra_and_what_is_missing_is_n
         assert (code, told.count("\n")) == (2, 1), told
         assert package in told
         assert f"pip install 'mien[{extra}]'" in told
+
+
+def test_a_film_and_the_example_of_the_runtime_need_no_more_than_pyav(exported: Path, tmp_path: Path):
+    lines = [["render", str(exported), "--out", str(tmp_path / name), "--frames", "3"] for name in ("a.mp4", "a.webm")]
+    ended = json.loads(python_without(set(extras.EXTRA_OF) - {"av"}, LINES, json.dumps(lines)))
+    assert [code for code, _ in ended] == [0, 0], ended
+    head = tmp_path / "head.mien"
+    runtime.write_portable(head, drawn_head(50))
+    example = f"import runpy\nsys.argv[1:] = {[str(head), '--out', str(tmp_path / 'f'), '--frames', '2']}\n"
+    example += f"runpy.run_path({str(ROOT / 'examples' / '08_runtime.py')!r}, run_name='__main__')"
+    assert "2 pictures" in python_without(set(extras.EXTRA_OF), example)
+    assert len(list((tmp_path / "f").glob("*.png"))) == 2
 
 
 def test_a_file_is_viewed_without_torch(exported: Path):

@@ -108,7 +108,7 @@ def _main(arguments: list[str]) -> int:
             return _crash()
         return _complain(f"{error.filename or 'a file'}: {error.strerror}; correct that and run the same command again")
     except ImportError as error:
-        words = missing_package(error)
+        words = missing_package(error, *arguments[:1])
         return _crash() if words is None else _complain(words)
     except Exception:
         return _crash()

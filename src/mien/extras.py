@@ -9,7 +9,7 @@ import sys
 EXTRA_OF = {
     "torch": "create",
     "filelock": "create",
-    "av": "create",
+    "av": "video",
     "cv2": "create",
     "mediapipe": "create",
     "ai_edge_litert": "create",
@@ -37,15 +37,18 @@ PACKAGE_OF = {
     "pxr": "usd-core",
 }
 """Name of a module -> name of its package, if that is another."""
+_OF_FILES = ("render", "view", "drive")
+"""Sub-commands that need nothing but PyAV to write a film of a .mien file. Others need all of `create` soon after."""
 _LAST_PYTHON_OF_MEDIAPIPE = (3, 12)
 _LIBRARY = ": cannot open shared object file"
 
 
-def missing_package(error: ImportError) -> str | None:
+def missing_package(error: ImportError, command: str = "") -> str | None:
     """One line about a package that is missing, with the command that installs it. None if it is none of the extras'.
 
     Args:
         error: What an import raised.
+        command: The sub-command that runs.
     """
     module = (error.name or "").partition(".")[0]
     if _LIBRARY in str(error):
@@ -57,6 +60,8 @@ def missing_package(error: ImportError) -> str | None:
     if module not in EXTRA_OF or not isinstance(error, ModuleNotFoundError):
         return None
     package, extra = PACKAGE_OF.get(module, module), EXTRA_OF[module]
+    if extra == "video" and command not in _OF_FILES:
+        extra = "create"
     if module == "mediapipe" and sys.version_info[:2] > _LAST_PYTHON_OF_MEDIAPIPE:
         here = ".".join(map(str, sys.version_info[:2]))
         return (

@@ -3,7 +3,6 @@
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 from av.sidedata.sidedata import Type as SideDataType
 from av.video.reformatter import Interpolation, VideoReformatter
@@ -134,6 +133,8 @@ def brought_to(
     """Return a picture at a width and height: as it is, shrunk by areas, or enlarged."""
     if (picture.shape[1], picture.shape[0]) == size:
         return picture
+    import cv2  # here, because films are written without OpenCV
+
     shrinks = picture.shape[1] > size[0]
     resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     return resized.astype(np.uint8, copy=False)

@@ -14,7 +14,6 @@ The curve is the same for every frame and every clip, so a face keeps its colour
 
 from functools import cache
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
@@ -54,6 +53,8 @@ class ToneMapper:
 
     def to_srgb(self, picture: UInt16[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Convert a picture of 16-bit non-linear R'G'B' in BT.2020."""
+        import cv2
+
         light = self._light[picture >> (16 - _SIGNAL_BITS)]
         if self._is_hlg:
             luminance = cv2.transform(light, _BT2020_LUMA)
@@ -79,6 +80,8 @@ def narrowed(picture: UInt8[np.ndarray, "h w 3"], primaries: int) -> UInt8[np.nd
 
     The transfer function is taken for that of sRGB, as for all video that is not HDR.
     """
+    import cv2
+
     light = cv2.transform(_light_of_levels()[picture], _WIDE[primaries])
     np.clip(light, 0, 1, out=light)
     return _levels_of_light()[np.rint(light * (_LIGHT_STEPS - 1)).astype(np.uint16)]

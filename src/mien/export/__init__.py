@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mien.export.glb_file import Glb, read_glb
     from mien.export.packed import Motion, pack, unpacked
     from mien.export.page_head import Described
+    from mien.export.pixels import png_bytes, to_rgb
     from mien.export.ply import read_ply, write_ply
     from mien.export.sog import read_sog, write_sog
     from mien.export.spz import read_spz, write_spz
@@ -41,6 +42,7 @@ __all__ = [
     "flame_params_of",
     "in_world",
     "pack",
+    "png_bytes",
     "read_gaussian_avatars_folder",
     "read_glb",
     "read_glb_avatar",
@@ -48,6 +50,7 @@ __all__ = [
     "read_sog",
     "read_spz",
     "read_usd",
+    "to_rgb",
     "unpacked",
     "write_gaussian_avatars_folder",
     "write_glb",

@@ -1,7 +1,8 @@
 """Pictures as files, by the ending of a path: one .png, numbered .png files, .mp4, or .webm.
 
 Transparent pictures have four channels with straight (not premultiplied) colours, because PNG requires that and players
-expect it for the alpha of a VP9 .webm. An .mp4 has no transparency.
+expect it for the alpha of a VP9 .webm. An .mp4 has no transparency. Of the packages of the extras, an .mp4 needs PyAV
+alone.
 """
 
 import itertools
@@ -10,7 +11,6 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from jaxtyping import UInt8
@@ -19,8 +19,7 @@ from mien.capture.video import write_video
 from mien.capture.video_file import create_video
 from mien.errors import UserError
 from mien.export.output import Output
-from mien.picture_files import write_png
-from mien.storage import cannot_write, write_atomically
+from mien.files import cannot_write, write_atomically
 
 _FRINGE = 8
 """Distance in pixels over which colours are spread beyond the opaque part: video halves the resolution of colour."""
@@ -47,6 +46,8 @@ def write_pictures(
         elif output.kind == "webm":
             _write_webm(output, pictures, fps)
         else:
+            from mien.picture_files import write_png
+
             for index, picture in enumerate(pictures):
                 write_png(output.path if output.kind == "still" else output.numbered(index), picture)
     except OSError as error:
@@ -96,6 +97,8 @@ def _spread_colors(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h 
 
     Video keeps colour at half the resolution and blurs it. Without this, black would bleed into outlines.
     """
+    import cv2
+
     alpha = picture[..., 3:].astype(np.float32)
     size = (2 * _FRINGE + 1, 2 * _FRINGE + 1)
     weights = cv2.blur(alpha, size)[..., None]
