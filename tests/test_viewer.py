@@ -83,6 +83,26 @@ def test_random_faces_keep_to_what_was_filmed(session: Session) -> None:
     assert np.abs(limited.face.expression).max() < most < np.abs(session.face.expression).max()
 
 
+def test_a_motion_keeps_a_preset_until_something_else_changes_the_face(session: Session) -> None:
+    smile = session.avatar.expression_names.index("mouthSmileLeft")
+    rest, bounds = session.face.expression[smile], session.avatar.portable.expression_bounds
+    session.take_preset("smile")
+    added = session.face.expression[smile] - rest
+    session.choose("clip")
+    assert session.clip is not None
+    session.play(True, 10.0)
+    session.advance(10.15)
+    clip = session.clip.motion.expression[:, smile]
+    assert (session.playing, session.preset) == (True, "smile")
+    assert session.face.expression[smile] == pytest.approx(min(bounds[smile, 1], clip[1] + added))
+    session.take_preset(None)
+    assert (session.playing, session.face.expression[smile]) == (True, clip[1])
+    for change in (session.rest, lambda: session.set_expression("jawOpen", 0.2)):
+        session.take_preset("smile")
+        change()
+        assert session.preset is None
+
+
 def test_a_motion_plays_by_the_clock(session: Session) -> None:
     assert session.advance(0.0) is None
     session.play(True, 0.0)

@@ -145,6 +145,72 @@ def test_two_clients_see_their_own_views_and_one_may_vanish(serving: Serving, se
     until(lambda: not serving.server.get_clients())
 
 
+def test_the_first_picture_is_that_of_the_filmed_camera(serving: Serving, session: Session) -> None:
+    """The page tells first where viser would stand, far beside the head, and then where it was told to begin."""
+
+    async def talk() -> None:
+        async with connect(serving) as connection:
+            client = Client(connection)
+            await client.look(session, 96, 64, aside=3.0)
+            first = await client.picture(64)
+            await client.look(session, 96, 64)
+            assert np.abs((await client.picture(64)).astype(int) - first).mean() < 2
+            await client.look(session, 96, 64, aside=3.0)
+            assert np.abs((await client.picture(64)).astype(int) - first).mean() > 2
+
+    asyncio.run(talk())
+
+
+def test_a_missing_package_is_named_and_no_bug(
+    session: Session, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def draw(*_: object) -> None:
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+    async def talk(serving: Serving) -> None:
+        async with connect(serving) as connection:
+            await Client(connection).look(session, 96, 64)
+            while not any(one["type"] == "NotificationShowMessage" for one in await Client(connection).told()):
+                pass
+
+    monkeypatch.setattr(session, "picture", draw)
+    with served(session) as serving:
+        asyncio.run(talk(serving))
+        assert len(serving.failures) == 1
+    told = capsys.readouterr().err
+    assert told.count("mien: this needs the package torch, which is not installed; run `pip install") == 1
+    assert "bug" not in told
+
+
+def test_the_panel_says_what_is_shown_and_that_it_waits(avatar: runtime.Avatar) -> None:
+    """Play waits for a motion that loads, and keeps the preset, which any other change takes away."""
+    loads = threading.Event()
+    slow = Session(avatar, None, {"clip": lambda: (loads.wait(PATIENCE_SECONDS), clip_of(avatar))[1]})
+    with served(slow) as running:
+        preset, button = running.panel.preset, running.panel.play_button
+        assert preset is not None
+        assert button is not None
+
+        async def press() -> None:
+            async with connect(running) as connection:
+                update = {"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}}
+                await Client(connection).look(slow, 96, 64)
+                await connection.send(msgspec.msgpack.encode(update))
+                await Client(connection).picture(64)
+
+        slow.take_preset("smile")
+        running.panel.move_sliders()
+        asyncio.run(press())
+        until(lambda: (button.label, button.disabled) == ("Loading ...", True))
+        loads.set()
+        until(lambda: slow.playing)
+        until(lambda: (button.label, button.disabled) == ("Pause", False))
+        assert (slow.preset, preset.value) == ("smile", "smile")
+        slow.rest()
+        running.panel.move_sliders()
+        assert preset.value == "none"
+
+
 def test_strangers_get_nothing(serving: Serving) -> None:
     cookie = serving.door.cookie
     status, headers, _ = request(serving.port, Cookie=cookie)

@@ -158,11 +158,7 @@ def _run(name: str, rest: list[str]) -> int:
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
-    for_all = None
-    if name == "batch":
-        from mien.commands.stages.batch_table import for_all_rows
-
-        rest, for_all = for_all_rows(rest)
+    rest, for_all = _for_all_rows(name, rest)
     for option in list_options(module.Command):
         if sum(argument.partition("=")[0].replace("_", "-") == option for argument in rest) > 1:
             # The first of its values would be dropped without a word.
@@ -202,14 +198,22 @@ def _run(name: str, rest: list[str]) -> int:
         raise UserError(f"{complaint}; see mien {name} --help{every}") from None
     sys.stderr.write(printable(complaints.getvalue(), lines=True))
     asked_threads()
-    if for_all:
-        command = replace(command, for_all=for_all)
+    command = replace(command, for_all=for_all) if for_all else command
     command.check()
     with orderly_stops():
         use_one_torch_thread()
         _check_instruction_set()
         command.run()
     return 0
+
+
+def _for_all_rows(name: str, rest: list[str]) -> tuple[list[str], dict[str, list[str]]]:
+    """The arguments of a sub-command, and the options of `mien create` that `mien batch` takes for all rows."""
+    if name != "batch":
+        return rest, {}
+    from mien.commands.stages.batch_table import for_all_rows
+
+    return for_all_rows(rest)
 
 
 def _check_instruction_set() -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mien.viewer.drawing import Look, Mesh, View
     from mien.viewer.following import CameraSwitch
     from mien.viewer.loop import DrawingLoop
-    from mien.viewer.server import serve
+    from mien.viewer.server import address_of, listen, serve
     from mien.viewer.session import Clip, Seen, Session
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
@@ -28,6 +28,8 @@ __all__ = [
     "Seen",
     "Session",
     "View",
+    "address_of",
     "is_loopback",
+    "listen",
     "serve",
 ]

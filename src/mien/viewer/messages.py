@@ -60,12 +60,13 @@ class Gate:
     """Lets the messages through that a viewer expects."""
 
     def __init__(self) -> None:
-        """Make a gate that is closed: it drops everything until `open`."""
+        """Make a gate that is closed: messages wait until `open`, and nothing else passes."""
         self._control: Callable[[str], Any] = lambda uuid: None
+        self.is_open = False
 
     def open(self, gui: viser.GuiApi) -> None:
         """Let messages through from now on, for the controls of `gui`."""
-        self._control = gui._gui_input_handle_from_uuid.get
+        self._control, self.is_open = gui._gui_input_handle_from_uuid.get, True
 
     def checked(self, message: bytes | str) -> bytes | None:
         """The message with checked values, or None if it is dropped."""

@@ -22,7 +22,7 @@ MAX_ANGLE = 0.5
 """Largest angle of a joint's slider, in radians."""
 _STEP = 0.01
 _AXES = ("nod", "turn", "tilt")
-_NOTHING = "none"
+_NOTHING, _LOADING = "none", "Loading ..."
 _LEAST_HEIGHT, _MOST_HEIGHT = 128, 1080
 _MOST_STILLS = 8
 """Number of browsers whose screenshots may wait."""
@@ -61,9 +61,10 @@ class Panel:
         self._time: viser.GuiSliderHandle[int] | None = None
         self._report: viser.GuiMarkdownHandle | None = None
         self._followed_at, self._stopping = 0.0, False
-        self._play: viser.GuiButtonHandle | None = None
-        self._play_asked = False
-        """Whether Play was pressed before a motion was there."""
+        self.play_button: viser.GuiButtonHandle | None = None
+        self._play_asked = self._loading = False
+        """Whether Play was pressed before a motion was there, and whether one is being loaded."""
+        self.preset: viser.GuiDropdownHandle[str] | None = None
         self._stills = Worker("mien-stills", failed, _MOST_STILLS)
         self._videos = Worker("mien-videos", failed, most=0)
         self._motions, self._switching = Worker("mien-motions", failed), Worker("mien-camera", failed)
@@ -111,12 +112,19 @@ class Panel:
         if self._time is not None:
             self._time.value = self._session.timestep
         self._name_play()
+        self._name_preset()
 
     def _name_play(self) -> None:
-        """Let the button say what it does: play or pause."""
-        label = "Pause" if self._session.playing else "Play"
-        if self._play is not None and self._play.label != label:
-            self._play.label = label
+        """Let the button say what it does: play or pause, or that it waits."""
+        label = _LOADING if self._loading else "Pause" if self._session.playing else "Play"
+        if self.play_button is not None and self.play_button.label != label:
+            self.play_button.label, self.play_button.disabled = label, self._loading
+
+    def _name_preset(self) -> None:
+        """Let the preset be the one that is shown."""
+        shown = _NOTHING if self._session.preset is None else readable(self._session.preset)
+        if self.preset is not None and self.preset.value != shown:
+            self.preset.value = shown
 
     def _add_camera(self, camera: CameraSwitch) -> None:
         gui, session = self._server.gui, self._session
@@ -156,31 +164,36 @@ class Panel:
             last = 1 if clip is None else max(1, len(clip.motion) - 1)
             timeline = self._time = gui.add_slider("Frame", 0, last, 1, 0)
             filmed = gui.add_checkbox("Filmed frame beside it", False)
-        self._play = play
+        self.play_button = play
         before = [first]
 
         def choose(name: str, client: viser.ClientHandle | None) -> None:
-            if name == before[0]:
-                return
             try:
-                session.choose(None if name == _NOTHING else name)
-            except UserError as error:
-                self._play_asked = False
-                self._complain(client, str(error))
+                if name != before[0]:
+                    session.choose(None if name == _NOTHING else name)
+                before[0] = name
+                if self._play_asked and session.clip is not None:
+                    session.play(True, time.monotonic())
+                timeline.max = max(1, len(session.clip.motion) - 1) if session.clip else 1
+            except (UserError, ImportError) as error:
                 if chosen.value == name:
                     chosen.value = before[0]
-                return
-            before[0] = name
-            if self._play_asked and session.clip is not None:
-                session.play(True, time.monotonic())
-            self._play_asked = False
-            timeline.max = max(1, len(session.clip.motion) - 1) if session.clip else 1
-            self.move_sliders()
+                if isinstance(error, ImportError):
+                    raise
+                self._complain(client, str(error))
+            finally:
+                self._play_asked = self._loading = False
+                self.move_sliders()
+
+        def load(client: viser.ClientHandle | None) -> None:
+            name = chosen.value
+            self._loading = name not in (_NOTHING, before[0])
+            self._name_play()
+            self._motions.ask("motion", lambda: choose(name, client))
 
         @chosen.on_update
         async def _(event: Any) -> None:
-            name = chosen.value
-            self._motions.ask("motion", lambda: choose(name, event.client))
+            load(event.client)
 
         @play.on_click
         async def _(event: Any) -> None:
@@ -189,8 +202,7 @@ class Panel:
                 self._play_asked = True
                 if chosen.value == _NOTHING:
                     chosen.value = session.clip_names[0]
-                name = chosen.value
-                self._motions.ask("motion", lambda: choose(name, event.client))
+                load(event.client)
                 return
             session.play(not session.playing, time.monotonic())
             self.move_sliders()
@@ -211,6 +223,7 @@ class Panel:
             avatar = session.avatar
             names = {readable(name): name for name in runtime.presets_for(avatar.expression_names, avatar.joint_names)}
             preset = gui.add_dropdown("Preset", (_NOTHING, *names), initial_value=_NOTHING) if names else None
+        self.preset = preset
 
         @rest.on_click
         async def _(event: Any) -> None:
@@ -226,11 +239,9 @@ class Panel:
 
             @preset.on_update
             async def _(event: Any) -> None:
-                if preset.value == _NOTHING:
-                    session.rest()
-                else:
-                    session.take_preset(names[preset.value])
-                self.move_sliders()
+                if event.client is not None:
+                    session.take_preset(names.get(preset.value))
+                    self.move_sliders()
 
     def _add_expressions(self) -> None:
         gui, portable = self._server.gui, self._session.avatar.portable
@@ -282,6 +293,8 @@ class Panel:
         async def _(event: Any) -> None:
             if event.client is not None:
                 take(slider.value)
+                self._name_play()
+                self._name_preset()
 
     def _add_picture(self) -> None:
         gui, session = self._server.gui, self._session

@@ -1,5 +1,6 @@
 """The viewer's server: viser shows our pictures behind its controls, and `mien.viewer.access` guards every request."""
 
+import asyncio
 import contextlib
 import errno
 import http.client
@@ -10,6 +11,7 @@ import socket
 import threading
 import warnings
 from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from mien.errors import UserError
+from mien.extras import missing_package
 from mien.terminal import tell
 from mien.viewer.access import HEADERS, Door
 from mien.viewer.drawing import View
@@ -41,7 +44,7 @@ _TRY_AGAIN_LATER = 1013
 """Code with which a WebSocket closes."""
 _CLOSE_SECONDS = 1.0
 """Time that a browser has to answer when its connection is closed, in seconds."""
-_WATCH_SECONDS = 0.5
+_WATCH_SECONDS, _GATE_SECONDS = 0.5, 0.02
 
 
 def serve(
@@ -51,6 +54,7 @@ def serve(
     title: str,
     ready: Callable[[str], None],
     camera: CameraSwitch | None = None,
+    listener: socket.socket | None = None,
 ) -> None:
     """Show a session to browsers until Ctrl-C or SIGTERM, or until its camera ends.
 
@@ -61,11 +65,12 @@ def serve(
         title: Name of the avatar.
         ready: Is called with the address, as soon as browsers can open it.
         camera: What lets the avatar follow a camera, if there is one.
+        listener: What `listen` returned for the host and the port, if browsers may wait there already.
 
     Raises:
         UserError: the host or the port cannot be used, or the camera fails.
     """
-    serving = Serving(session, door, port, title, camera)
+    serving = Serving(session, door, port, title, camera, listener)
     try:
         ready(serving.address)
         serving.wait()
@@ -76,7 +81,15 @@ def serve(
 class Serving:
     """A server that runs."""
 
-    def __init__(self, session: Session, door: Door, port: int, title: str, camera: CameraSwitch | None = None) -> None:
+    def __init__(
+        self,
+        session: Session,
+        door: Door,
+        port: int,
+        title: str,
+        camera: CameraSwitch | None = None,
+        listener: socket.socket | None = None,
+    ) -> None:
         """Start the server; the arguments are those of `serve`."""
         self._camera = camera
         self.door = door
@@ -84,15 +97,13 @@ class Serving:
         """The first failures of requests of browsers. Each is a bug, and the viewer goes on."""
         self._failing = threading.Lock()
         gate = Gate()
-        chosen = _free_port(door.host, port)
+        listener = listener or listen(door.host, port)
+        self.port = int(listener.getsockname()[1])
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
-        with _quiet(), _guarded(door, gate):
-            self.server = viser.ViserServer(host=door.host, port=chosen, label="mien", verbose=False)
+        with _quiet(), _guarded(door, gate, listener):
+            self.server = viser.ViserServer(host=door.host, port=self.port, label="mien", verbose=False)
         try:
-            self.port = self.server.get_port()
-            if port and self.port != port:
-                raise _taken(port)
             _check_guard(door.host, self.port)
             # viser could pass this server on through a machine of its makers.
             self.server.request_share_url = lambda verbose=True: None
@@ -104,8 +115,7 @@ class Serving:
             with _quiet():
                 self.server.stop()
             raise
-        shown = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
-        self.address = door.address(shown, self.port)
+        self.address = address_of(door, listener)
 
     def wait(self) -> None:
         """Wait until the camera ends, or the loop fails, which is a bug. Ctrl-C and SIGTERM end the wait, too."""
@@ -145,6 +155,16 @@ class Serving:
 
     def _failed(self, error: BaseException) -> None:
         """Tell that something could not be done for a browser, and go on for the others."""
+        words = missing_package(error, "view") if isinstance(error, ImportError) else None
+        if words is not None:
+            with self._failing:
+                is_new = words not in self.failures
+                self.failures += [words] * is_new
+            if is_new:
+                tell(f"mien: {words}")
+                for client in self.server.get_clients().values():
+                    client.add_notification("mien", words, color="red")
+            return
         words = f"{type(error).__name__}: {error}"
         with self._failing:
             if len(self.failures) < _MOST_TOLD:
@@ -170,14 +190,20 @@ class Serving:
                 view = view_of(client.camera)
                 words.content = self.session.words(view)
 
+        is_first = True
+
         async def look(camera: viser.CameraHandle) -> None:
+            nonlocal is_first
             view = view_of(camera)
+            if is_first:
+                # The page has not taken the camera yet that it is told to begin with. Its own is far beside the head.
+                view = replace(view, viewmat=self.session.avatar.camera.viewmat.astype(np.float64))
+            is_first = False
             if is_possible(view):
                 self.loop.look(client.client_id, view)
 
         self.loop.add(client.client_id, show)
         client.camera.on_update(look)
-        await look(client.camera)
 
     async def _forget(self, client: viser.ClientHandle) -> None:
         self.loop.remove(client.client_id)
@@ -197,18 +223,23 @@ def is_possible(view: View) -> bool:
     return view.width > 0 and view.height > 0
 
 
-def _free_port(host: str, port: int) -> int:
-    """The port, or a free one if it is 0. viser would silently take the next one, or wait for ever.
+def listen(host: str, port: int) -> socket.socket:
+    """Listen at a port, or at a free one if it is 0. Browsers that connect wait until a server takes the socket.
 
     Raises:
         UserError: the port is taken or not allowed, or the host is none of this machine.
     """
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(place)
-            return int(probe.getsockname()[1])
+        listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(place)
+            listener.listen(MOST_BROWSERS)
+        except OSError:
+            listener.close()
+            raise
+        return listener
     except (OSError, UnicodeError) as error:
         number = getattr(error, "errno", None)
         if number == errno.EADDRINUSE:
@@ -218,6 +249,12 @@ def _free_port(host: str, port: int) -> int:
         raise UserError(
             f"--host {host}: is no address of this machine; give one of its addresses, or 0.0.0.0 for all"
         ) from None
+
+
+def address_of(door: Door, listener: socket.socket) -> str:
+    """The address that people open to reach a socket."""
+    host = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
+    return door.address(host, int(listener.getsockname()[1]))
 
 
 def _taken(port: int) -> UserError:
@@ -232,8 +269,8 @@ def _quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _guarded(door: Door, gate: Gate) -> Iterator[None]:
-    """Let servers that start inside ask the door about each request, and the gate about each message.
+def _guarded(door: Door, gate: Gate, listener: socket.socket) -> Iterator[None]:
+    """Let servers that start inside listen at a socket, and ask the door about each request, the gate about messages.
 
     viser has no place for that.
     """
@@ -245,13 +282,17 @@ def _guarded(door: Door, gate: Gate) -> Iterator[None]:
 
         async def recv(self, decode: bool | None = None) -> Any:
             while True:
-                message = gate.checked(await super().recv(decode))
+                received = await super().recv(decode)
+                while not gate.is_open:  # a browser that has waited for the avatar may be sooner than the controls
+                    await asyncio.sleep(_GATE_SECONDS)
+                message = gate.checked(received)
                 if message is not None:
                     return message
 
     def guarded(
         handler: Callable[[Any], Awaitable[None]],
-        *arguments: Any,
+        host: str,
+        port: int,
         process_request: Callable[[Any, Request], Response | None],
         **named: Any,
     ) -> Any:
@@ -265,7 +306,7 @@ def _guarded(door: Door, gate: Gate) -> Iterator[None]:
             return response
 
         named |= {"create_connection": Connection, "max_size": MOST_BYTES, "close_timeout": _CLOSE_SECONDS}
-        return start(_at_most(MOST_BROWSERS, handler), *arguments, process_request=process, **named)
+        return start(_at_most(MOST_BROWSERS, handler), sock=listener, process_request=process, **named)
 
     module.serve = guarded
     try:

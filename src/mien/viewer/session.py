@@ -78,6 +78,7 @@ class Session:
         self._version = 0
         self._clip: Clip | None = None
         self._chosen: str | None = None
+        self._preset: str | None = None
         self._timestep = 0
         self._playing_since: float | None = None
         """Time at which timestep 0 was due, or None if nothing plays."""
@@ -114,6 +115,11 @@ class Session:
     def playing(self) -> bool:
         """Whether the motion plays."""
         return self._playing_since is not None
+
+    @property
+    def preset(self) -> str | None:
+        """The preset face that is shown, alone or with a motion. None after any other change of the face."""
+        return self._preset
 
     @property
     def face(self) -> Face:
@@ -161,9 +167,15 @@ class Session:
         """Show the person at rest."""
         self._take(self.avatar.face())
 
-    def take_preset(self, preset: str) -> None:
-        """Show a preset face that the avatar has (`mien.runtime.presets_for`)."""
-        self._take(self.avatar.face({preset: 1.0}))
+    def take_preset(self, preset: str | None) -> None:
+        """Show a preset face that the avatar has (`mien.runtime.presets_for`), or none.
+
+        A motion that is chosen keeps it, and goes on if it plays.
+        """
+        with self._lock:
+            self._preset = preset
+            self._face = self._face_at(self._timestep)
+            self._change()
 
     def take_random(self, random: np.random.Generator) -> None:
         """Show a random face, softly within what was filmed if that is known."""
@@ -190,14 +202,15 @@ class Session:
         with self._lock:
             self._clip, self._chosen, self._playing_since = clip, name, None
             self._timestep = 0
-            self._take(self.avatar.face() if clip is None else clip.motion.face(0))
+            self.take_preset(self._preset)
 
     def seek(self, timestep: int) -> None:
         """Show a timestep of the motion, and pause."""
         with self._lock:
             if self._clip is not None:
                 self._timestep = min(max(timestep, 0), len(self._clip.motion) - 1)
-                self._take(self._clip.motion.face(self._timestep))
+                self._playing_since = None
+                self.take_preset(self._preset)
 
     def play(self, playing: bool, now: float) -> None:
         """Play the motion from the timestep that is shown, again and again, or pause it."""
@@ -205,6 +218,7 @@ class Session:
             if self._clip is None or not playing:
                 self._playing_since = None
             else:
+                self._face = self._face_at(self._timestep)
                 self._playing_since = now - self._timestep / self._clip.motion.fps
             self._change()
 
@@ -218,7 +232,7 @@ class Session:
             steps = int((now - self._playing_since) * motion.fps + 5e-7 * motion.fps)
             timestep = steps % len(motion)
             if timestep != self._timestep:
-                self._timestep, self._face = timestep, motion.face(timestep)
+                self._timestep, self._face = timestep, self._face_at(timestep)
                 self._change()
             return self._playing_since + (steps + 1) / motion.fps
 
@@ -271,7 +285,7 @@ class Session:
                 timestep = self._timestep
             else:
                 assert clip is not None, "there is no motion"
-                face = clip.motion.face(timestep)
+                face = self._face_at(timestep)
         wide, high = view.sized(most)
         if not full:
             wide, high = max(1, wide // 2), max(1, high // 2)
@@ -301,8 +315,20 @@ class Session:
 
     def _take(self, face: Face) -> None:
         with self._lock:
-            self._playing_since, self._face = None, face
+            self._playing_since, self._preset, self._face = None, None, face
             self._change()
+
+    def _face_at(self, timestep: int) -> Face:
+        """The face of the motion at a timestep, or the person at rest, with the preset face added."""
+        avatar, face = self.avatar, self.avatar.face() if self._clip is None else self._clip.motion.face(timestep)
+        if self._preset is None:
+            return face
+        rest, posed = avatar.face(), avatar.face({self._preset: 1.0})
+        if self._clip is None:
+            return posed
+        low, high = avatar.portable.expression_bounds.T
+        expression = np.clip(face.expression + posed.expression - rest.expression, low, high)
+        return replace(face, expression=expression, joints=face.joints + posed.joints - rest.joints)
 
     def _change(self) -> None:
         self._version += 1

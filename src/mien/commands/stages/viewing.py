@@ -19,7 +19,7 @@ from mien.progress import say
 from mien.runtime import MeshBound, PortableAvatar, read_portable
 from mien.stops import Terminated
 from mien.system import PARENT_VARIABLE, end_this_process
-from mien.viewer import CameraSwitch, Door, Mesh, Session, is_loopback, serve
+from mien.viewer import CameraSwitch, Door, Mesh, Session, address_of, is_loopback, listen, serve
 
 if TYPE_CHECKING:
     import mien.face
@@ -63,9 +63,30 @@ class Motions:
 
 
 def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Place, follow: bool = False) -> None:
-    """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes."""
+    """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes.
+
+    The address is told at once. Browsers that open it wait until the avatar is loaded.
+    """
     door = Door.of(place.host, place.token)
-    viewed = open_viewed(avatar, run)
+    with contextlib.closing(listen(place.host, place.port)) as listener:
+        viewed = viewed_file(avatar) if avatar.is_file() else None  # takes no time, unlike the run of a workspace
+        say(f"Open {address_of(door, listener)} in a browser; Ctrl-C ends the viewer")
+        try:
+            viewed = viewed or open_viewed(avatar, run)
+            session = _session(viewed, motions)
+            if follow:
+                threading.Thread(target=follow_file, args=(session, avatar), daemon=True).start()
+            camera, name = _camera_switch(session, viewed, place), viewed.portable.about.name
+            serve(session, door, place.port, name, lambda address: None, camera, listener)
+        except KeyboardInterrupt:
+            say("The viewer is closed")
+        except Terminated as stop:
+            # Nothing continues later. A training ends its viewer in this way, and says so itself.
+            raise SystemExit(stop.code) from None
+
+
+def _session(viewed: Viewed, motions: Motions) -> Session:
+    """What browsers share: the avatar, and the motions that it may play."""
     clips = {}
     if viewed.sequences or motions.play is not None:
         from mien.commands.stages.viewing_motions import clip_of
@@ -74,23 +95,10 @@ def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Pl
         if motions.play is not None:
             clips[Path(motions.play).name] = clip_of(viewed, Path(motions.play), None, motions.neutral)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
-
     if motions.play is not None and motions.at_once:
         session.choose(Path(motions.play).name)
         session.play(True, time.monotonic())
-
-    def ready(address: str) -> None:
-        say(f"Open {address} in a browser; Ctrl-C ends the viewer")
-
-    if follow:
-        threading.Thread(target=follow_file, args=(session, avatar), daemon=True).start()
-    try:
-        serve(session, door, place.port, viewed.portable.about.name, ready, _camera_switch(session, viewed, place))
-    except KeyboardInterrupt:
-        say("The viewer is closed")
-    except Terminated as stop:
-        # Nothing continues later. A training ends its viewer in this way, and says so itself.
-        raise SystemExit(stop.code) from None
+    return session
 
 
 def open_viewed(avatar: Path, run: str | None) -> Viewed:
