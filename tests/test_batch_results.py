@@ -61,9 +61,13 @@ def test_results_have_all_figures_and_paired_differences(tmp_path: Path):
 @pytest.mark.slow
 def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
     batch = Batch(tmp_path)
+    (tmp_path / "rows" / "ann").mkdir(parents=True)
+    (tmp_path / "rows" / "ann" / "me.html").touch()
     write_wall(batch, scored(batch))
     page = (tmp_path / "index.html").read_text()
     assert page.index('data-psnr="30.0"') < page.index('data-psnr="31.0"') < page.index('data-psnr="33.0"')
+    assert page.count('<a href="rows/ann/me.html">alive</a>') == 2  # it has two runs
+    assert "rows/bob/me.html" not in page
     assert "&lt;b&gt;no face" in page
     assert "<b>no face" not in page
     assert "PSNR 30.00 dB" in page

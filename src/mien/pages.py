@@ -11,6 +11,9 @@ from importlib.resources import files
 import jinja2
 from markupsafe import Markup, escape
 
+LIVING_PAGE = "me.html"
+"""Name of the living avatar's page in a workspace."""
+
 
 def render(template: str, **content: object) -> Markup:
     """HTML from a template, which is named by its path in `mien`. Text in `content` is escaped, `Markup` is not."""

@@ -7,7 +7,7 @@ from mien.batch.plan import Batch
 from mien.batch.results import DIGITS, HIGHER, paired
 from mien.files import write_atomically
 from mien.metric_names import COLUMNS
-from mien.pages import render
+from mien.pages import LIVING_PAGE, render
 from mien.terminal import counted
 
 _HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}
@@ -41,12 +41,14 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
 
 def _card(batch: Batch, row: dict[str, Any]) -> dict[str, Any]:
     thumbnail = f"thumbs/{row['name']}.{row['run']}.jpg"
+    page = f"rows/{row['name']}/{LIVING_PAGE}"
     report = f"rows/{row['name']}/runs/{row['run']}/report.html"
     figures = {name: row[name] for name in HIGHER if isinstance(row.get(name), int | float)}
     return {
         "name": row["name"],
         "run": row["run"],
         "thumbnail": thumbnail if (batch.root / thumbnail).is_file() else None,
+        "page": page if (batch.root / page).is_file() else None,
         "report": report if (batch.root / report).is_file() else None,
         "figures": figures,
         "words": [_figure(name, value) for name, value in figures.items()],

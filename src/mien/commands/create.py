@@ -84,7 +84,7 @@ class Command:
         from mien.commands.stages.capturing import check_camera_ids
         from mien.commands.stages.face_models import face_model_of
         from mien.commands.stages.names import doubled_videos, run_name, sequence_names
-        from mien.commands.stages.showing import name_next_commands, show_avatar
+        from mien.commands.stages.showing import name_next_commands, show_film
         from mien.commands.stages.tracking import check_masks
         from mien.progress import say, whole_command
         from mien.training import check_run, check_untouched
@@ -107,7 +107,7 @@ class Command:
                 say(f"warning: {warning}")
         with whole_command(self._overall(settings)):
             self._run_stages(workspace, run, method, settings)
-        show_avatar(workspace, run)
+        show_film(workspace, run)
         say(f"Done in {time.monotonic() - began:.0f} s.")
         name_next_commands(workspace, run)
 
@@ -141,6 +141,7 @@ class Command:
         from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
         from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.commands.stages.names import sequence_names
+        from mien.commands.stages.showing import show_page
         from mien.commands.stages.tracking import run_tracking_stage, show_trackings
         from mien.commands.stages.training import run_training_stage
         from mien.evaluation import EvaluationSettings
@@ -177,6 +178,7 @@ class Command:
             run_alignment_stage(workspace, together, self.alignment, settings, keep=True)
         show_trackings(workspace, list(trackings), self.overlay)
         run_training_stage(workspace, together, run, method, settings, self.view)
+        show_page(workspace, run)
         if settings.holds_out:
             # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all the rest of scoring.
             run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)

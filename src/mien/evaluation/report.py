@@ -34,7 +34,7 @@ from mien.evaluation.page import (
 )
 from mien.evaluation.protocols import Evaluation
 from mien.metric_names import COLUMNS
-from mien.pages import render
+from mien.pages import LIVING_PAGE, render
 from mien.storage import write_atomically
 from mien.training.footage import Coverage
 
@@ -84,7 +84,8 @@ def write_report(
     first = next(iter(results.values()), None)
     hero = sections.hero(alive, path.parent / FILM, first) if alive is not None and first is not None else None
     shown = {name: video.on_page(path.parent) for name, video in videos.items()}
-    text = report_html(run, protocols, results, shown, driven, hero)
+    page = f"../../{LIVING_PAGE}" if (path.parent / "../.." / LIVING_PAGE).is_file() else None
+    text = report_html(run, protocols, results, shown, driven, hero, page)
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
@@ -95,8 +96,9 @@ def report_html(
     videos: Mapping[str, Video] = MappingProxyType({}),
     driven: sections.CrossSection | None = None,
     hero: sections.Hero | None = None,
+    page: str | None = None,
 ) -> str:
-    """The page as text. `videos` holds a video by protocol."""
+    """The page as text. `videos` holds a video by protocol, and `page` is the address of the living avatar's page."""
     command_line = _shortened(run.config["command_line"])
     first = next(iter(results.values()), None)
     shown = [
@@ -116,6 +118,7 @@ def report_html(
         version=run.config["mien"],
         command=shlex.join(command_line),
         hero=hero,
+        page=page,
         tiles=_tiles(run, protocols),
         tables=_tables(protocols),
         glossary=_glossary(protocols),

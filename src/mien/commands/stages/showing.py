@@ -11,21 +11,19 @@ from mien.errors import UserError
 from mien.evaluation.living import FILM, living, write_film
 from mien.export import Motion, write_page
 from mien.files import write_atomically
+from mien.pages import LIVING_PAGE
 from mien.progress import say
 from mien.training import read_coverage, read_run_config, run_camera
 from mien.workspace import Workspace
 
-PAGE, MOVIE = "me.html", "me.mp4"
-"""Names of the page and the film in the workspace."""
+MOVIE = "me.mp4"
+"""Name of the film in the workspace."""
 _SECONDS = 8.0
 """Length of the filmed motion that the page plays, in seconds."""
 
 
-def show_avatar(workspace: Workspace, run: str) -> None:
-    """Write DIR/me.html and DIR/me.mp4 of a run.
-
-    An avatar that may not be passed on, or that pages cannot draw, gets no page, with a message.
-    """
+def show_film(workspace: Workspace, run: str) -> None:
+    """Write DIR/me.mp4 of a run."""
     root, run_dir = workspace.root, workspace.run_dir(run)
     try:
         film = run_dir / FILM
@@ -40,12 +38,20 @@ def show_avatar(workspace: Workspace, run: str) -> None:
             say(f"{root / MOVIE}: five seconds of the avatar")
     except UserError as error:
         say(f"no film: {error}")
+
+
+def show_page(workspace: Workspace, run: str) -> None:
+    """Write DIR/me.html of a run. The report links it, so it comes first.
+
+    An avatar that may not be passed on, or that pages cannot draw, gets no page, with a message.
+    """
+    root, run_dir = workspace.root, workspace.run_dir(run)
     try:
         content = RunContent(workspace, run, (), Series(read_run_config(run_dir)["data"][0]["sequence"]))
         page = write_page(
-            root / PAGE, content.portable(confidence=False, soft_cut=True), _first_seconds(content.motion())
+            root / LIVING_PAGE, content.portable(confidence=False, soft_cut=True), _first_seconds(content.motion())
         )
-        say(f"{root / PAGE}: the living avatar, {page.size / 1e6:.1f} MB; open it in a browser, or send it")
+        say(f"{root / LIVING_PAGE}: the living avatar, {page.size / 1e6:.1f} MB; open it in a browser, or send it")
     except UserError as error:
         say(f"no page: {error}")
 
