@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import torch
 from mien import extras, runtime
 from mien.avatar import make_portable
 from mien.cli import COMMANDS, main
+from mien.export import pack, write_page
 from mien.export.pixels import png_bytes
 from mien.licences.spdx import requirements_of
 from mien.render import camera_paths as torchs
@@ -249,6 +251,26 @@ def test_paths_around_a_head_are_those_of_the_training_side():
     ]
     for own, other in pairs:
         np.testing.assert_allclose(own.viewmat, other.viewmat.numpy(), atol=2e-6)
+
+
+def test_a_head_that_the_filmed_frame_cuts_off_is_shown_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With --zoom, the picture is what the camera saw."""
+    head, file = drawn_head(500), tmp_path / "me.mien"
+    near = camera_paths.fitted(head.camera, head.camera.width, head.camera.height, 1.6)
+    for camera, cut in ((head.camera, False), (near, True)):
+        runtime.write_portable(file, replace(head, camera=camera))
+        for zoom in ([], ["--zoom", "1"]):
+            line = ["render", str(file), "--out", str(tmp_path / "a.png"), "--size", "64", *zoom]
+            assert main(line) == 0
+            picture = cv2.imread(str(tmp_path / "a.png"))
+            assert picture is not None
+            edges = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+            assert bool(edges.min() < 200) is (cut and bool(zoom))
+            assert picture.min() < 150
+    packed = []
+    monkeypatch.setattr("mien.export.web_page.pack", lambda avatar, *rest: packed.append(avatar) or pack(avatar, *rest))
+    write_page(tmp_path / "me.html", replace(head, camera=near))
+    assert packed[-1].camera.K[0, 0] < near.K[0, 0]
 
 
 def test_a_file_refuses_what_only_a_run_has(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -68,7 +68,8 @@ class Command:
     pitch: float = 0.0
     """The same upwards, or downwards if negative."""
     zoom: float | None = None
-    """Magnification. 1 shows what the camera saw in training (default: 1, and on a sheet as much as the head fits)."""
+    """Magnification. 1 shows what the camera saw in training (default: 1, or less if that cuts off the head; on a sheet
+    as much as the head fits)."""
     sequence: str | None = None
     """Name of a sequence whose motion the avatar plays, one frame per timestep (`mien drive` can do more)."""
     own_motion: bool = False
@@ -106,7 +107,7 @@ class Command:
             return
         from mien.avatar import load_avatar, move_avatar
         from mien.commands.expression import tell_of_unfilmed, with_expression
-        from mien.commands.stages.pictures import draw, posed_softly, warn_of_white
+        from mien.commands.stages.pictures import draw, posed_softly, warn_of_white, whole
         from mien.export.pictures import write_pictures
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
@@ -139,7 +140,9 @@ class Command:
                 say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
             return
         if cameras is None:
-            cameras = self._path(self._camera(run_dir, subject), subject.head_translation[0], self._frames(timesteps))
+            first = whole(self._camera(run_dir, subject), posed_softly(avatar)(face[0])) if self.zoom is None else None
+            first = first or self._camera(run_dir, subject)
+            cameras = self._path(first, subject.head_translation[0], self._frames(timesteps))
         like = like_on(choose_device(self.device))
         move_avatar(avatar, like)
         face = face.to(like)
@@ -210,9 +213,7 @@ class Command:
         from mien.commands.stages.file_pictures import View, render_file
 
         frames = self._frames(None)
-        view = View(
-            self.yaw, self.pitch, self._magnification, lambda camera, center: self._file_path(camera, center, frames)
-        )
+        view = View(self.yaw, self.pitch, self.zoom, lambda camera, center: self._file_path(camera, center, frames))
         render_file(self.workspace, self.picture.plan(self._output, frames), self.picture, self.set, view, self.fps)
 
     def _file_path(

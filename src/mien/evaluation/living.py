@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from mien import runtime
 from mien.avatar import Avatar, make_portable
@@ -13,6 +13,7 @@ from mien.camera import Camera
 from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.progress import track_progress
+from mien.runtime.camera_paths import fitted, zoom_for_all
 from mien.runtime.filmed import head_angles
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training.footage import Coverage, filmed_yaws
@@ -119,14 +120,19 @@ def yaws_of(avatar: runtime.Avatar, reached: tuple[int, int] | None) -> tuple[fl
 
 
 def near_camera(avatar: runtime.Avatar, yaws: tuple[float, float]) -> runtime.Camera:
-    """`Living.camera`. It is never further away than the view of the training."""
-    camera = avatar.camera.square(SIDE)
+    """`Living.camera`. It shows no more than the view of the training, unless that cuts the head off."""
+    square = avatar.camera.square(SIDE)
     turned = [
         avatar.pose(head_rotation=turned_head(avatar, yaw, pitch))
         for yaw in (*yaws, 0.0)
         for pitch in (-_MOST_PITCH, _MOST_PITCH)
     ]
-    shown = np.any([avatar.render(gaussians, camera)[1] > 0.1 for gaussians in turned], axis=0)
+
+    def drawn(zoom: float) -> Bool[np.ndarray, "h w"]:
+        return np.any([avatar.render(one, fitted(square, SIDE, SIDE, zoom))[1] > 0.1 for one in turned], axis=0)
+
+    zoom = zoom_for_all(drawn)
+    camera, shown = fitted(square, SIDE, SIDE, zoom), drawn(zoom)
     rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
     if not len(rows):
         return camera

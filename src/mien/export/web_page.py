@@ -7,7 +7,7 @@ import base64
 import html
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from mien.export.page_head import Described, head_part, write_poster
 from mien.export.thinning import fitted
 from mien.export.webcam import POLICY, WebcamFiles, webcam_part
 from mien.files import check_writable, write_atomically
-from mien.runtime import PortableAvatar
+from mien.runtime import PortableAvatar, camera_paths
 
 TEMPLATE = Path(__file__).with_name("page.html")
 WEBGPU = Path(__file__).with_name("webgpu.js")
@@ -78,7 +78,11 @@ def write_page(
     poster = path.with_suffix(".jpg") if described.address else None
     if poster:
         check_writable(poster)
-    drawn = runtime.Avatar(avatar)
+    drawn, filmed = runtime.Avatar(avatar), avatar.camera
+    zoom = camera_paths.zoom_at_rest(drawn, (filmed.width, filmed.height))
+    if zoom < 1:
+        avatar = replace(avatar, camera=camera_paths.fitted(filmed, filmed.width, filmed.height, zoom))
+        drawn = runtime.Avatar(avatar)
     parts = {
         "head": head_part(drawn, described, poster),
         "policy": POLICY if webcam else _SILENT if microphone else "",

@@ -1,16 +1,21 @@
 """Camera paths around a head in numpy, the counterpart of `mien.render.camera_paths` in torch."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from mien.runtime.avatar import Avatar
 from mien.runtime.baked import Camera
 from mien.runtime.rotation import matrix_from_axis_angle
 
 _UP = (0.0, 1.0, 0.0)
+_ZOOMS = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4)
+"""Magnifications that are tried until a head is whole."""
+_GLANCE, _FAINT = 128, 0.1
+"""Largest side of the small pictures that tell where an avatar is, in pixels, and the opacity that counts."""
 
 
 def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera:
@@ -20,6 +25,28 @@ def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera
     K[0, 2] += 0.5 * (width - scale * camera.width)
     K[1, 2] += 0.5 * (height - scale * camera.height)
     return Camera(K, camera.viewmat, width, height)
+
+
+def zoom_for_all(shown: Callable[[float], Bool[np.ndarray, "h w"]]) -> float:
+    """The largest magnification, of 1 and less, at which nothing that is drawn reaches an edge of the picture.
+
+    A filmed frame may cut off the crown of a head, which the avatar has. What fills any picture keeps 1.
+
+    Args:
+        shown: Returns where anything is drawn, at a magnification.
+    """
+    for zoom in _ZOOMS:
+        mask = shown(zoom)
+        if not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()):
+            return zoom
+    return 1.0
+
+
+def zoom_at_rest(avatar: Avatar, size: tuple[int, int]) -> float:
+    """The magnification of pictures of a width and height: 1, or less if that cuts off the person at rest."""
+    width, height = (max(8, round(_GLANCE * side / max(size))) for side in size)
+    gaussians = avatar.pose()
+    return zoom_for_all(lambda zoom: avatar.render(gaussians, fitted(avatar.camera, width, height, zoom))[1] > _FAINT)
 
 
 def orbit(camera: Camera, center: Float[np.ndarray, " 3"], angle: float, up: Sequence[float] = _UP) -> Camera:

@@ -14,7 +14,7 @@ from mien.export.output import Output
 from mien.export.pixels import png_bytes, to_rgb, to_rgba
 from mien.files import write_atomically
 from mien.progress import say, track_progress
-from mien.runtime.camera_paths import fitted, turned
+from mien.runtime.camera_paths import fitted, turned, zoom_at_rest
 
 CameraPath = Callable[[runtime.Camera, np.ndarray], Sequence[runtime.Camera]]
 """Returns the cameras of a path, from its first camera and the centre of the head in world space, in metres."""
@@ -47,14 +47,15 @@ def render_file(
 class View:
     """Place of the camera: how it is moved first, and the path that it then takes."""
 
-    def __init__(self, yaw: float, pitch: float, zoom: float, path: CameraPath) -> None:
-        """Take angles in degrees, the magnification, and the path."""
+    def __init__(self, yaw: float, pitch: float, zoom: float | None, path: CameraPath) -> None:
+        """Take angles in degrees, the magnification (None: 1, or less if that cuts the head off), and the path."""
         self._yaw, self._pitch, self._zoom, self._path = math.radians(yaw), math.radians(pitch), zoom, path
 
     def cameras(self, avatar: runtime.Avatar, options: PictureOptions) -> Sequence[runtime.Camera]:
         """The cameras of all frames."""
         center = avatar.portable.neutral.head_translation.astype(np.float64)
-        camera = fitted(avatar.camera, *options.shape(), self._zoom)
+        zoom = zoom_at_rest(avatar, options.shape()) if self._zoom is None else self._zoom
+        camera = fitted(avatar.camera, *options.shape(), zoom)
         return self._path(turned(camera, center, self._yaw, self._pitch), center)
 
 

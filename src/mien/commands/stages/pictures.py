@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from mien.avatar import Avatar
 from mien.camera import Camera
@@ -18,8 +18,12 @@ from mien.gaussians import Gaussians
 from mien.progress import say
 from mien.render import close_holes, rasterize
 from mien.render.validation import drawable
+from mien.runtime.camera_paths import zoom_for_all
 from mien.training import read_run_config
 from mien.training.whole_head import shares_left
+
+_GLANCE, _FAINT = 128, 0.1
+"""Largest side of the small pictures that tell where an avatar is, in pixels, and the opacity that counts."""
 
 
 def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
@@ -59,6 +63,19 @@ def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing:
     if options.background == "transparent":
         return to_rgba(*(tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha)))
     return to_rgb(close_holes(rendering.image.float(), closing).cpu().numpy())
+
+
+@torch.no_grad()
+def whole(camera: Camera, gaussians: Gaussians) -> Camera:
+    """The camera, or one that shows more if its picture cuts the avatar off."""
+    side = _GLANCE / max(camera.width, camera.height)
+    size = max(8, round(side * camera.width)), max(8, round(side * camera.height))
+
+    def drawn(zoom: float) -> Bool[np.ndarray, "h w"]:
+        return rasterize(gaussians, camera.fitted(*size, zoom)).alpha.numpy() > _FAINT
+
+    zoom = zoom_for_all(drawn)
+    return camera if zoom == 1 else camera.fitted(camera.width, camera.height, zoom)
 
 
 def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien.camera import Camera
@@ -16,6 +16,7 @@ from mien.face import FaceModel, FaceParams
 from mien.pictures import WHITE, picture_grid
 from mien.render.camera_paths import orbit
 from mien.runtime.baked import Filmed
+from mien.runtime.camera_paths import zoom_for_all
 from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
 
 TURNTABLE_TILES = 9
@@ -102,14 +103,23 @@ def nearer_tiles(
     picture: Callable[[FaceParams, Camera], UInt8[np.ndarray, "h w 3"]],
     background: tuple[int, int, int],
 ) -> list[Tile]:
-    """The same tiles, magnified alike so that what they show fills them but for a margin. They are never made smaller.
+    """The same tiles, magnified alike so that what they show fills them but for a margin.
+
+    They are made smaller only where the filmed frame cuts the head off.
 
     Small pictures of all tiles tell where that is.
     """
     first = tiles[0].camera
     width, height = (max(1, round(side * _GLANCE)) for side in (first.width, first.height))
-    glances = [picture(tile.face, tile.camera.resized(width, height)) for tile in tiles]
-    shown = np.any([np.abs(one.astype(int) - background).max(-1) > _FAINT for one in glances], axis=0)
+
+    def drawn(zoom: float) -> Bool[np.ndarray, "h w"]:
+        glances = [picture(tile.face, tile.camera.fitted(width, height, zoom)) for tile in tiles]
+        return np.any([np.abs(one.astype(int) - background).max(-1) > _FAINT for one in glances], axis=0)
+
+    zoom = zoom_for_all(drawn)
+    shown = drawn(zoom)
+    if zoom < 1:
+        tiles = [replace(tile, camera=tile.camera.fitted(first.width, first.height, zoom)) for tile in tiles]
     left, top, wide, high = cv2.boundingRect(shown.astype(np.uint8))
     if not wide:
         return list(tiles)
