@@ -28,16 +28,17 @@ def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera
 
 
 def zoom_for_all(shown: Callable[[float], Bool[np.ndarray, "h w"]]) -> float:
-    """The largest magnification, of 1 and less, at which nothing that is drawn reaches an edge of the picture.
+    """The largest magnification, of 1 and less, at which nothing that is drawn reaches the top or a side of the picture.
 
-    A filmed frame may cut off the crown of a head, which the avatar has. What fills any picture keeps 1.
+    A filmed frame may cut off the crown of a head, which the avatar has. A neck may end at the bottom. What fills any
+    picture keeps 1.
 
     Args:
         shown: Returns where anything is drawn, at a magnification.
     """
     for zoom in _ZOOMS:
         mask = shown(zoom)
-        if not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()):
+        if not (mask[0].any() or mask[:, 0].any() or mask[:, -1].any()):
             return zoom
     return 1.0
 
