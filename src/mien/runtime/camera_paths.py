@@ -28,7 +28,7 @@ def fitted(camera: Camera, width: int, height: int, zoom: float = 1.0) -> Camera
 
 
 def zoom_for_all(shown: Callable[[float], Bool[np.ndarray, "h w"]]) -> float:
-    """The largest magnification, of 1 and less, at which nothing that is drawn reaches the top or a side of the picture.
+    """The largest magnification, of 1 and less, at which a head reaches neither the top nor a side of the picture.
 
     A filmed frame may cut off the crown of a head, which the avatar has. A neck may end at the bottom. What fills any
     picture keeps 1.
