@@ -1,7 +1,7 @@
 """Packages that only some commands need: which extra of mien brings each, and what is said if one is missing.
 
 `pip install mien` installs what opens, draws and exports a finished avatar. The rest belongs to extras, because it
-takes gigabytes. The names of packages are those of pyproject.toml; `tests/test_extras.py` compares both.
+takes gigabytes. The names of packages are those of pyproject.toml; `tests/test_startup.py` compares both.
 """
 
 import sys
