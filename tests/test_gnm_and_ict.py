@@ -149,7 +149,8 @@ def test_what_does_not_fit_ict_is_told_in_one_line(tmp_path: Path) -> None:
         with pytest.raises(UserError, match="cannot be read as ICT-FaceKit") as told:
             read_ict(_packed(tmp_path, **fault))
         assert "\n" not in str(told.value)
-    found = np.load(_packed(tmp_path), allow_pickle=False)
+    with np.load(_packed(tmp_path)) as packed:
+        found = dict(packed)
     np.savez(tmp_path / "b.npz", **{key: found[key] for key in PACKED_KEYS if key != "identity"})
     with pytest.raises(UserError, match="has no 'identity'"):
         read_ict(tmp_path / "b.npz")
