@@ -27,7 +27,8 @@ import numpy as np
 
 from mien.cli import main
 from mien.commands.stages.sheets import named_picture
-from mien.commands.stages.showing import PAGE, show_avatar
+from mien.commands.stages.showing import show_film, show_page
+from mien.pages import LIVING_PAGE
 from mien.pictures import picture_grid
 from mien.tracking import read_tracking
 from mien.workspace import open_workspace
@@ -93,7 +94,7 @@ def walk(workspace: Path, out: Path, only: Sequence[str] = ()) -> Walk:
     """
     out.mkdir(parents=True, exist_ok=True)
     made = Walk(out)
-    if not (workspace / PAGE).is_file():
+    if not (workspace / LIVING_PAGE).is_file():
         made.command("demo", "--out", workspace)
     for name in only or STEPS:
         STEPS[name](made, workspace)
@@ -105,11 +106,12 @@ def walk(workspace: Path, out: Path, only: Sequence[str] = ()) -> Walk:
 def living_page(made: Walk, workspace: Path) -> None:
     """The page that `mien create` ends with, as this checkout writes it."""
     opened = open_workspace(workspace)
-    with made.step(f"the end of mien create: {PAGE}"):
-        show_avatar(opened, opened.run_names()[0])
+    with made.step(f"the end of mien create: {LIVING_PAGE}"):
+        show_page(opened, opened.run_names()[0])
+        show_film(opened, opened.run_names()[0])
     for screen in SCREENS:
         for theme in THEMES:
-            look_at_page(made, workspace / PAGE, screen, theme)
+            look_at_page(made, workspace / LIVING_PAGE, screen, theme)
 
 
 def look_at_page(made: Walk, page: Path, screen: str, theme: str) -> None:
