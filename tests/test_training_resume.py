@@ -122,7 +122,9 @@ def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     tensors = read_tensors(path)
     before = 1e6 + float(tensors["seconds"])
     assert before - 1e6 > sum(tensors["curves.step_ms"].tolist()) / 1000 > 0
-    changed = {name: torch.tensor(value).double() for name, value in (("seconds", before), ("peak_memory_mb", 7e6))}
+    changed = {
+        name: torch.tensor(value, dtype=torch.float64) for name, value in (("seconds", before), ("peak_memory_mb", 7e6))
+    }
     write_tensors(path, tensors | changed, {"format": "mien.checkpoint", "version": "1"})
     train_toy.main(tmp_path, STEPS)
     summary, curves = read_training_summary(tmp_path), read_curves(tmp_path)
