@@ -1,4 +1,4 @@
-"""What pages name exists, docs/api.md names what is stable (public_api.json), and the site shows a living avatar."""
+"""Pages name what exists, docs/api.md names what is stable (public_api.json), and the site shows a living avatar."""
 
 import importlib
 import inspect

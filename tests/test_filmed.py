@@ -1,4 +1,4 @@
-"""What training saw of a face is stored and softly kept to in driving; sheets show every expression or side once."""
+"""Driving keeps softly to the expressions and poses that training saw; sheets show every expression or side once."""
 
 import math
 import shutil

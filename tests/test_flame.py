@@ -147,7 +147,7 @@ FAULTS = {
     "weights": (lambda a: {"weights": 2 * a["weights"]}, "'weights' of a vertex do not add up to 1"),
     "texture": (lambda a: {"vt": np.zeros((4, 2)), "ft": a["f"][1:]}, "not texture coordinates"),
 }
-"""What is wrong with a file: arrays that are others, or missing, and the complaint."""
+"""Faults of a file: arrays that are others, or missing, and the complaint."""
 
 
 def test_what_is_missing_is_named_with_a_remedy(arrays, tmp_path):

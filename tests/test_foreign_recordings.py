@@ -162,7 +162,7 @@ def test_pieces_of_azures_speech(tmp_path: Path) -> None:
 
 
 LEFT = ("._{}", ".{}", ".DS_Store", "Thumbs.db", "desktop.ini", "__MACOSX/{}", "__MACOSX/._{}")
-"""What systems leave beside a file of some name."""
+"""Names of files that systems leave beside a file."""
 
 
 def given(folder: Path, *names: str) -> Path:

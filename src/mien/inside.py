@@ -85,7 +85,7 @@ def check_subtrees(folder: Path, *names: str) -> None:
 
 
 def listed(folder: Path, pattern: str = "*") -> list[Path]:
-    """What matches a pattern in a folder that a user gives, in the order of names, without what systems leave there.
+    """Return what matches a pattern in a folder of a user, in the order of names, without what systems leave there.
 
     Names that begin with a dot are left out (macOS has `._clip.mp4` beside `clip.mp4`), and those of `_OF_SYSTEMS`.
     """

@@ -42,7 +42,7 @@ def batch_progress(batch: Batch) -> dict[str, Any]:
 
 
 def running_words(batch: Batch, rows: Sequence[Row]) -> str:
-    """What runs now, in one line: the stage of each of the first running rows, and its percentage.
+    """Return what runs now, in one line: the stage of each of the first running rows, and its percentage.
 
     Only the first 100 rows are looked at, because each costs a read.
     """

@@ -95,7 +95,7 @@ def resample_evenly(
 
 @dataclass(frozen=True)
 class Times:
-    """What a file calls its times, and how messages name them."""
+    """A file's names for its times, and how messages name them."""
 
     name: str
     """Name of the times."""
@@ -108,7 +108,7 @@ class Times:
     remedy: str = ""
     """End of the message for times that go back."""
     faster: str = "correct its times"
-    """What to do if there are too few rows a second."""
+    """The remedy where there are too few rows a second."""
 
 
 def evenly_timed(
@@ -156,7 +156,7 @@ def _check_unit(path: Path, name: str, units: float, seconds: Float[np.ndarray, 
 
 
 def out_of_range(value: float | int) -> str:
-    """What is wrong with a coefficient beyond `MIN_COEFFICIENT` and `MAX_COEFFICIENT`, and what to do."""
+    """Say what is wrong with a coefficient beyond `MIN_COEFFICIENT` and `MAX_COEFFICIENT`, and what to do."""
     is_percent = 0 <= value <= 100 * MAX_COEFFICIENT
     return "coefficients go from 0 to 1; " + ("divide percent by 100" if is_percent else "correct or delete the row")
 

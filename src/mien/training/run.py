@@ -44,6 +44,7 @@ _MAX_SUMMARY = 1 << 62
 """Bound of the numbers in training.json that are read."""
 _MAX_CURVE_NUMBER = 1e12
 """Largest number in a curve that is read. Real ones stay far below, and plots cannot divide their range beyond it."""
+_OTHER_NAME = "give this run another name (--run NAME) or delete it"
 _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
 """Settings that say how a run is computed, not what it computes. They may change when the run continues."""
 
@@ -79,14 +80,13 @@ def check_run(
     if not (run_dir / "config.json").is_file():
         return False
     found = read_run_config(run_dir)
-    remedy = "give this run another name (--run NAME) or delete it"
     choices = json.loads(json.dumps(_choices(method_config, settings)))
     different = sorted(_differences({name: found[name] for name in choices}, choices))
     if different:
-        raise UserError(f"{run_dir}: holds a run with other {', '.join(different[:5])}; {remedy}")
+        raise UserError(f"{run_dir}: holds a run with other {', '.join(different[:5])}; {_OTHER_NAME}")
     trained = [entry["sequence"] for entry in found["data"]]
     if names is not None and trained != list(names):
-        raise UserError(f"{run_dir}: was trained on {', '.join(trained)}, not on {', '.join(names)}; {remedy}")
+        raise _of_others(run_dir, trained, names)
     return True
 
 
@@ -106,10 +106,11 @@ def check_videos(run_dir: Path, names: Items[str], known: Items[str]) -> None:
     trained = [entry["sequence"] for entry in read_run_config(run_dir)["data"]]
     of = {sequence: name for name in names for sequence in (*trained, *known) if is_part_of(sequence, name)}
     if not all(sequence in of for sequence in trained) or not set(names) <= set(of.values()):
-        raise UserError(
-            f"{run_dir}: was trained on {', '.join(trained)}, not on {', '.join(names)}; give this run another name "
-            "(--run NAME) or delete it"
-        )
+        raise _of_others(run_dir, trained, names)
+
+
+def _of_others(run_dir: Path, trained: Items[str], names: Items[str]) -> UserError:
+    return UserError(f"{run_dir}: was trained on {', '.join(trained)}, not on {', '.join(names)}; {_OTHER_NAME}")
 
 
 def is_part_of(sequence: str, name: str) -> bool:

@@ -86,7 +86,7 @@ def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Pl
 
 
 def _session(viewed: Viewed, motions: Motions) -> Session:
-    """What browsers share: the avatar, and the motions that it may play."""
+    """The avatar that browsers share, and the motions that it may play."""
     clips = {}
     if viewed.sequences or motions.play is not None:
         from mien.commands.stages.viewing_motions import clip_of
