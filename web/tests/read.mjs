@@ -1,13 +1,14 @@
 // Reads an avatar as a page does, for tests/test_hostile_pages.py:
 //   node read.mjs MIEN.JS AVATAR   prints json: the error's message, if there is one, and the most memory in bytes
-import { existsSync, readFileSync } from "node:fs";
+import { existsSync, readFileSync, statSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 
 const [bundle, path] = process.argv.slice(2);
 const { AvatarError, Poser, readAny } = await import(pathToFileURL(bundle).href);
 let message = "", bytes = null;
 try {
-  bytes = new Uint8Array(readFileSync(path));
+  if (statSync(path).isFile()) bytes = new Uint8Array(readFileSync(path));
+  else message = "is not a file"; // as a pipe, or /dev/zero, which has no end
 } catch (error) {
   message = `cannot be opened (${error.code})`; // no matter of the reader: a page hands it bytes
 }
