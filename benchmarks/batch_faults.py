@@ -19,7 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from batch_stub import note, watched
-from mien.batch import Batch, Row, batch_progress, do_with, progress_text, row_process
+from mien.batch import Row
+from mien.batch.plan import Batch
+from mien.batch.progress import batch_progress, progress_text
+from mien.batch.row import row_process
+from mien.batch.steps import do_with
 from mien.cli import main as mien
 from mien.files import read_json
 

@@ -23,7 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from batch_stub import do_stub, stub_row
-from mien.batch import Batch, Driver, EngineOptions, Row, State, run_row, write_results
+from mien.batch import EngineOptions, Row
+from mien.batch.drive import Driver
+from mien.batch.plan import Batch, State
+from mien.batch.results import write_results
+from mien.batch.row import run_row
 
 _JOBS = int(os.environ.get("MIEN_TRIAL_JOBS", "64"))
 _BYTES_A_ROW = 40

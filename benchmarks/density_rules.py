@@ -18,18 +18,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien.avatar import Avatar, DensityRules, FaceTuning, GaussianAvatarsConfig, GradientSettings
+from mien.avatar import Avatar, GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.settings import as_published
+from mien.avatar.settings import DensityRules, FaceTuning, GradientSettings
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit
 from mien.face import FaceParams, load_face_model
-from mien.lab.synthetic import Segment, SyntheticRecipe, synthesize
+from mien.lab.synthetic import synthesize
+from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.render import rasterize
 from mien.storage import read_tensors
-from mien.tracking import Scoring, make_scoring
-from mien.training import PRESETS, Sequence, held_out, read_curves, train
-from mien.training.footage.frames import Frame, evenly_spread
-from mien.training.footage.sequence import composite
+from mien.tracking.scoring import Scoring, make_scoring
+from mien.training import PRESETS, train
+from mien.training.footage.frames import Frame, evenly_spread, held_out
+from mien.training.footage.sequence import Sequence, composite
+from mien.training.run import read_curves
 
 RECIPE = SyntheticRecipe(
     name="rules", width=256, height=256, fps=10.0, cameras="ring", ring_size=6, glasses=False,

@@ -24,8 +24,9 @@ import numpy as np
 from mien.capture import write_capture
 from mien.cli import main as mien
 from mien.datasets.sequences import detected_landmarks
-from mien.face import add_face_model
-from mien.lab.synthetic import SyntheticRecipe, synthesize
+from mien.face.loading import add_face_model
+from mien.lab.synthetic import synthesize
+from mien.lab.synthetic.recipe import SyntheticRecipe
 
 ROOT = Path(__file__).resolve().parent.parent
 NAMES = ("anny", "gnm", "flame", "ict")

@@ -22,12 +22,15 @@ import torch
 
 from mien.avatar import Avatar, load_avatar
 from mien.avatar.gaussian_avatars.settings import as_published
-from mien.capture import Capture, read_capture, write_capture
+from mien.capture import read_capture, write_capture
+from mien.capture.capture import Capture
 from mien.face import load_face_model
 from mien.lab.synthetic import RECIPES, synthesize
 from mien.render import rasterize
-from mien.tracking import Tracking, read_tracking, track, write_tracking
-from mien.training import Sequence, TrainSettings, train
+from mien.tracking import read_tracking, track, write_tracking
+from mien.tracking.tracking import Tracking
+from mien.training import TrainSettings, train
+from mien.training.footage.sequence import Sequence
 
 FIRST = "here"
 OLD = {"MKL_CBWR": "COMPATIBLE", "ATEN_CPU_CAPABILITY": "default", "OPENBLAS_CORETYPE": "Nehalem", "MIEN_ISA": "sse4"}

@@ -12,8 +12,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from mien.export import write_packed
-from mien.runtime import PortableAvatar
+from mien.export.web_page import write_packed
+from mien.runtime.baked import PortableAvatar
 from test_web import skinned_head
 from test_web_gpu import PAGE, opened
 from web_case import browse, build, drawn_head, painted_head, script, served

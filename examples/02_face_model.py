@@ -13,7 +13,7 @@ import torch
 
 from mien.camera import Camera, camera_from_fov
 from mien.face import load_face_model
-from mien.render import render_mesh
+from mien.render.mesh import render_mesh
 
 SHOWN = ("neutral", "jawOpen", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp", "mouthPucker")
 

@@ -7,9 +7,14 @@ import argparse
 import math
 from pathlib import Path
 
-from mien.capture import CaptureSettings, capture_video, read_capture_hash
+from mien.capture import capture_video
+from mien.capture.settings import CaptureSettings
+from mien.capture.store import read_capture_hash
 from mien.face import load_face_model
-from mien.tracking import make_scoring, track, write_overlay, write_scoring, write_tracking
+from mien.tracking import track, write_tracking
+from mien.tracking.report.overlay import write_overlay
+from mien.tracking.scoring import make_scoring
+from mien.tracking.scoring_files import write_scoring
 from mien.workspace import Workspace
 
 

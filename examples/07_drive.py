@@ -13,7 +13,8 @@ from mien.avatar import load_avatar, neutral_of
 from mien.capture.video import write_video
 from mien.driving import drive
 from mien.render import rasterize
-from mien.training import read_sequence, run_camera
+from mien.training import read_sequence
+from mien.training.run import run_camera
 from mien.workspace import open_workspace
 
 

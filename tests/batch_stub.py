@@ -15,8 +15,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mien.batch import Batch, Driver, EngineOptions, Row, row_process
-from mien.batch.row import RowFailedError
+from mien.batch import EngineOptions, Row
+from mien.batch.drive import Driver
+from mien.batch.plan import Batch
+from mien.batch.row import RowFailedError, row_process
 from mien.batch.store import fetched
 from mien.stops import orderly_stops
 

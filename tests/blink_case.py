@@ -9,8 +9,11 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.face import FaceModel, load_face_model
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.fitting import Fit, SequenceFit, Shot, batch_of, layout_of, shot_of
-from mien.tracking.landmarks import LandmarkModel, reduce_face_model
+from mien.tracking.fitting.fit import Fit, SequenceFit
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.shot import Shot, shot_of
+from mien.tracking.fitting.views import batch_of
+from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
 from mien.tracking.landmarks.term import unknown_subject
 from mien.tracking.settings import TrackingSettings
 from tracking_case import capture_of

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from color_charts import to_light
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.capture.tone import PQ, hlg_scene_light, pq_light
 from mien.capture.video import write_video
 

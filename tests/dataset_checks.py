@@ -13,8 +13,9 @@ from dataset_layouts import Layout, View
 from dataset_scene import Scene, draw, projected
 from dataset_writers import MIRROR, rigid
 from mien.camera import Camera
-from mien.datasets import Findings, TrackedSequence, recognised
-from mien.render import rasterize_mesh
+from mien.datasets.dataset import Findings, TrackedSequence
+from mien.datasets.registry import recognised
+from mien.render.mesh import rasterize_mesh
 
 PIXELS = 1e-3
 """Largest error of a projected vertex, in pixels."""

@@ -6,20 +6,27 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, FaceTuning
+from mien.avatar import Avatar
+from mien.avatar.methods import DEFAULT_METHOD, METHODS
+from mien.avatar.settings import FaceTuning
 from mien.camera import Camera, camera_from_fov
-from mien.capture import read_capture_hash, write_capture
+from mien.capture import write_capture
 from mien.capture.capture import Capture
+from mien.capture.store import read_capture_hash
 from mien.evaluation.experiment import Experiment
 from mien.face import FaceParams
 from mien.gaussians import sh_from_rgb
 from mien.pictures import to_uint8
 from mien.render import rasterize
 from mien.render.camera_paths import orbit
-from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
-from mien.training import Split, TrainSettings, held_out, read_sequence, train
-from mien.training.footage.frames import Frame
+from mien.tracking import write_tracking
+from mien.tracking.scoring import Scoring
+from mien.tracking.scoring_files import write_scoring
+from mien.tracking.tracking import Tracking
+from mien.training import TrainSettings, read_sequence, train
+from mien.training.footage.frames import Frame, held_out
 from mien.training.footage.sequence import Sequence
+from mien.training.settings import Split
 from plain_settings import plain_config
 from small_face_model import make_small_face_model
 

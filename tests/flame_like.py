@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien.face import FaceModel, Landmarks
+from mien.face import FaceModel
+from mien.face.model import Landmarks
 from mien.rotation import matrix_from_axis_angle
 
 IDENTITIES, EXPRESSIONS = 40, 24

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from flame_like import principal_directions
-from mien.face import FaceModel, Landmarks
+from mien.face import FaceModel
+from mien.face.model import Landmarks
 from mien.rotation import matrix_from_axis_angle
 
 IDENTITIES, EXPRESSIONS = 30, 26

@@ -2,7 +2,9 @@
 
 import torch
 
-from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, Rate
+from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
+from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
+from mien.avatar.schedules import Rate
 from mien.face import FaceModel
 from mien.render.rendering import Rendering
 from plain_settings import plain_mono_gaussian_avatar

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from mien.capture import Capture
+from mien.capture.capture import Capture
 
 _MOUTH, _EYES, _FOREHEAD = (61, 291, 0, 17), (33, 263), 151
 _FINGERS = (-0.42, -0.14, 0.14, 0.40)

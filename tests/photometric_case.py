@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.face import FaceModel, FaceParams
 from mien.render.mesh import Texture, render_mesh
-from mien.tracking import Tracking
-from mien.tracking.fitting import layout_of
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.tracking import Tracking
 from small_face_model import make_small_face_model
 from tracking_case import capture_of
 

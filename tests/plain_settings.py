@@ -6,17 +6,14 @@ Tests of a formula or a mechanism use them, so that a change of a default does n
 from dataclasses import replace
 from typing import Any
 
-from mien.avatar import (
-    METHODS,
-    FaceTuning,
-    GaussianAvatarsConfig,
-    MethodConfig,
-    MonoGaussianAvatarConfig,
-    PointAvatarConfig,
-    Rate,
-    TexturedMeshConfig,
-)
+from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.settings import as_published
+from mien.avatar.methods import METHODS
+from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
+from mien.avatar.point_avatar.settings import PointAvatarConfig
+from mien.avatar.schedules import Rate
+from mien.avatar.settings import FaceTuning, MethodConfig
+from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.training import TrainSettings
 
 

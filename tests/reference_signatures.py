@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mien.lab.synthetic import ReferenceCapture
-from mien.lab.synthetic.references import REFERENCES
+from mien.lab.synthetic.references import REFERENCES, ReferenceCapture
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.lab.synthetic.truth import surface_of
 

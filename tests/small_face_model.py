@@ -5,8 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-from mien.face import FaceModel, Landmarks
-from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS
+from mien.face import FaceModel
+from mien.face.model import Landmarks
+from mien.tracking.landmarks.groups import LEFT_IRIS, RIGHT_IRIS
 from toy_scene import sphere
 
 

@@ -11,7 +11,10 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment
-from mien.avatar import Avatar, Moments, ParameterGroup, Rate, move_avatar
+from mien.avatar import Avatar
+from mien.avatar.avatar import ParameterGroup, move_avatar
+from mien.avatar.schedules import Rate
+from mien.avatar.store import Moments
 from mien.cli import main
 from mien.commands.create import Command as Create
 from mien.commands.options import TrainOptions
@@ -19,8 +22,9 @@ from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import l1
 from mien.face import FaceParams
 from mien.tracking import read_tracking
-from mien.training import AlignmentSettings, TrainSettings, align, train
-from mien.training.alignment import TRAINING, FaceDescent, align_faces, steadier
+from mien.training import TrainSettings, train
+from mien.training.alignment import TRAINING, FaceDescent, align, align_faces, steadier
+from mien.training.alignment_settings import AlignmentSettings
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
 

@@ -24,7 +24,7 @@ from mien.lab.analysis.gaussian_avatars import growth, speed
 from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
 from mien.plots import Axes, Series
 from mien.storage import write_tensors
-from mien.training import read_curves
+from mien.training.run import read_curves
 from shared_things import MadeOnce, toy_workspace
 from toy_workspace import write_toy_workspace
 from web_case import violations

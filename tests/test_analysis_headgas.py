@@ -13,15 +13,16 @@ import torch
 
 import train_toy
 from capture_helpers import tree_bytes
-from mien.avatar import GradientSettings, HeadGasConfig, PerceptualLoss, Photometric
+from mien.avatar.headgas.settings import HeadGasConfig
+from mien.avatar.settings import GradientSettings, PerceptualLoss, Photometric
 from mien.capture.video import count_frames
 from mien.cli import main
 from mien.gaussians import Gaussians
-from mien.lab.analysis import AnalysisOptions
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas import ablations, basis, beyond, layers, sizes
 from mien.lab.analysis.headgas.basis import start_of_bases
 from mien.lab.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
+from mien.lab.analysis.spec import AnalysisOptions
 from mien.lab.analysis.views import head_camera, labeled, mouth_camera
 from mien.runtime.filmed import head_angles
 from shared_things import MadeOnce

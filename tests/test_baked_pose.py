@@ -9,8 +9,9 @@ import torch
 
 from known import known
 from mien import runtime
-from mien.avatar import Avatar, HeadGas, load_avatar
+from mien.avatar import Avatar, load_avatar
 from mien.avatar.files import write_avatar
+from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.schedules import Progress
 from mien.face import FaceParams

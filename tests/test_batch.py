@@ -15,19 +15,12 @@ import pytest
 
 from batch_stub import PROGRAM, do_stub, driver, ended, stub_row, wait_for_begin
 from forked import ForkServer
-from mien.batch import (
-    Batch,
-    Driver,
-    EngineOptions,
-    Row,
-    State,
-    batch_progress,
-    progress_text,
-    run_row,
-    shard_of,
-    write_results,
-)
-from mien.batch.row import attempt
+from mien.batch import EngineOptions, Row
+from mien.batch.drive import Driver, shard_of
+from mien.batch.plan import Batch, State
+from mien.batch.progress import batch_progress, progress_text
+from mien.batch.results import write_results
+from mien.batch.row import attempt, run_row
 from mien.batch.steps import write_strip
 from mien.cli import main
 from mien.commands.stages.batch_table import read_table

@@ -17,7 +17,10 @@ from typing import Any
 import pytest
 
 from batch_stub import PROGRAM, stub_row, wait_for_begin
-from mien.batch import Batch, Driver, EngineOptions, batch_progress
+from mien.batch import EngineOptions
+from mien.batch.drive import Driver
+from mien.batch.plan import Batch
+from mien.batch.progress import batch_progress
 from needs import NO_ENGINE
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]

@@ -11,8 +11,11 @@ import pytest
 from PIL import Image
 
 from batch_stub import PROGRAM
-from mien.batch import Batch, Row, State, latex_table, markdown_table, means_by, write_results, write_wall
+from mien.batch import Row
+from mien.batch.plan import Batch, State
+from mien.batch.results import latex_table, markdown_table, means_by, write_results
 from mien.batch.steps import write_strip
+from mien.batch.wall import write_wall
 from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands import batch as batch_command

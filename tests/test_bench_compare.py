@@ -9,14 +9,15 @@ from typing import Any
 
 import pytest
 
-from mien.avatar import METHODS
+from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.commands.bench import Compare
 from mien.commands.stages import comparing
 from mien.commands.stages.comparing import Budget, CompareSettings
-from mien.face import add_face_model
+from mien.face.loading import add_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
-from mien.training import PRESETS, read_run_config, read_training_summary, trainer
+from mien.training import PRESETS, trainer
+from mien.training.run import read_run_config, read_training_summary
 from mien.workspace import Workspace
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace

@@ -14,10 +14,14 @@ from capture_helpers import random_capture
 from mien.cli import main
 from mien.commands.bench import CaptureName
 from mien.lab.benchmarking import following, quality
-from mien.lab.synthetic import RECIPES, REFERENCES, Segment, SyntheticScene, Truth, truth_of
+from mien.lab.synthetic import RECIPES
+from mien.lab.synthetic.recipe import Segment
+from mien.lab.synthetic.references import REFERENCES
+from mien.lab.synthetic.scene import SyntheticScene
+from mien.lab.synthetic.truth import Truth, truth_of
 from mien.render.mesh import vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import Tracking
+from mien.tracking.tracking import Tracking
 from small_face_model import make_small_face_model
 from tracking_case import still_camera
 

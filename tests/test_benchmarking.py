@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from mien import _native
-from mien.avatar import HeadGasConfig
+from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
 from mien.lab.benchmarking import device as device_benchmark

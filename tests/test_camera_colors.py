@@ -13,13 +13,13 @@ from mien.errors import UserError
 from mien.face import FaceModel
 from mien.render.rendering import Rendering
 from mien.storage import read_tensors
-from mien.training import Sequence, TrainSettings, train
+from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
 from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.frames import Frame, training_frames
-from mien.training.footage.sequence import Targets, composite
+from mien.training.footage.sequence import Sequence, Targets, composite
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import toy_sequence

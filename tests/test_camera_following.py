@@ -16,12 +16,19 @@ from mien.capture.video import probe_video, read_video_frames, write_video
 from mien.cli import main
 from mien.commands.stages import viewing_motions
 from mien.driving.constants import DRIVING
-from mien.driving.live import Follower, FollowOptions, LandmarkFit, OneEuro
+from mien.driving.live.follower import Follower, FollowOptions
+from mien.driving.live.landmark_fit import LandmarkFit
+from mien.driving.live.one_euro import OneEuro
 from mien.face import load_face_model
-from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
+from mien.lab.synthetic import RECIPES
+from mien.lab.synthetic.recipe import Segment
+from mien.lab.synthetic.scene import SyntheticScene
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime import write_portable
-from mien.viewer import CameraSwitch, DrawingLoop, Seen, Session, View
+from mien.viewer.drawing import View
+from mien.viewer.following import CameraSwitch
+from mien.viewer.loop import DrawingLoop
+from mien.viewer.session import Seen, Session
 from test_live_camera import FPS, Stage, until
 from web_case import drawn_head
 

@@ -16,7 +16,9 @@ from capture_helpers import (
     tree_bytes,
     write_face_clip,
 )
-from mien.capture import CaptureSettings, capture_video, capture_video_parts, process, read_capture
+from mien.capture import capture_video, process, read_capture
+from mien.capture.from_video import capture_video_parts
+from mien.capture.settings import CaptureSettings
 from mien.capture.video import write_video
 from mien.errors import UserError
 

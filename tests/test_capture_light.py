@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mien.capture import CaptureSettings, capture_video, is_light_changing
-from mien.capture.quality import measure_face, quality_report, relative_quality
+from mien.capture import capture_video
+from mien.capture.quality import is_light_changing, measure_face, quality_report, relative_quality
 from mien.capture.screen import screen_matte, screen_of, without_screen
+from mien.capture.settings import CaptureSettings
 from mien.storage import read_json
 
 SIDE = 120

@@ -15,17 +15,11 @@ import torch
 from capture_helpers import assert_same_capture, random_capture, tree_bytes, write_face_clip
 from damage import edit_json
 from mien.camera import camera_from_fov
-from mien.capture import (
-    CaptureSettings,
-    capture_video,
-    frame_files,
-    process,
-    read_capture,
-    read_capture_hash,
-    write_capture,
-)
+from mien.capture import capture_video, frame_files, process, read_capture, write_capture
 from mien.capture.frame_files import FrameLayout
 from mien.capture.room import capture_bytes, check_room
+from mien.capture.settings import CaptureSettings
+from mien.capture.store import read_capture_hash
 from mien.cli import main
 from mien.errors import UserError
 

@@ -9,8 +9,10 @@ import pytest
 from PIL import Image
 
 from capture_helpers import encode, face_picture, write_gradient_video
-from mien.capture import CaptureSettings, capture_video, capture_video_parts
+from mien.capture import capture_video
+from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
+from mien.capture.settings import CaptureSettings
 from mien.capture.source import FrameSelection, open_source
 from mien.capture.video import read_lazily, write_video
 from mien.errors import UserError

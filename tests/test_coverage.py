@@ -8,18 +8,31 @@ import pytest
 import torch
 
 from known import known
-from mien.avatar import METHODS, Avatar, Photometric, Progress, SurfacePrior
+from mien.avatar import Avatar
+from mien.avatar.bound_surface import SurfacePrior
 from mien.avatar.density import GradientDensity
+from mien.avatar.methods import METHODS
+from mien.avatar.schedules import Progress
+from mien.avatar.settings import Photometric
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.render import rasterize
 from mien.runtime.baked import Filmed
-from mien.training import Sequence, filmed_words, read_coverage, train
+from mien.training import train
 from mien.training.density_control import density_strategy
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
-from mien.training.footage.filmed import FILE, filmed_yaws, view_of_head, with_shown_angles, write_coverage
+from mien.training.footage.filmed import (
+    FILE,
+    filmed_words,
+    filmed_yaws,
+    read_coverage,
+    view_of_head,
+    with_shown_angles,
+    write_coverage,
+)
 from mien.training.footage.frames import training_frames
+from mien.training.footage.sequence import Sequence
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run

@@ -7,14 +7,17 @@ import pytest
 import torch
 
 from known import known
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.evaluation.load import held_out_by_protocol
-from mien.lab.synthetic import SyntheticRecipe, SyntheticScene, synthesize
-from mien.tracking import Tracking, read_tracking, residual_report, write_tracking
-from mien.tracking.landmarks import LEFT_EYELIDS, RIGHT_EYELIDS
+from mien.lab.synthetic import synthesize
+from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.scene import SyntheticScene
+from mien.tracking import read_tracking, write_tracking
+from mien.tracking.landmarks.groups import LEFT_EYELIDS, RIGHT_EYELIDS
 from mien.tracking.pixels.covered import covered_parts, the_face, usual_look
 from mien.tracking.report.page import findings
-from mien.tracking.tracking import PARTS
+from mien.tracking.report.residuals import residual_report
+from mien.tracking.tracking import PARTS, Tracking
 from mien.training import TrainSettings
 from mien.training.footage.frames import held_out, training_frames
 from mien.training.footage.sequence import Sequence

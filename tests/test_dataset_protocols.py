@@ -13,19 +13,22 @@ import torch
 from torch.nn.functional import conv2d, max_pool2d
 
 from evaluation_case import make_experiment, two_cameras, write_run, write_sequence
-from mien.capture import read_capture, read_capture_hash
+from mien.capture import read_capture
+from mien.capture.store import read_capture_hash
 from mien.commands.evaluate import Protocol
 from mien.errors import UserError
-from mien.evaluation import EvaluationSettings, dataset_protocols, evaluate, scoring
+from mien.evaluation import dataset_protocols, evaluate, scoring
 from mien.evaluation.dataset_protocols import DATASET_PROTOCOLS, dataset_protocol
 from mien.evaluation.experiment import avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import ssim
+from mien.evaluation.protocols import EvaluationSettings
 from mien.files import write_json
 from mien.storage import write_arrays
-from mien.tracking import read_scoring, write_scoring
-from mien.training import OwnSplit, write_own_split
-from mien.training.footage import FOREIGN, Frame, packed_clothes
+from mien.tracking.scoring_files import read_scoring, write_scoring
+from mien.training.footage.clothes import FOREIGN, packed_clothes
+from mien.training.footage.frames import Frame
+from mien.training.footage.own_split import OwnSplit, write_own_split
 from plain_settings import plain_run
 
 pytestmark = pytest.mark.unchecked

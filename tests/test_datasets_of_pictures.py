@@ -11,17 +11,19 @@ from PIL import Image
 import dataset_checks as checks
 import dataset_writers as writers
 from dataset_scene import Scene, draw, drawn_person, head_view, projected, unfound
-from mien.capture import CaptureSettings
 from mien.capture.calibration import read_calibration
+from mien.capture.settings import CaptureSettings
 from mien.capture.video import write_video
 from mien.commands.stages import import_footage
-from mien.datasets import Clip, FilmedSequence, Footage, TrackedSequence, datasets, find_dataset, sequences
+from mien.datasets import sequences
+from mien.datasets.dataset import Clip, FilmedSequence, Footage, TrackedSequence
 from mien.datasets.nerface import viewmats_from_nerface
+from mien.datasets.registry import datasets, find_dataset
 from mien.errors import UserError
 from mien.face import load_face_model
-from mien.render import rasterize_mesh
+from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
-from mien.training import OwnSplit
+from mien.training.footage.own_split import OwnSplit
 
 
 @pytest.fixture

@@ -13,13 +13,15 @@ import dataset_layouts as layouts
 import dataset_writers as writers
 from dataset_scene import SIDE, NoDetector, Scene, draw, drawn_person, unfound
 from flame_like import write_npz
-from mien.datasets import find_dataset, insta, matting, overlay, sequences, write_sequence
+from mien.datasets import insta, matting, overlay, sequences
 from mien.datasets.pictures import read_picture
+from mien.datasets.registry import find_dataset
+from mien.datasets.writing import write_sequence
 from mien.errors import UserError
 from mien.face import FaceModel, teeth
 from mien.face.flame import flame_face_model, read_flame
-from mien.training import OwnSplit
-from mien.training.footage import clothes_mask
+from mien.training.footage.clothes import clothes_mask
+from mien.training.footage.own_split import OwnSplit
 
 CHECKED = ("insta", "imavatar", "vhap, one camera")
 """One layout of each importer, whose calls are checked."""

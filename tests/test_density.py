@@ -10,12 +10,17 @@ from hypothesis import strategies as st
 
 from known import known
 from mien.adam import Moments
-from mien.avatar import GaussianStore, GradientDensity, GradientSettings, Posed, Progress, RefillDensity, RefillSettings
-from mien.avatar.density import split_along_axes
+from mien.avatar.avatar import Posed
+from mien.avatar.density import GradientDensity, RefillDensity, split_along_axes
+from mien.avatar.schedules import Progress
+from mien.avatar.settings import GradientSettings, RefillSettings
+from mien.avatar.store import GaussianStore
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_quaternion
-from mien.training.density_control import GradientStrategy, RefillStrategy, density_strategy
+from mien.training.density_control import density_strategy
+from mien.training.density_control.gradient import GradientStrategy
+from mien.training.density_control.refill import RefillStrategy
 
 WIDTH, HEIGHT, FIRST = 40, 20, Progress(0, 100)
 EVERY_STEP = GradientSettings(start=0.0, stop=1.0, rounds=101, split_size=0.0025, opacity_resets=())

@@ -10,11 +10,13 @@ from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.synthetic.detector_calibration import Sightings, fit_response
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking.fitting import Fit, SequenceFit, Views, batch_of, layout_of
-from mien.tracking.landmarks import DetectorResponse, all_landmarks, read_response, reduce_face_model, write_response
-from mien.tracking.landmarks.detector_response import unknown_response
+from mien.tracking.fitting.fit import Fit, SequenceFit
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.views import Views, batch_of
+from mien.tracking.landmarks.detector_response import DetectorResponse, read_response, unknown_response, write_response
+from mien.tracking.landmarks.model import reduce_face_model
 from mien.tracking.landmarks.shared_fit import fit_shared
-from mien.tracking.landmarks.term import move_subject, unknown_subject
+from mien.tracking.landmarks.term import all_landmarks, move_subject, unknown_subject
 from mien.tracking.settings import TrackingSettings
 from small_face_model import make_small_face_model
 from tracking_case import still_camera

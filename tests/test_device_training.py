@@ -17,7 +17,9 @@ import mien.devices
 import train_toy
 from mien import _native
 from mien.adam import FactoredMoments
-from mien.avatar import METHODS, GaussianAvatarsConfig, MethodConfig, load_avatar
+from mien.avatar import GaussianAvatarsConfig, load_avatar
+from mien.avatar.methods import METHODS
+from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from forked import ForkServer
-from mien.avatar import METHODS
+from mien.avatar.methods import METHODS
 from mien.cli import COMMANDS, main
-from mien.export import write_page
+from mien.export.web_page import write_page
 from web_case import browse, drawn_head, served, violations
 
 ROOT = Path(__file__).parent.parent

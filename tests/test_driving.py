@@ -10,27 +10,23 @@ import torch
 
 from mien.avatar import neutral_of
 from mien.camera import camera_from_fov
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.capture.pace import frame_rate, pace_report
 from mien.capture.video import probe_video, write_video
 from mien.commands.stages import driving
 from mien.commands.stages.driving import open_driver, run_driving_stage
-from mien.driving import (
-    ARKIT_NAMES,
-    drive,
-    face_of_motion,
-    read_blendshape_json,
-    read_live_link_face,
-    read_tracked_driver,
-)
-from mien.driving.drivers import Driver
-from mien.driving.motion import Motion, gaze_of
+from mien.driving import drive
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.drivers import Driver, read_tracked_driver
+from mien.driving.live_link_face import read_live_link_face
+from mien.driving.motion import ARKIT_NAMES, Motion, gaze_of
 from mien.driving.sides import PAIRS
+from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import FaceParams, load_face_model
 from mien.render.camera_paths import orbit, turned_camera, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import Tracking
+from mien.tracking.tracking import Tracking
 from mien.workspace import Workspace
 from recordings import LAYOUTS, row, write_csv
 from small_face_model import make_small_face_model

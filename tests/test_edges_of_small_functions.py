@@ -20,7 +20,7 @@ from mien.face.checks import check_face_model
 from mien.face.mirror import triangle_geometry
 from mien.face.npz import read_npz
 from mien.files import check_writable, remove_leftovers, write_atomically
-from mien.lab.synthetic import Segment, SyntheticRecipe
+from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.limits import MAX_NUMBER
 from mien.ranges import Range
 from mien.render.camera_paths import sway

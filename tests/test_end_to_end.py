@@ -18,11 +18,11 @@ from demo_case import DEMO, FRAMES, VIDEO, leave_network, make_demo, skip_if_onl
 from forked import ForkServer
 from fuzzing.kills import TRACK
 from mien import runtime, tracking
-from mien.avatar import DEFAULT_METHOD
+from mien.avatar.methods import DEFAULT_METHOD
 from mien.capture.video import probe_video
 from mien.cli import COMMANDS, main
-from mien.face import add_face_model
-from mien.tracking import PhotometricSettings, TrackingSettings
+from mien.face.loading import add_face_model
+from mien.tracking.settings import PhotometricSettings, TrackingSettings
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 from viewer_alone import page_of

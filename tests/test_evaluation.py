@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from evaluation_case import drawn_sequence, make_experiment
-from mien.avatar import DEFAULT_METHOD
+from mien.avatar.methods import DEFAULT_METHOD
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -18,10 +18,10 @@ from mien.evaluation.report import RunRecord, report_html
 from mien.evaluation.report_sections import spans
 from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
 from mien.gaussians import sh_from_rgb
-from mien.perceptual import load_perceptual
+from mien.perceptual.distance import load_perceptual
 from mien.plots import Axes, Series, line_chart
 from mien.tracking.tracking import PARTS
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
 
 experiment = pytest.fixture(scope="module")(lambda: make_experiment(20))
 QUICK = EvaluationSettings(perceptual=False, baselines=False)

@@ -16,7 +16,7 @@ from mien.errors import UserError
 from mien.evaluation import cross
 from mien.evaluation.cross import cross_reenactment, load_driven
 from mien.evaluation.redetection import angle_degrees, measure_motion, transfer_figures
-from mien.face import most_frontal_camera
+from mien.face.params import most_frontal_camera
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import write_tracking
 from plain_settings import plain_run

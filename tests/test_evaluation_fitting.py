@@ -9,16 +9,15 @@ import pytest
 import torch
 
 from evaluation_case import drawn_sequence, make_experiment
-from mien.avatar import METHODS
+from mien.avatar.methods import METHODS
 from mien.cli import main
-from mien.evaluation import EvaluationSettings
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.fitting import FittedFaces, fit_face
 from mien.evaluation.metrics import l1
 from mien.evaluation.partial import PartialScores
-from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, evaluate_frames, protocol_content
+from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.text import protocol_lines
-from mien.tracking import Scoring
+from mien.tracking.scoring import Scoring
 from plain_settings import plain_config
 from shared_things import MadeOnce, toy_workspace
 

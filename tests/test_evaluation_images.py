@@ -12,9 +12,10 @@ from evaluation_case import make_experiment, write_run, write_sequence
 from mien.capture.video import write_video
 from mien.cli import main
 from mien.errors import UserError
-from mien.evaluation import EvaluationSettings, evaluate
+from mien.evaluation import evaluate
 from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
 from mien.evaluation.metrics import psnr
+from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.storage import read_json
 from plain_settings import plain_run

@@ -16,24 +16,25 @@ import pytest
 import torch
 
 from evaluation_case import SIZE, make_experiment, two_cameras, write_run, write_sequence
-from mien.capture import read_capture_hash
+from mien.capture.store import read_capture_hash
 from mien.capture.video import probe_video, read_video_frames
 from mien.cli import main
 from mien.errors import UserError
-from mien.evaluation import EvaluationSettings, evaluate, protocols, read_metrics
+from mien.evaluation import evaluate, protocols
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.evaluate import is_evaluated
 from mien.evaluation.experiment import Experiment, head_box, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.protocols import evaluate_frames
+from mien.evaluation.metrics_file import read_metrics
+from mien.evaluation.protocols import EvaluationSettings, evaluate_frames
 from mien.evaluation.scoring import METRICS
 from mien.evaluation.text import comparison_text, protocol_lines
 from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.pictures import to_uint8
 from mien.storage import read_tensors, write_json, write_tensors
-from mien.tracking import write_scoring
+from mien.tracking.scoring_files import write_scoring
 from mien.training import read_sequence
 from mien.training.footage.frames import Frame, spread_frames
 from plain_settings import plain_run

@@ -24,19 +24,23 @@ from fuzzing.formats import members_of, zip_of
 from fuzzing.material import new_avatar, tiny_flame
 from fuzzing.repairs import joined, split
 from mien import runtime
-from mien.avatar import make_portable
+from mien.avatar.baking import make_portable
 from mien.bounded import parse_json
 from mien.capture import given
 from mien.capture.crop import whole_picture
 from mien.capture.faces import LANDMARKS
 from mien.capture.given import GivenMattes, read_landmarks
 from mien.cli import main
-from mien.driving import drive, motion, read_blendshape_json, read_live_link_face
+from mien.driving import drive, motion
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
 from mien.errors import UserError
-from mien.export import ply, read_glb, read_glb_avatar, read_ply, read_sog, read_usd, write_ply, write_sog, write_usd
-from mien.export.glb_avatar import EXTENSION
-from mien.export.glb_file import GlbWriter
+from mien.export import ply, read_ply, write_ply
+from mien.export.glb_avatar import EXTENSION, read_glb_avatar
+from mien.export.glb_file import GlbWriter, read_glb
 from mien.export.ply import property_names
+from mien.export.sog import read_sog, write_sog
+from mien.export.usd import read_usd, write_usd
 from mien.face.checks import check_face_params
 from mien.face.flame import read_flame
 from mien.gaussians import Gaussians

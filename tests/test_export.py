@@ -20,11 +20,12 @@ from mien.cli import main
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.pictures import draw
 from mien.errors import UserError
-from mien.export import in_world, read_ply, read_spz, write_ply
+from mien.export import in_world, read_ply, write_ply
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
 from mien.export.pixels import to_rgb, to_rgba
 from mien.export.ply import property_names
+from mien.export.spz import read_spz
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render import rasterize
 from mien.render.camera_paths import read_cameras, sway, write_cameras

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 
 from mien import runtime
-from mien.avatar import METHODS, make_portable
+from mien.avatar.baking import make_portable
+from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.errors import UserError
-from mien.export import find_webcam_files, unpacked, write_packed, write_page
+from mien.export.packed import unpacked
 from mien.export.rows import with_rows
 from mien.export.thinning import contributions
-from mien.export.webcam import OWN, POLICY, VERSION, own_model
+from mien.export.web_page import write_packed, write_page
+from mien.export.webcam import OWN, POLICY, VERSION, find_webcam_files, own_model
 from test_runtime import SIZE, new_avatar
 from toy_scene import toy_camera
 from web_case import WEB, drawn_head, faces_of, tasks_vision

@@ -12,7 +12,10 @@ import torch
 
 from known import known
 from mien import runtime
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, Progress, Rate, load_avatar, make_portable, write_avatar
+from mien.avatar import GaussianAvatarsConfig, load_avatar
+from mien.avatar.baking import make_portable
+from mien.avatar.files import write_avatar
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.gaussian_avatars.changes import mean_squares
 from mien.avatar.ops.expression_changes import (
     MARGIN,
@@ -22,6 +25,7 @@ from mien.avatar.ops.expression_changes import (
     within_seen,
 )
 from mien.avatar.ops.feature_network import Layers, feature_network_reference
+from mien.avatar.schedules import Progress, Rate
 from mien.errors import UserError
 from mien.export.packed import pack
 from mien.gaussians import Gaussians

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from blink_case import SKIN, WHITE, BlinkCase
-from mien.tracking.eyelids import place_lids
 from mien.tracking.eyelids.eyes import eyes_of
-from mien.tracking.eyelids.placing import weigh_positions
-from mien.tracking.fitting import CameraBatch, Shot, Views, layout_of
+from mien.tracking.eyelids.placing import place_lids, weigh_positions
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.shot import Shot
+from mien.tracking.fitting.views import CameraBatch, Views
 from small_face_model import make_small_face_model
 
 TIMESTEPS = 24

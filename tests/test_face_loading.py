@@ -11,7 +11,8 @@ import torch
 from mien.cli import main
 from mien.commands.stages import driving
 from mien.errors import UserError
-from mien.face import available_face_models, cache, listing, load_face_model, loading
+from mien.face import cache, listing, load_face_model, loading
+from mien.face.listing import available_face_models
 from small_face_model import make_small_face_model
 
 

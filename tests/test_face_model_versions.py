@@ -14,13 +14,14 @@ from dataset_layouts import draw_at
 from dataset_scene import NoDetector, Scene, drawn_person
 from dataset_writers import write_benchmark, write_flash_avatar, write_imavatar, write_insta, write_vhap
 from flame_like import write_npz
-from mien.datasets import TrackedSequence, overlay
+from mien.datasets import overlay
+from mien.datasets.dataset import TrackedSequence
 from mien.datasets.overlay import check_overlay
 from mien.datasets.steadiness import Steadiness, measure_steadiness
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.flame import flame_face_model, read_flame
-from mien.tracking.landmarks import with_regions_by_landmarks
+from mien.tracking.landmarks.regions import with_regions_by_landmarks
 
 pytestmark = pytest.mark.unchecked
 TIMESTEPS = 10

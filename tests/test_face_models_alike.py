@@ -13,16 +13,19 @@ from torch import Tensor
 
 from face_models import NAMES, face_model_named
 from mien.camera import Camera
-from mien.capture import Capture
-from mien.driving import ARKIT_NAMES, drive, face_of_motion, fit_expression_map
-from mien.driving.motion import Motion, gaze_of
+from mien.capture.capture import Capture
+from mien.driving import drive
+from mien.driving.expression_map import fit_expression_map
+from mien.driving.motion import ARKIT_NAMES, Motion, gaze_of
+from mien.driving.transfer import face_of_motion
 from mien.face import FaceModel, FaceParams
 from mien.face.chart import find_outside
 from mien.face.checks import check_face_model
-from mien.render import render_mesh
-from mien.tracking import TrackingSettings, track
-from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS, read_response
-from mien.tracking.settings import PhotometricSettings
+from mien.render.mesh import render_mesh
+from mien.tracking import track
+from mien.tracking.landmarks.detector_response import read_response
+from mien.tracking.landmarks.groups import LEFT_IRIS, RIGHT_IRIS
+from mien.tracking.settings import PhotometricSettings, TrackingSettings
 
 pytestmark = pytest.mark.unchecked
 

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from mien.avatar import FaceTuning, Progress, Rate
+from mien.avatar.schedules import Progress, Rate
+from mien.avatar.settings import FaceTuning
 from mien.face import FaceParams
 from mien.training.adam import Adam
 from mien.training.constants import TRAINING

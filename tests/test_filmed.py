@@ -12,7 +12,11 @@ import torch
 
 import train_toy
 from mien import runtime
-from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, load_avatar, make_portable, measure_filmed, write_avatar
+from mien.avatar import Avatar, load_avatar
+from mien.avatar.baking import make_portable
+from mien.avatar.files import write_avatar
+from mien.avatar.filmed import measure_filmed
+from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.camera import Camera, camera_from_fov
 from mien.cli import main
 from mien.commands.stages import driving
@@ -25,15 +29,15 @@ from mien.commands.stages.sheets import (
     turntable_tiles,
 )
 from mien.commands.stages.viewing import viewed_file
-from mien.driving import ARKIT_NAMES, keep_to_filmed
+from mien.driving.keeping import keep_to_filmed
+from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render.camera_paths import orbit
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.runtime import Filmed
+from mien.runtime.baked import Filmed
 from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
-from mien.training import read_coverage
-from mien.training.footage.filmed import FILE
+from mien.training.footage.filmed import FILE, read_coverage
 from plain_settings import plain_config
 from shared_things import toy_workspace
 from small_face_model import make_small_face_model

@@ -18,9 +18,9 @@ from mien.face.flame import FlameFile, flame_face_model, read_flame
 from mien.face.inert_pickle import read_inert_pickle
 from mien.face.teeth import tooth_triangles, with_teeth
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking.fitting import layout_of
-from mien.tracking.landmarks import with_regions_by_landmarks
-from mien.tracking.pixels import texture_space
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.landmarks.regions import with_regions_by_landmarks
+from mien.tracking.pixels.texture import texture_space
 
 arrays = pytest.fixture(scope="module")(lambda: flame_like.flame_like(load_face_model("anny")))
 

@@ -3,8 +3,8 @@
 import torch
 
 from mien.camera import look_at
-from mien.tracking.fitting import CameraBatch, Views
 from mien.tracking.fitting.shot import without_flicker
+from mien.tracking.fitting.views import CameraBatch, Views
 from mien.tracking.landmarks.term import trust_of
 from tracking_case import still_camera
 

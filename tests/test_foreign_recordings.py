@@ -15,7 +15,9 @@ from mien.cli import main
 from mien.commands.stages import driving
 from mien.commands.stages.batch_table import read_table
 from mien.datasets.live_link_face_take import LIVE_LINK_FACE
-from mien.driving import ARKIT_NAMES, Motion, read_blendshape_json, read_live_link_face
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
+from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.errors import UserError
 from mien.evaluation.image_source import open_pictures
 from mien.inside import listed

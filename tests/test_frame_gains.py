@@ -9,18 +9,20 @@ import torch
 
 from evaluation_case import make_experiment
 from mien.avatar.schedules import Progress
-from mien.capture import FrameQuality
+from mien.capture.quality import FrameQuality
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.fitting import fit_face
 from mien.evaluation.metrics import l1
 from mien.render.rendering import Rendering
 from mien.storage import read_tensors, write_tensors
-from mien.training import AlignmentSettings, Sequence, TrainSettings, read_gains, train
+from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.alignment import align_faces
-from mien.training.footage import training_frames
-from mien.training.frame_gains import FrameGains, frame_gains_part, lit
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.footage.frames import training_frames
+from mien.training.footage.sequence import Sequence
+from mien.training.frame_gains import FrameGains, frame_gains_part, lit, read_gains
 from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import toy_sequence
 

@@ -6,11 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien.avatar import GaussianAvatars, GaussianAvatarsConfig, GaussianStore, Progress
-from mien.avatar.gaussian_avatars.avatar import never_empty_a_triangle
+from mien.avatar import GaussianAvatarsConfig
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars, never_empty_a_triangle
 from mien.avatar.gaussian_avatars.settings import SurfaceLimits
 from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface, limits_of_triangles
 from mien.avatar.ops.triangle_frames import bind_to_world, triangle_ellipses
+from mien.avatar.schedules import Progress
+from mien.avatar.store import GaussianStore
 from mien.face import FaceModel
 from mien.gaussians import world_means
 from mien.render import rasterize

@@ -12,10 +12,12 @@ import torch
 from flame_like import posed_as_flame
 from fuzzing.material import tiny_flame
 from known import known
-from mien.avatar import METHODS, Avatar
+from mien.avatar import Avatar
+from mien.avatar.methods import METHODS
 from mien.errors import UserError
-from mien.export import read_gaussian_avatars_folder, read_ply, write_gaussian_avatars_folder
+from mien.export import read_ply
 from mien.export.flame_params import read_flame_params, write_flame_params
+from mien.export.gaussian_avatars_folder import read_gaussian_avatars_folder, write_gaussian_avatars_folder
 from mien.face import FaceModel, FaceParams
 from mien.face.flame import flame_face_model, read_flame
 from mien.render import rasterize

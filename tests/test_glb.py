@@ -10,9 +10,8 @@ import torch
 from mien import runtime
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
-from mien.export import Glb, MeshModel, read_glb, write_glb
-from mien.export.glb import joint_positions, morph_targets
-from mien.export.glb_file import GlbWriter
+from mien.export.glb import MeshModel, joint_positions, morph_targets, write_glb
+from mien.export.glb_file import Glb, GlbWriter, read_glb
 from mien.export.texture import Shot, Surface, bake_texture
 from mien.face import load_face_model
 from mien.runtime.named import LOOK_ANGLE, within_lids

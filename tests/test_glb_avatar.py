@@ -7,12 +7,13 @@ import pytest
 
 from damage import nested
 from mien import runtime
-from mien.avatar import METHODS, as_array, bake_rig, make_portable
+from mien.avatar.baking import as_array, bake_rig, make_portable
+from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.errors import UserError
-from mien.export import MeshModel, read_glb, read_glb_avatar, write_glb
-from mien.export.glb_avatar import EXTENSION
-from mien.export.glb_file import GlbWriter
+from mien.export.glb import MeshModel, write_glb
+from mien.export.glb_avatar import EXTENSION, read_glb_avatar
+from mien.export.glb_file import GlbWriter, read_glb
 from needs import NO_VALIDATOR
 from shared_things import MadeOnce, toy_workspace
 from test_runtime import new_avatar

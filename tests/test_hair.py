@@ -4,20 +4,22 @@ import numpy as np
 import pytest
 import torch
 
-from mien.avatar import SurfacePrior, method_named
+from mien.avatar.bound_surface import SurfacePrior
 from mien.avatar.gaussian_avatars.hair_strands import strand_gaussians
+from mien.avatar.methods import method_named
 from mien.avatar.ops.triangle_frames import frames_to_world, triangle_frames
 from mien.camera import camera_from_fov
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import matrix_from_quaternion
-from mien.tracking import NeckParts, Tracking, fit_neck_cut
-from mien.tracking.neck_cut import above_neck_cut
-from mien.training import PRESETS, Sequence
+from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
+from mien.tracking.tracking import Tracking
+from mien.training import PRESETS
 from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence
 from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
 from sh_colors import rgb_from_sh

@@ -9,21 +9,23 @@ import torch
 
 from flame_like import exact_landmarks, flame_like, write_npz
 from known import known
-from mien.avatar import SurfacePrior, method_named
+from mien.avatar.bound_surface import SurfacePrior
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
+from mien.avatar.methods import method_named
 from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.camera import Camera, camera_from_fov
-from mien.face import FaceModel, FaceParams, mirror_triangles
+from mien.face import FaceModel, FaceParams
 from mien.face.flame import flame_face_model, read_flame
 from mien.face.head_parts import head_parts
-from mien.face.mirror import triangle_geometry
+from mien.face.mirror import mirror_triangles, triangle_geometry
 from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.render.mesh import shade
-from mien.tracking.landmarks import with_regions_by_landmarks
-from mien.training import PRESETS, Sequence, train
+from mien.tracking.landmarks.regions import with_regions_by_landmarks
+from mien.training import PRESETS, train
 from mien.training.footage.coverage import triangle_views
 from mien.training.footage.frames import training_frames
+from mien.training.footage.sequence import Sequence
 from mien.training.parts import Preparation
 from mien.training.trainer import start
 from mien.training.whole_head.completion import complete_colors, vertex_means

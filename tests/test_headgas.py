@@ -9,16 +9,19 @@ from torch import Tensor
 
 from known import known
 from mien.adam import FactoredMoments, Moments
-from mien.avatar import HeadGas, HeadGasConfig, Progress, make_portable, method_named
 from mien.avatar.avatar import neutral_of
+from mien.avatar.baking import make_portable
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.headgas.avatar import input_directions, neighbor_distances, sample_surface, spread_out
+from mien.avatar.headgas.avatar import HeadGas, input_directions, neighbor_distances, sample_surface, spread_out
 from mien.avatar.headgas.constants import HEADGAS
-from mien.avatar.headgas.settings import Variant
+from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.headgas.variants import MOVED, averaging_weights
+from mien.avatar.methods import method_named
+from mien.avatar.schedules import Progress
 from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, head_poses
+from mien.face import FaceModel, FaceParams
+from mien.face.posing import head_poses
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
 from mien.runtime import pose

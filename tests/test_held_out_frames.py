@@ -7,8 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from mien.avatar import METHODS, MethodConfig
-from mien.training import Sequence, TrainSettings, train
+from mien.avatar.methods import METHODS
+from mien.avatar.settings import MethodConfig
+from mien.training import TrainSettings, train
+from mien.training.footage.sequence import Sequence
 from plain_settings import plain_config
 from toy_scene import toy_sequence
 

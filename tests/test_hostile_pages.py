@@ -13,8 +13,8 @@ import pytest
 
 from mien import runtime
 from mien.errors import UserError
-from mien.export import pack, write_page
-from mien.export.web_page import TEMPLATE
+from mien.export.packed import pack
+from mien.export.web_page import TEMPLATE, write_page
 from mien.pages import render, with_code
 from web_case import WEB, drawn_head, node
 

@@ -21,14 +21,18 @@ from mien.capture import read_capture
 from mien.capture.frame_files import CacheWriter, FrameLayout, FrameWriter
 from mien.cli import main
 from mien.errors import UserError
-from mien.evaluation import EvaluationSettings, evaluate
+from mien.evaluation import evaluate
 from mien.evaluation.experiment import Frame
 from mien.evaluation.partial import PartialScores
+from mien.evaluation.protocols import EvaluationSettings
 from mien.face.loading import read_landmarks
 from mien.inside import check_tree, inside, is_plain_name, remove_tree
 from mien.storage import file_digest, read_tensors, write_tensors
-from mien.tracking import TrackingSettings, pipeline, read_scoring, read_tracking, track_subject
-from mien.training import read_run_config, read_sequence, trainer
+from mien.tracking import pipeline, read_tracking, track_subject
+from mien.tracking.scoring_files import read_scoring
+from mien.tracking.settings import TrackingSettings
+from mien.training import read_sequence, trainer
+from mien.training.run import read_run_config
 from mien.workspace import Workspace, check_new_workspace, open_workspace
 from shared_things import MadeOnce, evaluated_workspace
 from toy_scene import toy_face_model, toy_sequence

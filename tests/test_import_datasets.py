@@ -18,19 +18,13 @@ from mien.capture.source import read_image
 from mien.cli import main
 from mien.commands.stages import importing
 from mien.datasets import overlay, sequences
-from mien.face import add_face_model
+from mien.face.loading import add_face_model
 from mien.files import write_json
 from mien.runtime import load as load_portable
-from mien.training import (
-    OwnSplit,
-    TrainSettings,
-    read_face_track,
-    read_own_split,
-    read_sequence,
-    with_own_split,
-    write_own_split,
-)
+from mien.training import TrainSettings, read_sequence
 from mien.training.footage.frames import training_frames
+from mien.training.footage.own_split import OwnSplit, read_own_split, with_own_split, write_own_split
+from mien.training.run import read_face_track
 from shared_things import MadeOnce, toy_workspace
 from toy_workspace import write_toy_workspace
 

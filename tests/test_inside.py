@@ -8,14 +8,15 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mien.avatar import METHODS, Avatar
+from mien.avatar import Avatar
+from mien.avatar.methods import METHODS
 from mien.face import FaceModel
 from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
-from mien.training import Sequence, train
+from mien.training import train
 from mien.training.footage.frames import training_frames
 from mien.training.footage.hidden import hidden_triangles, inside_triangles
-from mien.training.footage.sequence import Targets
+from mien.training.footage.sequence import Sequence, Targets
 from mien.training.whole_head.mouth_interior import Inside, cover_hidden, covered_reference
 from mien.training.whole_head.unseen import unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run

@@ -14,7 +14,8 @@ from mien.capture.litert.mesh import Mesh
 from mien.capture.matte import Segmenter
 from mien.capture.settings import CaptureSettings
 from mien.capture.video import read_video_frames
-from mien.lab.synthetic import SyntheticRecipe, SyntheticScene
+from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.scene import SyntheticScene
 from mien.picture_files import write_png
 
 pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")

@@ -12,9 +12,12 @@ from capture_helpers import random_capture
 from mien import picture_files
 from mien.capture import read_capture, write_capture
 from mien.picture_files import map_pictures
-from mien.tracking import make_scoring, read_scoring, track, write_scoring
+from mien.tracking import track
 from mien.tracking.fitting import solver
-from mien.tracking.landmarks import LandmarkModel, stages, term
+from mien.tracking.landmarks import stages, term
+from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.scoring import make_scoring
+from mien.tracking.scoring_files import read_scoring, write_scoring
 from needs import NO_PROC
 from small_face_model import make_small_face_model
 from test_tracking_scoring import _tracking, _upright

@@ -13,25 +13,21 @@ import torch
 from damage import edit_json
 from known import known
 from mien import runtime
-from mien.avatar import (
-    DEFAULT_METHOD,
-    METHODS,
-    Avatar,
-    GaussianStore,
-    HeadGasConfig,
-    MethodConfig,
-    Moments,
-    ParameterGroup,
-    Progress,
-    load_avatar,
-    write_avatar,
-)
+from mien.avatar import Avatar, load_avatar
+from mien.avatar.avatar import ParameterGroup
 from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.density import FixedDensity
-from mien.avatar.headgas.settings import Variant
-from mien.avatar.settings import GradientSettings, PerceptualLoss, Photometric
+from mien.avatar.files import write_avatar
+from mien.avatar.headgas.settings import HeadGasConfig, Variant
+from mien.avatar.methods import DEFAULT_METHOD, METHODS
+from mien.avatar.schedules import Progress
+from mien.avatar.settings import GradientSettings, MethodConfig, PerceptualLoss, Photometric
+from mien.avatar.store import GaussianStore, Moments
 from mien.errors import UserError
-from mien.export import MeshModel, pack, read_glb_avatar, write_glb, write_page
+from mien.export.glb import MeshModel, write_glb
+from mien.export.glb_avatar import read_glb_avatar
+from mien.export.packed import pack
+from mien.export.web_page import write_page
 from mien.face import FaceModel
 from mien.render import rasterize
 from mien.training import TrainSettings

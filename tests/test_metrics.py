@@ -14,7 +14,8 @@ from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import scoring
 from mien.evaluation.metrics import MAX_PSNR, Windows, crop_to, l1, psnr, ssim, ssim_map
-from mien.perceptual import distance, load_perceptual, lpips, weights
+from mien.perceptual import distance, lpips, weights
+from mien.perceptual.distance import load_perceptual
 from mien.storage import read_json
 
 

@@ -8,18 +8,20 @@ import torch
 from torch import Tensor
 
 from known import known
-from mien.avatar import MonoGaussianAvatar, Progress, Rate
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar import motion
+from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
 from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.mono_gaussian_avatar.motion import canonical_face, nearest_vertices
 from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.avatar.schedules import Progress, Rate
 from mien.avatar.surface_places import at_places, random_places
 from mien.errors import UserError
-from mien.face import FaceModel, head_poses
+from mien.face import FaceModel
 from mien.face.mirror import triangle_geometry
+from mien.face.posing import head_poses
 from mien.training import PRESETS
 from mono_avatars import SMALL, new_avatar, pictured
 from plain_settings import plain_mono_gaussian_avatar

@@ -10,16 +10,12 @@ import pytest
 import torch
 
 from mien.camera import camera_from_fov, look_at
-from mien.driving import (
-    ARKIT_NAMES,
-    Motion,
-    drive,
-    face_of_motion,
-    read_blendshape_json,
-    read_live_link_face,
-    read_recording,
-)
-from mien.driving.motion import gaze_of
+from mien.driving import drive
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.drivers import read_recording
+from mien.driving.live_link_face import read_live_link_face
+from mien.driving.motion import ARKIT_NAMES, Motion, gaze_of
+from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.render.mesh import rasterize_mesh

@@ -17,9 +17,11 @@ from mien.commands.stages import training as training_stage
 from mien.commands.stages.evaluating import driver_folders
 from mien.errors import UserError
 from mien.tracking import write_tracking
-from mien.training import PRESETS, TrainSettings, doubly_held_out, split_by_name, with_benchmark_split, with_named_split
+from mien.training import PRESETS, TrainSettings
+from mien.training.footage.benchmark_split import with_benchmark_split
 from mien.training.footage.frames import training_frames
-from mien.training.footage.named_split import SEQUENCES, driving_sequences
+from mien.training.footage.named_split import SEQUENCES, driving_sequences, split_by_name, with_named_split
+from mien.training.settings import doubly_held_out
 from toy_scene import toy_face_model, toy_sequence, toy_tracking
 
 FOLDERS = (

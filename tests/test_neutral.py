@@ -10,10 +10,11 @@ import torch
 from mien.avatar import neutral_of
 from mien.commands.options import check_neutral
 from mien.commands.stages.driving import open_driver
-from mien.driving import drive, facing, rest_of, with_neutral
+from mien.driving import drive
 from mien.driving.constants import DRIVING
 from mien.driving.drivers import Driver
-from mien.driving.rest import kept_share
+from mien.driving.neutral import with_neutral
+from mien.driving.rest import facing, kept_share, rest_of
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle

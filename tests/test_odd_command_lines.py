@@ -14,7 +14,8 @@ from damage import edit_json
 from mien.cli import main
 from mien.commands.stages.names import doubled_videos
 from mien.errors import UserError
-from mien.tracking import TrackingSettings, read_tracking
+from mien.tracking import read_tracking
+from mien.tracking.settings import TrackingSettings
 from mien.workspace import Workspace
 from shared_things import MadeOnce, toy_workspace
 

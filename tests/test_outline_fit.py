@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from mien.avatar import DEFAULT_METHOD, FaceTuning
+from mien.avatar.methods import DEFAULT_METHOD
+from mien.avatar.settings import FaceTuning
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.render.mesh import rasterize_mesh
-from mien.training import Sequence, TrainSettings
-from mien.training.footage import Frame
+from mien.training import TrainSettings
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence
 from mien.training.trainer import start
-from mien.training.whole_head import fitted_faces
-from mien.training.whole_head.outline_fit import fit_to_outlines
+from mien.training.whole_head.outline_fit import fit_to_outlines, fitted_faces
 from plain_settings import plain_config, plain_run
 from test_hair import _TIMESTEPS, _sequence
 from toy_scene import toy_sequence

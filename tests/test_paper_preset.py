@@ -13,8 +13,10 @@ from typing import Any
 import pytest
 import torch
 
-from mien.avatar import METHODS, GaussianAvatars, Progress, Rate
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
+from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.avatar.schedules import Progress, Rate
 from mien.camera import Camera
 from mien.training import PRESETS, TrainSettings
 from mien.training.adam import Adam

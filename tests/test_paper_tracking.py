@@ -8,17 +8,21 @@ import pytest
 import torch
 
 from mien.adam import Moments
-from mien.tracking import TrackingSettings, track, track_subject
+from mien.tracking import track, track_subject
 from mien.tracking.constants import TRACKING
 from mien.tracking.descent import epochs, frames
 from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent
 from mien.tracking.descent.scene import first_state, paper_scene
 from mien.tracking.descent.terms import landmark_terms, prior_term, read_target
-from mien.tracking.fitting import Fit, SequenceFit, StageCache, layout_of, lenses_of, resume, shot_of, widen
-from mien.tracking.landmarks import all_landmarks, quiet_landmarks, reduce_face_model
-from mien.tracking.landmarks.term import unknown_subject
-from mien.tracking.settings import PaperSettings, PhotometricSettings
+from mien.tracking.fitting import resume
+from mien.tracking.fitting.fit import Fit, SequenceFit, widen
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import lenses_of, shot_of
+from mien.tracking.landmarks.model import reduce_face_model
+from mien.tracking.landmarks.term import all_landmarks, quiet_landmarks, unknown_subject
+from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
 from photometric_case import FOCAL, PhotometricCase, assert_alike, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
 

@@ -12,18 +12,19 @@ from torch.nn.functional import conv2d, interpolate, max_pool2d
 
 import train_toy
 from mien import _native
-from mien.avatar import PerceptualLoss, Photometric
+from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.perceptual import load_training_features
+from mien.perceptual.features import load_training_features
 from mien.perceptual.weights import weights_path
 from mien.pictures import Box
 from mien.render.rendering import Rendering
-from mien.training import Sequence, TrainSettings, read_curves, train
+from mien.training import TrainSettings, train
 from mien.training.footage.frames import crop_random
-from mien.training.footage.sequence import Target, Targets
+from mien.training.footage.sequence import Sequence, Target, Targets
 from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss, person_box
 from mien.training.photometric import differentiable_ssim_map, photometric_loss, photometric_loss_reference
+from mien.training.run import read_curves
 from rasterize_scenes import relative_error
 from toy_scene import toy_sequence
 from train_toy import silence

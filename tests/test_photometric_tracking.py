@@ -12,15 +12,25 @@ from mien.camera import Camera
 from mien.render.mesh import Texture as MeshTexture
 from mien.render.mesh import interpolate, rasterize_mesh, render_mesh, sample_texture, shade, vertex_normals
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking import Tracking, TrackingSettings, residual_report, track, track_subject
-from mien.tracking.fitting import Subject, Views, batch_of, layout_of
-from mien.tracking.pixels import SkinTexture, even_light, texture_space
+from mien.tracking import track, track_subject
+from mien.tracking.fitting.fit import Subject
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.views import Views, batch_of
 from mien.tracking.pixels.outline import OutlineTerm, edge_distances, outline_term
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.shared import move_like_keyframes
 from mien.tracking.pixels.surface import PosedSurface, surface_model
-from mien.tracking.pixels.texture import Sighting, estimate_appearance, unknown_texture
-from mien.tracking.settings import PhotometricSettings
+from mien.tracking.pixels.texture import (
+    Sighting,
+    SkinTexture,
+    estimate_appearance,
+    even_light,
+    texture_space,
+    unknown_texture,
+)
+from mien.tracking.report.residuals import residual_report
+from mien.tracking.settings import PhotometricSettings, TrackingSettings
+from mien.tracking.tracking import Tracking
 from photometric_case import (
     FOCAL,
     SIZE,

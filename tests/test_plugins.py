@@ -16,15 +16,17 @@ import torch
 from batch_stub import PROGRAM
 from forked import ForkServer
 from fuzzing import uses
-from mien.avatar import METHODS, has_method, method_named, method_names
-from mien.avatar.methods import Method
-from mien.batch import Batch
-from mien.capture import read_capture_hash
+from mien.avatar.methods import METHODS, Method, has_method, method_named, method_names
+from mien.batch.plan import Batch
+from mien.capture.store import read_capture_hash
 from mien.cli import main
-from mien.datasets import Dataset, TrackedSequence, write_sequence
+from mien.datasets import Dataset
+from mien.datasets.dataset import TrackedSequence
+from mien.datasets.writing import write_sequence
 from mien.errors import UserError
-from mien.face import Landmarks, add_face_model
-from mien.tracking import scoring_exists
+from mien.face.loading import add_face_model
+from mien.face.model import Landmarks
+from mien.tracking.scoring_files import scoring_exists
 from mien.training import read_sequence
 from shared_things import toy_workspace
 from toy_package import blocks, entry_points, help_of, install, mien

@@ -8,14 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from mien.avatar import PointAvatar, PointAvatarConfig, Progress
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
-from mien.avatar.point_avatar.avatar import was_drawn
+from mien.avatar.point_avatar.avatar import PointAvatar, was_drawn
 from mien.avatar.point_avatar.networks import SurfaceNet
+from mien.avatar.point_avatar.settings import PointAvatarConfig
+from mien.avatar.schedules import Progress
 from mien.errors import UserError
-from mien.face import FaceParams, head_poses
+from mien.face import FaceParams
+from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
-from mien.render import close_holes, rasterize
+from mien.render import rasterize
+from mien.render.closing import close_holes
 from mien.training import PRESETS
 from plain_settings import plain_point_avatar
 from sh_colors import rgb_from_sh

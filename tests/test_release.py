@@ -13,10 +13,9 @@ import pytest
 from scikit_build_core.build import build_sdist
 
 from mien.cli import main
-from mien.licences import PARTS, installed_licences, spdx_document
-from mien.licences.facts import PACKAGES
-from mien.licences.installed import canonical, kind_of
-from mien.licences.spdx import requirements_of
+from mien.licences.facts import PACKAGES, PARTS
+from mien.licences.installed import canonical, installed_licences, kind_of
+from mien.licences.spdx import requirements_of, spdx_document
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "release"))

@@ -11,7 +11,9 @@ import safetensors.numpy
 import torch
 
 from mien import runtime
-from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, make_portable
+from mien.avatar import Avatar
+from mien.avatar.baking import make_portable
+from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.errors import UserError
 from mien.runtime.posing import run_network
 from plain_settings import plain_config

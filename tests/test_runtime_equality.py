@@ -11,11 +11,15 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, GaussianAvatars, MethodConfig, make_portable
+from mien.avatar import Avatar
+from mien.avatar.baking import make_portable
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
+from mien.avatar.methods import DEFAULT_METHOD, METHODS
+from mien.avatar.settings import MethodConfig
 from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render import rasterize
-from mien.runtime import Gaussians
+from mien.runtime.posing import Gaussians
 from plain_settings import plain_config
 
 EQUAL = 1e-5

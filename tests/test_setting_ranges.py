@@ -10,11 +10,15 @@ import pytest
 
 import train_toy
 from mien import _native
-from mien.avatar import METHODS, HeadGasConfig, Rate, RefillSettings
+from mien.avatar.headgas.settings import HeadGasConfig
+from mien.avatar.methods import METHODS
+from mien.avatar.schedules import Rate
+from mien.avatar.settings import RefillSettings
 from mien.commands.settings_options import leaves
 from mien.errors import UserError
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges
-from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings, train, trainer
+from mien.training import PRESETS, TrainSettings, train, trainer
+from mien.training.settings import MAIN_SETTINGS
 from test_settings import help_of, with_file
 from toy_scene import toy_sequence
 

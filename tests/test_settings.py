@@ -8,8 +8,12 @@ from typing import Any
 
 import pytest
 
-from mien.avatar import METHODS, FaceTuning, GaussianAvatarsConfig, GradientSettings, HeadGasConfig, MethodConfig, Rate
+from mien.avatar import GaussianAvatarsConfig
+from mien.avatar.headgas.settings import HeadGasConfig
+from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import PRESETS as mono_gaussian_avatar_presets
+from mien.avatar.schedules import Rate
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
 from mien.cli import main
 from mien.commands.stages import training
 from mien.training import PRESETS, TrainSettings

@@ -9,26 +9,29 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.avatar import GaussianAvatars, Progress, make_portable, method_named
+from mien.avatar.baking import make_portable
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
+from mien.avatar.methods import method_named
+from mien.avatar.schedules import Progress
 from mien.camera import camera_from_fov
 from mien.cli import main
 from mien.commands.picture import PictureOptions
 from mien.commands.stages import pictures
 from mien.commands.stages.exporting import RunContent
 from mien.commands.stages.pictures import posed_softly
-from mien.export import write_packed
+from mien.export.web_page import write_packed
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.gaussians import world_means
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
-from mien.runtime import MeshBound
-from mien.tracking import NeckCut, NeckParts, fit_neck_cut, head_cutter
+from mien.runtime.baked import MeshBound
+from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
+from mien.tracking.scoring import head_cutter
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame, resolved
-from mien.training.whole_head import with_soft_cut
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
-from mien.training.whole_head.soft_cut import opacity_shares
+from mien.training.whole_head.soft_cut import opacity_shares, with_soft_cut
 from mien.training.whole_head.unseen import fills_sides
 from mien.workspace import open_workspace
 from plain_settings import plain_gaussian_avatars

@@ -14,10 +14,11 @@ import pytest
 import torch
 
 from mien import extras, runtime
-from mien.avatar import make_portable
+from mien.avatar.baking import make_portable
 from mien.cli import COMMANDS, main
-from mien.export import pack, write_page
+from mien.export.packed import pack
 from mien.export.pixels import png_bytes
+from mien.export.web_page import write_page
 from mien.licences.spdx import requirements_of
 from mien.render import camera_paths as torchs
 from mien.runtime import camera_paths

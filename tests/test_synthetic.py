@@ -13,18 +13,13 @@ from exact_guard import exact_guard
 from mien import exact
 from mien.capture import read_capture
 from mien.errors import UserError
-from mien.lab.synthetic import (
-    RECIPES,
-    REFERENCES,
-    Segment,
-    SyntheticScene,
-    read_truth,
-    reference_named,
-    synthesize,
-    write_synthetic_capture,
-)
-from mien.lab.synthetic.captures import Pictures, inputs_hash
+from mien.lab.synthetic import RECIPES, synthesize
+from mien.lab.synthetic.captures import Pictures, inputs_hash, write_synthetic_capture
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
+from mien.lab.synthetic.recipe import Segment
+from mien.lab.synthetic.references import REFERENCES, reference_named
+from mien.lab.synthetic.scene import SyntheticScene
+from mien.lab.synthetic.truth import read_truth
 from mien.render.mesh import vertex_normals
 from reference_signatures import drawn_signatures, signature_distance, stored_signatures
 

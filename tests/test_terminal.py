@@ -21,7 +21,7 @@ from mien.overall import Overall, Piece
 from mien.progress import progress_bar, say, whole_command
 from mien.terminal import plain_name, printable, show
 from mien.threads import MAX_THREADS, asked_threads, thread_count
-from mien.tracking import TrackingSettings
+from mien.tracking.settings import TrackingSettings
 from mien.training import TrainSettings
 
 NASTY = "\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\udcff.mp4"

@@ -8,7 +8,10 @@ import torch
 from torch import Tensor
 
 from known import known
-from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, move_avatar
+from mien.avatar.avatar import move_avatar
+from mien.avatar.schedules import Progress
+from mien.avatar.textured_mesh.avatar import TexturedMesh
+from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams

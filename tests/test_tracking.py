@@ -7,16 +7,18 @@ import pytest
 import torch
 
 from mien.camera import look_at
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle, rigid_transform
-from mien.tracking import Tracking, TrackingSettings, read_tracking, residual_report, track, track_subject
+from mien.tracking import read_tracking, track, track_subject
 from mien.tracking import write_tracking as write
 from mien.tracking.fitting.shot import initial_camera
 from mien.tracking.landmarks.groups import landmark_weights
 from mien.tracking.report.overlay import frontal_camera
-from mien.tracking.settings import PaperSettings, PhotometricSettings
+from mien.tracking.report.residuals import residual_report
+from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
+from mien.tracking.tracking import Tracking
 from small_face_model import make_small_face_model
 from tracking_case import FOCAL, FPS, SIZE, capture_of, make_tracking_case, still_camera
 

@@ -11,13 +11,18 @@ import numpy as np
 import pytest
 import torch
 
-from mien.capture import Capture, write_capture
+from mien.capture import write_capture
+from mien.capture.capture import Capture
 from mien.cli import main
-from mien.tracking import Tracking, TrackingSettings, read_tracking, track, track_subject
-from mien.tracking.fitting import Fit, StageCache, Subject, shot_of
+from mien.tracking import read_tracking, track, track_subject
+from mien.tracking.fitting.fit import Fit, Subject
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import shot_of
 from mien.tracking.held_out import mean_light
-from mien.tracking.pixels import PhotometricFit, SkinTexture, turn_light
-from mien.tracking.settings import PaperSettings, PhotometricSettings
+from mien.tracking.pixels.outcome import turn_light
+from mien.tracking.pixels.texture import PhotometricFit, SkinTexture
+from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
+from mien.tracking.tracking import Tracking
 from photometric_case import PhotometricCase, assert_alike, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
 

@@ -5,11 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien.tracking import SmoothnessSettings, TrackingSettings, fitting
-from mien.tracking.landmarks import LandmarkTerm, all_landmarks, groups, reduce_face_model, without_turn_habits
+from mien.tracking import fitting
+from mien.tracking.landmarks import groups
+from mien.tracking.landmarks.model import reduce_face_model
 from mien.tracking.landmarks.outcome import fill_gaps
 from mien.tracking.landmarks.shared_fit import joint_cost, precision_of_shared
-from mien.tracking.landmarks.term import unknown_subject
+from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, unknown_subject
+from mien.tracking.landmarks.turn_habits import without_turn_habits
+from mien.tracking.settings import SmoothnessSettings, TrackingSettings
 from small_face_model import make_small_face_model
 from tracking_case import make_tracking_case, still_camera
 

@@ -12,30 +12,25 @@ import pytest
 import torch
 
 from mien.camera import Camera, look_at
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.capture.video import probe_video
 from mien.face import FaceModel
 from mien.parallel import stream_in_threads
 from mien.render.mesh import shade
 from mien.rotation import invert_rigid, matrix_from_axis_angle
-from mien.tracking import (
-    Appearance,
-    Tracking,
-    TrackingSettings,
-    residual_report,
-    track,
-    write_overlay,
-    write_residual_report,
-)
-from mien.tracking.pixels import SkinTexture, even_light, model_pictures, window_of
+from mien.tracking import track
+from mien.tracking.pixels.comparison import model_pictures, window_of
 from mien.tracking.pixels.outcome import appearance_in_world, turn_light
+from mien.tracking.pixels.texture import SkinTexture, even_light
 from mien.tracking.report import overlay
 from mien.tracking.report.contact_sheet import sheet_frames, sheet_rows, worst_of_runs
 from mien.tracking.report.heat import heat_map
-from mien.tracking.report.overlay import OverlayPainter, overlay_stride
+from mien.tracking.report.overlay import OverlayPainter, overlay_stride, write_overlay
 from mien.tracking.report.page import findings, name_runs
+from mien.tracking.report.residuals import residual_report, write_residual_report
 from mien.tracking.report.rig import seen_from_front, visible_landmarks
-from mien.tracking.settings import PaperSettings, PhotometricSettings
+from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
+from mien.tracking.tracking import Appearance, Tracking
 from photometric_case import FOCAL, SIZE, PhotometricCase, make_photometric_case, smooth_noise
 from small_face_model import make_small_face_model
 from tracking_case import make_tracking_case, still_camera

@@ -13,12 +13,16 @@ import torch
 from mien.capture import write_capture
 from mien.cli import main
 from mien.commands.stages import tracking as stage
-from mien.tracking import TrackingSettings, track_subject
-from mien.tracking.fitting import StageCache, layout_of, shot_of
-from mien.tracking.landmarks import reduce_face_model, stages
+from mien.tracking import track_subject
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import shot_of
+from mien.tracking.landmarks import stages
+from mien.tracking.landmarks.model import reduce_face_model
 from mien.tracking.pixels import refine
-from mien.tracking.report import Preview, preview
-from mien.tracking.settings import PaperSettings, PhotometricSettings
+from mien.tracking.report import preview
+from mien.tracking.report.preview import Preview
+from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
 from photometric_case import FOCAL, assert_alike, make_photometric_case, make_textured_model
 
 FAST = TrackingSettings(photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1))

@@ -13,25 +13,20 @@ from damage import edit_json
 from mien.camera import look_at
 from mien.errors import UserError
 from mien.storage import read_json, read_tensors, write_tensors
-from mien.tracking import (
-    Appearance,
-    Scoring,
-    ScoringSettings,
-    Tracking,
-    check_scoring_cut,
-    make_scoring,
-    read_scoring,
-    read_scoring_hash,
-    read_tracking,
-    scoring_exists,
-    write_overlay,
-    write_scoring,
-    write_tracking,
-)
+from mien.tracking import read_tracking, write_tracking
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.neck_line import bottom_vertices, fit_neck_lines
-from mien.tracking.report.overlay import OverlayPainter
-from mien.tracking.scoring import cut_matte, head_crop
+from mien.tracking.report.overlay import OverlayPainter, write_overlay
+from mien.tracking.scoring import Scoring, cut_matte, head_crop, make_scoring
+from mien.tracking.scoring_files import (
+    check_scoring_cut,
+    read_scoring,
+    read_scoring_hash,
+    scoring_exists,
+    write_scoring,
+)
+from mien.tracking.settings import ScoringSettings
+from mien.tracking.tracking import Appearance, Tracking
 from small_face_model import make_small_face_model
 from tracking_case import SIZE, capture_of, still_camera
 

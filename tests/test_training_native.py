@@ -17,7 +17,6 @@ import test_point_network as points
 from instruction_sets import by_threads
 from mien import _native
 from mien.adam import FactoredMoments
-from mien.avatar import GaussianStore, Moments
 from mien.avatar.gaussian_avatars.settings import SurfaceLimits
 from mien.avatar.gaussian_avatars.surface_limits import (
     keep_on_surface,
@@ -30,6 +29,7 @@ from mien.avatar.ops.expression_changes import expression_change, expression_cha
 from mien.avatar.ops.skin_points import skin_points, skin_points_reference
 from mien.avatar.ops.triangle_frames import bind_to_world
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
+from mien.avatar.store import GaussianStore, Moments
 from mien.training.adam import (
     FactoredAdamUpdate,
     FactoredUpdate,

@@ -13,14 +13,16 @@ import pytest
 import dataset_writers as writers
 from dataset_cases import make_quick, tiny_scene
 from dataset_scene import NoDetector, Scene, drawn_person, scene_of
-from mien.batch import Batch, run_row
+from mien.batch.plan import Batch
+from mien.batch.row import run_row
 from mien.batch.steps import do_with
 from mien.cli import main
 from mien.commands.stages.batch_table import read_table
 from mien.datasets import matting, overlay, sequences
-from mien.evaluation import EvaluationSettings, evaluate
-from mien.face import add_face_model
+from mien.evaluation import evaluate
+from mien.evaluation.protocols import EvaluationSettings
 from mien.face.cache import cache_folder
+from mien.face.loading import add_face_model
 from mien.training import read_sequence
 
 pytestmark = pytest.mark.unchecked

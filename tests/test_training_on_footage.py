@@ -15,11 +15,15 @@ import color_charts
 from dataset_writers import FRONTAL, write_nersemble, write_picture
 from known import known
 from mien.camera import Camera
-from mien.capture import Capture, read_capture
+from mien.capture import read_capture
+from mien.capture.capture import Capture
 from mien.capture.video import write_video
 from mien.cli import main
-from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
-from mien.training import read_curves, read_sequence
+from mien.lab.synthetic import RECIPES
+from mien.lab.synthetic.recipe import Segment
+from mien.lab.synthetic.scene import SyntheticScene
+from mien.training import read_sequence
+from mien.training.run import read_curves
 
 PERSON = replace(
     RECIPES["plain"], width=550, height=802, fps=25.0, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),

@@ -12,14 +12,24 @@ import torch
 import train_toy
 from bounded_memory import MIB, allocating_at_most
 from mien import _native
-from mien.avatar import GaussianStore, Moments, ParameterGroup, Photometric, Progress, Rate, store_group
+from mien.avatar.avatar import ParameterGroup, store_group
+from mien.avatar.schedules import Progress, Rate
+from mien.avatar.settings import Photometric
+from mien.avatar.store import GaussianStore, Moments
 from mien.errors import UserError
 from mien.render.rendering import Rendering
-from mien.training import Sequence, held_out, train
+from mien.training import train
 from mien.training.adam import Adam
 from mien.training.ahead import AHEAD, targets_ahead
-from mien.training.footage.frames import FrameOrder, background_at, density_random, expression_rarity, training_frames
-from mien.training.footage.sequence import Target, Targets, composite, composite_reference
+from mien.training.footage.frames import (
+    FrameOrder,
+    background_at,
+    density_random,
+    expression_rarity,
+    held_out,
+    training_frames,
+)
+from mien.training.footage.sequence import Sequence, Target, Targets, composite, composite_reference
 from mien.training.losses import picture_losses
 from mien.training.photometric import photometric_loss
 from mien.training.settings import Split

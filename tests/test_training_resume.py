@@ -20,8 +20,9 @@ from mien.lab.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
 from mien.lab.benchmarking.train_step import training_case
 from mien.stops import Terminated
 from mien.storage import read_tensors, write_tensors
-from mien.training import read_curves, read_training_summary, train
+from mien.training import train
 from mien.training.checkpoint import checkpoint_files
+from mien.training.run import read_curves, read_training_summary
 from mien.training.trainer import step
 from toy_scene import toy_sequence
 

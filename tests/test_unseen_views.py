@@ -10,8 +10,8 @@ from known import known
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.lab.benchmarking.quality import unseen_lines
 from mien.lab.benchmarking.unseen_views import Front, angle_names, camera_beside, write_unseen_chart
-from mien.lab.synthetic import REFERENCES
 from mien.lab.synthetic.recipe import SIDES
+from mien.lab.synthetic.references import REFERENCES
 from mien.rotation import matrix_from_axis_angle
 
 

@@ -13,19 +13,24 @@ import torch
 from flame_like import exact_landmarks, flame_like, write_npz
 from gnm_like import gnm_landmarks, gnm_like, write_gnm
 from mien.avatar import load_avatar
-from mien.capture import Capture, write_capture
+from mien.capture import write_capture
+from mien.capture.capture import Capture
 from mien.cli import main
 from mien.commands.stages import face_models as stage
 from mien.errors import UserError
-from mien.face import FaceModel, Landmarks, available_face_models, load_face_model
+from mien.face import FaceModel, load_face_model
 from mien.face.cache import cache_folder
 from mien.face.checks import check_face_model
-from mien.lab.synthetic import SyntheticRecipe, synthesize
+from mien.face.listing import available_face_models
+from mien.face.model import Landmarks
+from mien.lab.synthetic import synthesize
+from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.runtime import load as load_portable
 from mien.storage import file_digest, write_json
-from mien.tracking import TrackingSettings, read_tracking, track
-from mien.tracking.landmarks import EmbeddingSettings, embedding
-from mien.tracking.settings import PaperSettings, PhotometricSettings
+from mien.tracking import read_tracking, track
+from mien.tracking.landmarks import embedding
+from mien.tracking.landmarks.embedding import EmbeddingSettings
+from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
 
 pytestmark = pytest.mark.unchecked
 

@@ -14,10 +14,9 @@ from mien.errors import UserError
 from mien.export.pixels import to_rgb
 from mien.face import load_face_model
 from mien.runtime.posing import rig_points
-from mien.viewer import Clip, Mesh, Session, View
-from mien.viewer.drawing import words_about_view
+from mien.viewer.drawing import Mesh, View, words_about_view
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
-from mien.viewer.session import center_of
+from mien.viewer.session import Clip, Session, center_of
 from shared_things import MadeOnce, toy_workspace
 from web_case import drawn_head, faces_of, motion_of
 

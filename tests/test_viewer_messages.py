@@ -19,9 +19,10 @@ from viser import _messages
 
 from fuzzing.viewer_messages import campaign
 from mien import runtime
-from mien.viewer import Session, panel
+from mien.viewer import panel
 from mien.viewer.messages import MOST_TEXT, Gate
 from mien.viewer.server import MOST_BROWSERS, Serving
+from mien.viewer.session import Session
 from test_viewer import clip_of
 from test_viewer_page import Client, connect, served
 from web_case import drawn_head, until

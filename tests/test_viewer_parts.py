@@ -19,13 +19,15 @@ import train_toy
 from capture_helpers import tree_bytes
 from forked import ForkServer
 from mien import runtime
-from mien.avatar import make_portable
+from mien.avatar.baking import make_portable
 from mien.commands.stages import live_view, viewing
 from mien.commands.stages.live_view import LiveView
 from mien.errors import UserError
 from mien.training import train
-from mien.viewer import Door, DrawingLoop, Session, View, is_loopback
-from mien.viewer.loop import STILL_SECONDS
+from mien.viewer.access import Door, is_loopback
+from mien.viewer.drawing import View
+from mien.viewer.loop import STILL_SECONDS, DrawingLoop
+from mien.viewer.session import Session
 from mien.viewer.work import Worker
 from test_runtime import new_avatar
 from toy_scene import toy_camera, toy_sequence

@@ -13,11 +13,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mien.driving.live import OneEuro
-from mien.export import find_webcam_files, write_packed, write_page
-from mien.export.webcam import VERSION
+from mien.driving.live.one_euro import OneEuro
+from mien.export.web_page import write_packed, write_page
+from mien.export.webcam import VERSION, find_webcam_files
 from mien.face import FaceModel, FaceParams
-from mien.lab.synthetic import SyntheticRecipe, SyntheticScene, motion, scene
+from mien.lab.synthetic import motion, scene
+from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.scene import SyntheticScene
 from web_case import WEB, browse, drawn_head, expect_usable, run_node, script, served, tasks_vision
 
 FAKE = "--use-fake-device-for-media-stream"

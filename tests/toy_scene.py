@@ -9,11 +9,11 @@ from torch import Tensor
 from mien.avatar import Avatar
 from mien.avatar.gaussian_avatars.surface import GaussianSurface
 from mien.camera import Camera
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.face import FaceModel, FaceParams
-from mien.runtime import Face
-from mien.tracking import Tracking
-from mien.training import Sequence
+from mien.runtime.posing import Face
+from mien.tracking.tracking import Tracking
+from mien.training.footage.sequence import Sequence
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

@@ -6,9 +6,15 @@ from pathlib import Path
 import numpy as np
 
 import train_toy
-from mien.capture import Capture, read_capture_hash, write_capture
-from mien.evaluation import EvaluationSettings, evaluate
-from mien.tracking import Scoring, Tracking, write_scoring, write_tracking
+from mien.capture import write_capture
+from mien.capture.capture import Capture
+from mien.capture.store import read_capture_hash
+from mien.evaluation import evaluate
+from mien.evaluation.protocols import EvaluationSettings
+from mien.tracking import write_tracking
+from mien.tracking.scoring import Scoring
+from mien.tracking.scoring_files import write_scoring
+from mien.tracking.tracking import Tracking
 from mien.training import read_sequence, train
 from toy_scene import toy_sequence
 

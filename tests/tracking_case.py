@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.face import FaceModel, FaceParams
-from mien.tracking.fitting import layout_of
+from mien.tracking.fitting.parameters import layout_of
 from small_face_model import make_small_face_model
 
 FOCAL, SIZE, FPS = 768.0, 512, 25.0

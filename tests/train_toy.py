@@ -9,7 +9,8 @@ from pathlib import Path
 
 import torch
 
-from mien.avatar import DEFAULT_METHOD, FaceTuning, GradientSettings
+from mien.avatar.methods import DEFAULT_METHOD
+from mien.avatar.settings import FaceTuning, GradientSettings
 from mien.progress import Advance
 from mien.training import train
 from plain_settings import plain_config, plain_run

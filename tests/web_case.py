@@ -23,8 +23,11 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.avatar import GaussianAvatars, HeadGas, HeadGasConfig, make_portable
-from mien.export import Motion, pack, unpacked
+from mien.avatar.baking import make_portable
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
+from mien.avatar.headgas.avatar import HeadGas
+from mien.avatar.headgas.settings import HeadGasConfig
+from mien.export.packed import Motion, pack, unpacked
 from mien.face import load_face_model
 from mien.runtime.baked import FeatureChanges
 from mien.runtime.posing import expression_changes, rig_points

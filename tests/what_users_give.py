@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import safetensors.numpy
 
-from mien.driving import ARKIT_NAMES
+from mien.driving.motion import ARKIT_NAMES
 from mien.evaluation.image_folders import write_crops
 
 

@@ -19,7 +19,10 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import dataset_scene  # noqa: E402
 import dataset_writers as writers  # noqa: E402
-from mien.datasets import TrackedSequence, matting, recognised, sequences, write_sequence  # noqa: E402
+from mien.datasets import matting, sequences  # noqa: E402
+from mien.datasets.dataset import TrackedSequence  # noqa: E402
+from mien.datasets.registry import recognised  # noqa: E402
+from mien.datasets.writing import write_sequence  # noqa: E402
 from mien.face import load_face_model  # noqa: E402
 
 OUT = Path(__file__).parent / "imported_meshes.webp"

@@ -18,20 +18,21 @@ from matplotlib.figure import Figure
 
 from mien.avatar import load_avatar
 from mien.camera import Camera
-from mien.capture import Capture, CaptureSettings, capture_video, read_capture_hash, write_capture
+from mien.capture import capture_video, write_capture
+from mien.capture.capture import Capture
+from mien.capture.settings import CaptureSettings
+from mien.capture.store import read_capture_hash
 from mien.capture.video import write_video
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.lab.synthetic import RECIPES, Segment, SyntheticRecipe, SyntheticScene, write_synthetic_video
+from mien.lab.synthetic import RECIPES
+from mien.lab.synthetic.captures import write_synthetic_video
+from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
+from mien.lab.synthetic.scene import SyntheticScene
 from mien.render import rasterize
-from mien.tracking import (
-    SmoothnessSettings,
-    TrackingSettings,
-    make_scoring,
-    read_tracking,
-    track,
-    write_scoring,
-    write_tracking,
-)
+from mien.tracking import read_tracking, track, write_tracking
+from mien.tracking.scoring import make_scoring
+from mien.tracking.scoring_files import write_scoring
+from mien.tracking.settings import SmoothnessSettings, TrackingSettings
 from mien.training import PRESETS, read_sequence, train
 
 SIZE, PERSON = 256, 3

@@ -3,7 +3,8 @@
 import sys
 from pathlib import Path
 
-from mien.batch import do_with, row_process
+from mien.batch.row import row_process
+from mien.batch.steps import do_with
 from mien.cli import main
 
 if __name__ == "__main__":

@@ -24,7 +24,8 @@ from typing import Any
 from safetensors.numpy import load_file
 
 from forked import Forked, ForkServer
-from mien.lab.synthetic import RECIPES, write_synthetic_video
+from mien.lab.synthetic import RECIPES
+from mien.lab.synthetic.captures import write_synthetic_video
 
 CLIP, FRAMES, SIDE = "clip.mp4", 10, 192
 TRACK = (

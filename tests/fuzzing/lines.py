@@ -17,7 +17,7 @@ from fuzzing.faults import Place
 from fuzzing.kinds import LITERALS, PORT, TEXTS
 from fuzzing.uses import run_words
 from mien import cli
-from mien.avatar import METHODS
+from mien.avatar.methods import METHODS
 from mien.cli import COMMANDS
 
 PARTS = ("given", "pictures", "videos", "flame", "gaussian_avatars", "flame_avatars", "head.mien", "head.ply", "cache")

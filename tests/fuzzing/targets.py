@@ -16,17 +16,22 @@ from mien.capture.calibration import read_calibration
 from mien.capture.given import read_landmarks
 from mien.commands.config_file import read_config_file
 from mien.driving.speech import read_speech
-from mien.evaluation import read_metrics
 from mien.evaluation.image_folders import read_crops
 from mien.evaluation.load import load_experiments
+from mien.evaluation.metrics_file import read_metrics
 from mien.evaluation.partial import PartialScores
-from mien.export import read_gaussian_avatars_folder, read_glb_avatar, read_ply, read_sog, read_spz, read_usd
+from mien.export import read_ply
+from mien.export.gaussian_avatars_folder import read_gaussian_avatars_folder
+from mien.export.glb_avatar import read_glb_avatar
+from mien.export.sog import read_sog
+from mien.export.spz import read_spz
+from mien.export.usd import read_usd
 from mien.face.flame import flame_face_model, read_flame
 from mien.render.camera_paths import read_cameras
 from mien.runtime import read_portable
-from mien.tracking import read_scoring, read_tracking
-from mien.training import read_curves, read_run_config, read_training_summary
-from mien.training.run import run_camera
+from mien.tracking import read_tracking
+from mien.tracking.scoring_files import read_scoring
+from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
 
 Read = Callable[[Path, Path], Any]
 """Reader that takes the folder with the copies and the faulty file."""

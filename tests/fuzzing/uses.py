@@ -19,8 +19,9 @@ from torch import Tensor, nn
 
 from fuzzing.material import ANALYSIS, CONFIG, GROWTH, QUICK, RUN, SEQUENCE, SETTINGS
 from mien import cli
-from mien.avatar import METHODS, load_avatar
+from mien.avatar import load_avatar
 from mien.avatar.baking import make_portable
+from mien.avatar.methods import METHODS
 from mien.capture.calibration import CalibratedCamera
 from mien.capture.crop import whole_picture
 from mien.capture.given import GivenMattes
@@ -30,23 +31,34 @@ from mien.capture.video import count_frames, probe_video, read_video_frames
 from mien.commands.config_file import ConfigFile
 from mien.commands.options import TrainOptions, with_settings
 from mien.commands.stages.importing import front_camera
-from mien.datasets import TrainedAvatar, datasets, recognised, write_sequence
-from mien.driving import Motion, drive, read_blendshape_json, read_live_link_face
+from mien.datasets.dataset import TrainedAvatar
+from mien.datasets.registry import datasets, recognised
+from mien.datasets.writing import write_sequence
+from mien.driving import drive
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
+from mien.driving.motion import Motion
 from mien.errors import UserError
-from mien.evaluation import evaluate, read_metrics
+from mien.evaluation import evaluate
 from mien.evaluation.image_source import open_pictures, read_picture
-from mien.export import in_world, read_glb, read_ply, write_gaussian_avatars_folder, write_ply
-from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
+from mien.evaluation.metrics_file import read_metrics
+from mien.export import in_world, read_ply, write_ply
+from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
+from mien.export.glb_file import read_glb
+from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.flame import flame_face_model
-from mien.lab.analysis import AnalysisOptions, run_analysis
+from mien.face.listing import available_face_models
+from mien.lab.analysis.running import run_analysis
+from mien.lab.analysis.spec import AnalysisOptions
 from mien.lab.analysis.study.files import read_all_answers, read_key
 from mien.lab.analysis.study.tally import tally_content, tally_text
 from mien.render import rasterize
-from mien.runtime import Avatar, write_portable
+from mien.runtime import write_portable
+from mien.runtime.avatar import Avatar
 from mien.storage import read_tensors
-from mien.training import read_face_track, read_sequence, train, write_imported_run
+from mien.training import read_sequence, train
 from mien.training.checkpoint import resume
-from mien.training.run import run_camera
+from mien.training.run import read_face_track, run_camera, write_imported_run
 from mien.training.trainer import start
 from mien.workspace import Workspace, open_workspace
 from toy_scene import toy_camera, toy_face_model, toy_sequence

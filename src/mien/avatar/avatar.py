@@ -20,7 +20,8 @@ from mien.avatar.density import DensityControl
 from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.settings import MethodConfig
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.runtime.baked import BakedAvatar, Filmed

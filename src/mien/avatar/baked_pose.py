@@ -8,7 +8,8 @@ from torch import Tensor
 
 from mien import runtime
 from mien.arrays import is_native
-from mien.face import FaceParams, head_poses
+from mien.face.params import FaceParams
+from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
 from mien.runtime.baked import BakedAvatar
 

@@ -15,8 +15,9 @@ from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_of
 from mien.camera import Camera
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
 from mien.face.listing import available_face_models
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.runtime import baked
 from mien.runtime.baked import About, Neutral, PortableAvatar, Rig
 

@@ -11,9 +11,10 @@ from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_named, method_of
 from mien.config import decode, encode, for_loading
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.checks import check_face_params
-from mien.face.loading import read_face_model, read_landmarks, write_face_model
+from mien.face.loading import load_face_model, read_face_model, read_landmarks, write_face_model
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.inside import check_subtrees, check_tree
 from mien.limits import MAX_NUMBER
 from mien.locks import read_beside_writers

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mien.avatar.constants import AVATAR
 from mien.avatar.ops.expression_changes import expression_inputs
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.runtime.baked import Filmed
 from mien.runtime.filmed import head_angles
 

@@ -8,7 +8,8 @@ import tyro
 
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
-from mien.training import AlignmentSettings, Split, TrainSettings, check_held_out
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.settings import Split, TrainSettings, check_held_out
 from mien.workspace import open_workspace
 
 _SPLITS = ("blocks", "tail", "none")

@@ -9,7 +9,8 @@ import tyro
 
 from mien.commands.help_text import Described
 from mien.errors import UserError
-from mien.lab.analysis import ANALYSES, Analysis, AnalysisOptions, chosen_parts
+from mien.lab.analysis.registry import ANALYSES
+from mien.lab.analysis.spec import Analysis, AnalysisOptions, chosen_parts
 from mien.workspace import Workspace, open_workspace
 
 
@@ -57,7 +58,7 @@ class Command:
         import json
 
         from mien.commands.stages.evaluating import run_sequences
-        from mien.lab.analysis import run_analysis
+        from mien.lab.analysis.running import run_analysis
         from mien.progress import say
         from mien.terminal import show
 

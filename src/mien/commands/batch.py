@@ -10,7 +10,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from mien.batch import Batch, EngineOptions, engine_named, engine_names, shard_of
+from mien.batch.drive import shard_of
+from mien.batch.engines import EngineOptions, engine_named, engine_names
+from mien.batch.plan import Batch
 from mien.commands.help_text import Described
 from mien.errors import UserError
 from mien.extras import EXTRA_OF
@@ -143,7 +145,10 @@ class Command:
             raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
 
     def _run_rows(self) -> None:
-        from mien.batch import Driver, batch_progress, progress_text, write_results, write_wall
+        from mien.batch.drive import Driver
+        from mien.batch.progress import batch_progress, progress_text
+        from mien.batch.results import write_results
+        from mien.batch.wall import write_wall
         from mien.commands.stages.batch_table import read_table
         from mien.progress import say
         from mien.terminal import counted
@@ -186,7 +191,7 @@ class Command:
             say(f"{counted(len(dropped), 'row')} of an earlier table will not be listed any more ({shown}); files stay")
 
     def _status(self, batch: Batch) -> None:
-        from mien.batch import batch_progress, progress_text
+        from mien.batch.progress import batch_progress, progress_text
 
         while True:
             found = batch_progress(batch)
@@ -196,7 +201,7 @@ class Command:
             time.sleep(_WATCH_SECONDS)
 
     def _table(self, batch: Batch) -> None:
-        from mien.batch import latex_table, markdown_table, means_by, result_rows
+        from mien.batch.results import latex_table, markdown_table, means_by, result_rows
         from mien.files import write_atomically
 
         columns = [column.strip() for column in self.columns.split(",") if column.strip()]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mien.avatar import DEFAULT_METHOD, METHODS
+from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.commands.options import PresetName, check_method, listed_methods
 from mien.devices import DeviceName, check_device, choose_device, like_on
 from mien.errors import UserError
@@ -200,7 +200,7 @@ class Compare:
     def check(self) -> None:
         """Check without heavy libraries that there is something to compare, and that it can be written."""
         from mien.files import check_writable
-        from mien.training import PRESETS
+        from mien.training.settings import PRESETS
 
         if not self.workspaces and not self.captures:
             raise UserError("nothing to compare on; give workspace folders, or --captures NAME")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from mien.capture import CaptureSettings
+from mien.capture.settings import CaptureSettings
 from mien.errors import UserError
 from mien.workspace import Workspace, check_new_workspace
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mien.avatar import has_method, method_names
+from mien.avatar.methods import has_method, method_names
 from mien.bounded import parse_json, read_bytes
 from mien.config import no_such_setting
 from mien.errors import UserError

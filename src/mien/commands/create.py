@@ -7,13 +7,17 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mien.avatar import MethodConfig
-from mien.capture import CaptureSettings
+from mien.avatar.settings import MethodConfig
+from mien.capture.settings import CaptureSettings
 from mien.commands.options import TrainOptions, check_viewer
 from mien.errors import UserError
 from mien.overall import Overall
-from mien.tracking import ScoringSettings, TrackingSettings
-from mien.training import BENCHMARK_SPLIT, NAMED_SPLIT, OWN_SPLIT, PRESETS, AlignmentSettings, TrainSettings
+from mien.tracking.settings import ScoringSettings, TrackingSettings
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.footage.benchmark_split import BENCHMARK_SPLIT
+from mien.training.footage.named_split import NAMED_SPLIT
+from mien.training.footage.own_split import OWN_SPLIT
+from mien.training.settings import PRESETS, TrainSettings
 from mien.workspace import Workspace, check_new_workspace
 
 
@@ -87,7 +91,7 @@ class Command:
         from mien.commands.stages.showing import name_next_commands, show_film
         from mien.commands.stages.tracking import check_masks
         from mien.progress import say, whole_command
-        from mien.training import check_run, check_untouched
+        from mien.training.run import check_run, check_untouched
         from mien.training.run import check_videos as check_trained_videos
 
         began = time.monotonic()
@@ -144,9 +148,9 @@ class Command:
         from mien.commands.stages.showing import show_page
         from mien.commands.stages.tracking import run_tracking_stage, show_trackings
         from mien.commands.stages.training import run_training_stage
-        from mien.evaluation import EvaluationSettings
+        from mien.evaluation.protocols import EvaluationSettings
         from mien.progress import say
-        from mien.training import check_held_out
+        from mien.training.settings import check_held_out
 
         if self.calibration is None:
             videos = zip(self.videos, sequence_names(self.videos, self.name), strict=True)

@@ -39,7 +39,8 @@ class Command:
         """Write the video unless it exists, then run `mien create` on it."""
         from dataclasses import replace
 
-        from mien.lab.synthetic import RECIPES, write_synthetic_video
+        from mien.lab.synthetic.captures import write_synthetic_video
+        from mien.lab.synthetic.recipe import RECIPES
         from mien.locks import hold
 
         recipe = RECIPES["demo"]

@@ -116,7 +116,7 @@ class Command:
     def _follow(self) -> None:
         from mien.commands.stages.following import CameraOptions, run_following_stage
         from mien.commands.stages.viewing import Place
-        from mien.driving.live import FollowOptions
+        from mien.driving.live.follower import FollowOptions
 
         place = Place("127.0.0.1", self.port) if has_viewer() else None
         follow = FollowOptions(self.head_pose, self.unlimited)

@@ -112,7 +112,7 @@ class Command:
 
     def _evaluate(self) -> None:
         from mien.commands.stages.evaluating import run_evaluation_stage
-        from mien.evaluation import EvaluationSettings
+        from mien.evaluation.protocols import EvaluationSettings
 
         whole = self.protocol is not None and self.lpips_weights is not None
         settings = EvaluationSettings(

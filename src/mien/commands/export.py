@@ -10,13 +10,15 @@ import tyro
 
 from mien.commands.help_text import Described
 from mien.commands.options import check_driver, check_neutral
-from mien.datasets.layouts import LAYOUTS, Layout, MatteKind, find_layout
+from mien.datasets.layouts.layout import Layout, MatteKind
+from mien.datasets.layouts.registry import LAYOUTS, find_layout
 from mien.errors import UserError
-from mien.formats import Format, Holds, endings, find_format, format_of, formats, numbered
+from mien.formats.format import Format, Holds
+from mien.formats.registry import endings, find_format, format_of, formats, numbered
 from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
-    from mien.formats import Options
+    from mien.formats.format import Options
 
 SUBMISSION = "nersemble-benchmark"
 """Name for `--format` of the benchmark's submission folder."""
@@ -213,7 +215,7 @@ class Command:
 
     def _check_capture(self, layout: Layout) -> None:
         """Check the options and paths of a capture."""
-        from mien.datasets.layouts import check_new_folder
+        from mien.datasets.layouts.layout import check_new_folder
 
         other = self._option_of_avatars()
         if other is not None:
@@ -353,8 +355,8 @@ class Command:
         kind.check(self.out)
 
     def _options(self) -> "Options":
-        from mien.export import find_webcam_files
-        from mien.formats import Options
+        from mien.export.webcam import find_webcam_files
+        from mien.formats.format import Options
 
         webcam = find_webcam_files(self.webcam_model) if self.webcam else None
         version = self.spz_version or 4

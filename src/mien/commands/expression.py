@@ -5,7 +5,8 @@ from dataclasses import replace
 import torch
 
 from mien.commands.assignments import Settable, angle_names, assign
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.progress import say
 from mien.runtime.baked import Filmed
 from mien.runtime.named import is_gaze, parts_of

@@ -46,7 +46,7 @@ class Command:
 
     def run(self) -> None:
         """Add or bake a model if asked for, then print the table."""
-        from mien.face import available_face_models
+        from mien.face.listing import available_face_models
         from mien.face.obtainable import OBTAINABLE
 
         if self.add is not None:
@@ -60,7 +60,7 @@ class Command:
                 )
             add_face_model_file(self.add, self.name, self.shareable, self.teeth)
         if self.bake is not None:
-            from mien.face import load_face_model
+            from mien.face.loading import load_face_model
 
             load_face_model(self.bake)
         rows = [asdict(info) for info in available_face_models()]

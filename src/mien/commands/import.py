@@ -8,7 +8,8 @@ import tyro
 
 from mien.commands.help_text import Described
 from mien.commands.stages.names import check_new_run, check_new_sequence, run_name
-from mien.datasets import Dataset, Findings, find_dataset, known_datasets, recognised
+from mien.datasets.dataset import Dataset, Findings
+from mien.datasets.registry import find_dataset, known_datasets, recognised
 from mien.errors import UserError
 from mien.workspace import Workspace, check_new_workspace
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 
 import tyro
 
-from mien.avatar import DEFAULT_METHOD, MethodConfig, has_method, method_named, method_names
+from mien.avatar.methods import DEFAULT_METHOD, has_method, method_named, method_names
+from mien.avatar.settings import MethodConfig
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.config_file import ConfigFile, read_config_file
 from mien.commands.help_text import Described, OtherValues, subclass_with
@@ -17,7 +18,8 @@ from mien.commands.settings_options import apply_options, check_names, leaves, o
 from mien.config import overlay
 from mien.devices import DeviceName, check_device
 from mien.errors import UserError
-from mien.training import MAIN_SETTINGS, NAMED_SPLIT, PRESETS, Split, TrainSettings, doubly_held_out
+from mien.training.footage.named_split import NAMED_SPLIT
+from mien.training.settings import MAIN_SETTINGS, PRESETS, Split, TrainSettings, doubly_held_out
 from mien.workspace import is_workspace, open_workspace
 
 if TYPE_CHECKING:

@@ -22,10 +22,12 @@ class Command:
 
     def run(self) -> None:
         """Print the list."""
-        from mien.avatar import METHODS, Method
-        from mien.batch import ENGINES, Engine
-        from mien.datasets import Dataset, datasets
-        from mien.formats import Format, formats
+        from mien.avatar.methods import METHODS, Method
+        from mien.batch.engines import ENGINES, Engine
+        from mien.datasets.dataset import Dataset
+        from mien.datasets.registry import datasets
+        from mien.formats.format import Format
+        from mien.formats.registry import formats
         from mien.plugins import added
 
         found = {

@@ -105,13 +105,15 @@ class Command:
         if self._is_file():
             self._draw_file()
             return
-        from mien.avatar import load_avatar, move_avatar
+        from mien.avatar.avatar import move_avatar
+        from mien.avatar.files import load_avatar
         from mien.commands.expression import tell_of_unfilmed, with_expression
         from mien.commands.stages.pictures import draw, posed_softly, warn_of_white, whole
         from mien.export.pictures import write_pictures
         from mien.face.checks import check_face_params
         from mien.progress import say, track_progress
-        from mien.training import filmed_range, filmed_words, read_coverage
+        from mien.training.footage.filmed import filmed_words, read_coverage
+        from mien.training.run import filmed_range
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
@@ -164,7 +166,8 @@ class Command:
         self, workspace: Workspace, run_dir: Path, model: "mien.face.FaceModel"
     ) -> "mien.face.FaceParams | None":
         """The motion of --sequence or --own-motion."""
-        from mien.training import read_face_track, read_sequence
+        from mien.training.footage.sequence import read_sequence
+        from mien.training.run import read_face_track
 
         if self.sequence is not None:
             return read_sequence(workspace.sequence_dir(workspace.pick_sequence(self.sequence))).tracking.face
@@ -237,7 +240,7 @@ class Command:
         from mien.commands.stages.pictures import view
         from mien.commands.stages.sheets import SMALL_TILE
         from mien.render.camera_paths import turned_camera
-        from mien.training import run_camera
+        from mien.training.run import run_camera
 
         options = self.picture
         if self.sheet in ("expressions", "filmed") and options.size is None:
@@ -252,7 +255,7 @@ class Command:
         face: "mien.face.FaceParams",
         output: "mien.export.output.Output",
     ) -> None:
-        from mien.avatar import move_avatar
+        from mien.avatar.avatar import move_avatar
         from mien.commands.stages.pictures import draw, posed_softly
         from mien.commands.stages.sheets import (
             draw_sheet,
@@ -263,7 +266,7 @@ class Command:
         )
         from mien.export.pictures import write_pictures
         from mien.progress import say
-        from mien.training import filmed_range
+        from mien.training.run import filmed_range
 
         camera, model = self._camera(run_dir, avatar.subject), avatar.face_model
         if self.sheet == "turntable":
@@ -287,7 +290,7 @@ class Command:
 
     def _chosen_timestep(self, run_dir: Path, face_model: "mien.face.FaceModel") -> "mien.face.FaceParams | None":
         """The face at --timestep, or None without that option."""
-        from mien.training import read_face_track
+        from mien.training.run import read_face_track
 
         if self.timestep is None:
             return None
@@ -338,7 +341,7 @@ class Command:
         """Cameras that do not depend on the avatar, one per frame, or None for a path around its head."""
         from mien.commands.stages.pictures import view
         from mien.render.camera_paths import read_cameras
-        from mien.tracking import read_tracking
+        from mien.tracking.files import read_tracking
 
         if self.cameras is not None:
             cameras = read_cameras(self.cameras)

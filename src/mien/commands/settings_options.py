@@ -13,7 +13,7 @@ from functools import partial
 from operator import attrgetter
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from mien.avatar import Rate
+from mien.avatar.schedules import Rate
 from mien.commands.help_text import field_docs
 from mien.config import no_such_setting
 from mien.errors import UserError

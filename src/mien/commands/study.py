@@ -12,7 +12,8 @@ from mien.terminal import show
 from mien.workspace import Workspace, open_workspace
 
 if TYPE_CHECKING:
-    from mien.lab.analysis.study import StudyRuns, StudySettings
+    from mien.lab.analysis.study.clips import StudyRuns
+    from mien.lab.analysis.study.settings import StudySettings
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Make:
 
     def run(self) -> None:
         """Write the page and the key."""
-        from mien.lab.analysis.study import write_study
+        from mien.lab.analysis.study.making import write_study
         from mien.progress import say
 
         opened = [open_workspace(folder) for folder in self.workspaces]
@@ -71,7 +72,7 @@ class Make:
         say(f"Look at {self.out} and send it; keep {key}, then: mien study tally {key} ANSWERS.json ...")
 
     def _settings(self) -> "StudySettings":
-        from mien.lab.analysis.study import StudySettings
+        from mien.lab.analysis.study.settings import StudySettings
 
         return StudySettings(self.clips, self.seconds, self.side, self.megabytes, self.seed)
 
@@ -155,7 +156,7 @@ class Command:
 
 def _study_runs(workspace: Workspace, labels: list[str]) -> "StudyRuns":
     from mien.commands.stages.evaluating import run_sequences
-    from mien.lab.analysis.study import StudyRuns
+    from mien.lab.analysis.study.clips import StudyRuns
 
     folders = {label: workspace.run_dir(label) for label in labels}
     runs = {label: (folder, tuple(run_sequences(workspace, folder))) for label, folder in folders.items()}

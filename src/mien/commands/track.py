@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mien.tracking import ScoringSettings, TrackingSettings
+from mien.tracking.settings import ScoringSettings, TrackingSettings
 from mien.workspace import open_workspace
 
 

@@ -7,15 +7,10 @@ from typing import Annotated
 import tyro
 
 from mien.commands.options import TrainOptions, check_viewer
-from mien.training import (
-    BENCHMARK_SPLIT,
-    NAMED_SPLIT,
-    OWN_SPLIT,
-    NamedSplit,
-    check_held_out,
-    split_by_name,
-    with_named_split,
-)
+from mien.training.footage.benchmark_split import BENCHMARK_SPLIT
+from mien.training.footage.named_split import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
+from mien.training.footage.own_split import OWN_SPLIT
+from mien.training.settings import check_held_out
 from mien.workspace import open_workspace
 
 
@@ -57,7 +52,7 @@ class Command:
             fill_in_own_split,
             run_training_stage,
         )
-        from mien.training import check_run
+        from mien.training.run import check_run
 
         workspace = open_workspace(self.workspace)
         method, settings = self.options.method_config(), self.options.settings()

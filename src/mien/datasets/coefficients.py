@@ -18,8 +18,8 @@ from mien.datasets.dataset import FilmedSequence, ReadSequence, TrackedSequence
 from mien.datasets.flame_poses import AXES, FRONT, axis_angles, camera_of
 from mien.datasets.sequences import tracked_sequence
 from mien.errors import UserError
-from mien.face import FaceModel
 from mien.face.coefficients import coefficient_count
+from mien.face.model import FaceModel
 
 Place = tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]
 """Turn R, scale s and shift d of mien's head in the axes of other poses: x -> s R x + d."""

@@ -7,7 +7,7 @@ from mien import export
 from mien.datasets.dataset import Dataset, TrainedAvatar
 
 if TYPE_CHECKING:
-    from mien.face import FaceModel
+    from mien.face.model import FaceModel
 
 _FILES = ("point_cloud.ply", "flame_param.npz")
 

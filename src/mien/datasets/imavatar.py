@@ -16,7 +16,7 @@ from mien.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
-    from mien.face import FaceModel
+    from mien.face.model import FaceModel
 
 _FILE = "flame_params.json"
 _VERSION = "FLAME 2020 (generic_model.pkl)"
@@ -144,7 +144,7 @@ def _clothes(clip: _Clip, root: Path, size: tuple[int, int]) -> "dict[str, np.nd
     import numpy as np
 
     from mien.datasets.pictures import read_matte
-    from mien.training.footage import packed_clothes
+    from mien.training.footage.clothes import packed_clothes
 
     if not (clip.file.parent / "semantic").is_dir():
         return {}
@@ -202,7 +202,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
 
 
 def _with_split(sequence: Any, held: dict[str, tuple[tuple[int, int], ...]]) -> ReadSequence:
-    from mien.training import OwnSplit
+    from mien.training.footage.own_split import OwnSplit
 
     return replace(sequence, own_split=OwnSplit(held[sequence.capture.name]) if held else None)
 

@@ -34,7 +34,7 @@ from mien.terminal import counted
 if TYPE_CHECKING:
     import numpy as np
 
-    from mien.face import FaceModel
+    from mien.face.model import FaceModel
 
 _FPS = 25.0
 TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
@@ -222,7 +222,7 @@ def _pictures(layout: _Layout, size: tuple[int, int]) -> "tuple[np.ndarray, np.n
 
 
 def _with_split(sequence: ReadSequence, layout: _Layout) -> ReadSequence:
-    from mien.training import OwnSplit, ranges_of
+    from mien.training.footage.own_split import OwnSplit, ranges_of
 
     return replace(sequence, own_split=OwnSplit(ranges_of(list(layout.test)))) if layout.test else sequence
 

@@ -12,7 +12,7 @@ from mien.errors import UserError
 from mien.inside import listed
 
 if TYPE_CHECKING:
-    from mien.face import FaceModel
+    from mien.face.model import FaceModel
 
 _MAX_CSV_BYTES = 256 << 20
 _DEPTH = "depth_data.bin"

@@ -16,8 +16,9 @@ from mien.bounded import MAX_SIDE, open_archive, open_member, open_ordinary
 from mien.datasets.content import REMEDY, rotation_part
 from mien.datasets.flame_poses import axis_angles, face_of_flame, in_front, matrices_from_rows_6d
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
 from mien.face.inert_pickle import parse_inert_pickle
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.limits import MAX_NUMBER
 from mien.progress import progress_bar
 

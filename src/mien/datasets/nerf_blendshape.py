@@ -24,7 +24,7 @@ from mien.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
-    from mien.face import FaceModel
+    from mien.face.model import FaceModel
 
 _FILE = "transforms.json"
 _FPS = 25.0
@@ -99,7 +99,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.datasets.matting import fill_mattes
     from mien.datasets.pictures import collect, read_picture
     from mien.datasets.sequences import filmed_sequence
-    from mien.training import OwnSplit
+    from mien.training.footage.own_split import OwnSplit
 
     file = path / _FILE
     content, frames = _frames(path)

@@ -26,7 +26,7 @@ from mien.inside import listed
 if TYPE_CHECKING:
     import numpy as np
 
-    from mien.face import FaceModel
+    from mien.face.model import FaceModel
 
 _CLIPS = ("train", "test")
 """The parts that become sequences. The five pictures of val are left out, because nothing tells their place in time."""
@@ -126,7 +126,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.datasets.matting import fill_mattes
     from mien.datasets.pictures import collect, read_picture
     from mien.datasets.sequences import filmed_sequence
-    from mien.training import OwnSplit
+    from mien.training.footage.own_split import OwnSplit
 
     for name, given in _clips(path).items():
         file, frames = _file(path, name), _in_time(path, given) if name == "train" else given

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mien.camera import Camera
-    from mien.face import FaceModel
+    from mien.face.model import FaceModel
 
 SIZE = (2200, 3208)
 """Width and height that the intrinsics are for."""

@@ -15,7 +15,7 @@ from mien.capture.faces import LandmarkDetector
 from mien.datasets.dataset import TrackedSequence
 from mien.datasets.steadiness import measure_steadiness
 from mien.errors import UserError
-from mien.render import rasterize_mesh
+from mien.render.mesh import rasterize_mesh
 
 _FRAMES, _CAMERAS = 5, 3
 _SOLID = 128

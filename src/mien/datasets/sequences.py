@@ -8,16 +8,18 @@ import torch
 from jaxtyping import Float, UInt8
 
 from mien.camera import Camera
-from mien.capture import Capture
 from mien.capture.backend import choose_detector, detector_entry
+from mien.capture.capture import Capture
 from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import FilmedSequence, TrackedSequence
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.limits import camera_fault
-from mien.tracking import Tracking, fit_neck_lines
+from mien.tracking.neck_line import fit_neck_lines
+from mien.tracking.tracking import Tracking
 
 _LANDMARKS = "mediapipe"
 _CHUNK = 32

@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from mien.camera import Camera
 from mien.datasets.dataset import TrackedSequence
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 
 _LANDMARKS, _SKIN = "mediapipe", 468
 """The points that are compared, and the number of those that are not on the irises."""

@@ -16,8 +16,9 @@ from mien.datasets.flame_poses import FRONT, carried, face_of_flame, in_front, n
 from mien.datasets.nersemble import read_cameras
 from mien.datasets.nersemble_benchmark import FPS_MONO, FPS_VIEWS, TRACKING, VERSION, flame_from_benchmark
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
-from mien.training import HIDDEN_CAMERAS, TEST_CAMERAS, TEST_SEQUENCES, TRAINING_CAMERA
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.training.footage.benchmark_split import HIDDEN_CAMERAS, TEST_CAMERAS, TEST_SEQUENCES, TRAINING_CAMERA
 
 MONO_PEOPLE = ("393", "404", "461", "477", "486")
 VIEW_PEOPLE = ("388", "422", "443", "445", "475")

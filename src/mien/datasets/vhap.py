@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mien.datasets.dataset import TrackedSequence
-    from mien.face import FaceModel
-    from mien.training import OwnSplit
+    from mien.face.model import FaceModel
+    from mien.training.footage.own_split import OwnSplit
 
 _VERSION = "FLAME 2023 (flame2023.pkl) with GaussianAvatars' teeth"
 _WHOLE, _TRAIN = "transforms.json", "transforms_train.json"
@@ -107,7 +107,7 @@ def _group(path: Path, name: str, frames: dict[tuple[int, str], _Frame]) -> _Gro
 
 def _own_split(group: _Group) -> "OwnSplit | None":
     """Whole timesteps and cameras that transforms_train.json does not list."""
-    from mien.training import OwnSplit, ranges_of
+    from mien.training.footage.own_split import OwnSplit, ranges_of
 
     trained = {key for key, frame in group.frames.items() if frame.trained}
     by_time = {timestep for timestep, _ in trained}

@@ -5,16 +5,20 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from mien.capture import read_capture, write_capture
+from mien.capture.store import read_capture, write_capture
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import Dataset, FilmedSequence, TrackedSequence
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.inside import remove_tree
 from mien.storage import replace_folder, write_arrays
-from mien.tracking import make_scoring, write_overlay_sheet, write_scoring, write_tracking
-from mien.training import read_sequence, write_own_split
-from mien.training.footage import FOREIGN
+from mien.tracking.files import write_tracking
+from mien.tracking.report.contact_sheet import write_overlay_sheet
+from mien.tracking.scoring import make_scoring
+from mien.tracking.scoring_files import write_scoring
+from mien.training.footage.clothes import FOREIGN
+from mien.training.footage.own_split import write_own_split
+from mien.training.footage.sequence import read_sequence
 
 OVERLAY = "tracking/overlay.png"
 """File in a sequence's folder: the imported mesh over some of its pictures."""

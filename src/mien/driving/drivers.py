@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from mien.avatar import neutral_of
+from mien.avatar.avatar import neutral_of
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.expression_map import fit_expression_map
@@ -19,10 +19,11 @@ from mien.driving.speech import read_speech
 from mien.driving.timing import at_moments, even_moments, rate_of
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, load_face_model
-from mien.face.params import concatenate, most_frontal_camera
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams, concatenate, most_frontal_camera
 from mien.progress import say
-from mien.training import Sequence, read_sequence
+from mien.training.footage.sequence import Sequence, read_sequence
 
 _TRACKED_REST = "the calmest tenth of its frames"
 _RECORDED_REST = "where its coefficients are 0, with the head's median pose"

@@ -14,7 +14,8 @@ from torch import Tensor
 from mien.driving.constants import DRIVING
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 
 _MARKS = "mediapipe"
 _FACE_MARKS = 468

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.avatar import as_array
-from mien.face import FaceParams
+from mien.avatar.baking import as_array
+from mien.face.params import FaceParams
 from mien.runtime.baked import Filmed
 from mien.runtime.filmed import within_filmed_inputs, within_filmed_poses
 

@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
-from mien.avatar import neutral_of
+from mien.avatar.avatar import neutral_of
 from mien.driving.constants import DRIVING
 from mien.driving.drivers import Driver
 from mien.driving.rest import rest_of
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.progress import say
 from mien.rotation import axis_angle_from_matrix
 

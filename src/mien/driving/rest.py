@@ -17,8 +17,8 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.driving.constants import DRIVING
-from mien.face import FaceModel, FaceParams
-from mien.face.params import most_frontal_camera
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams, most_frontal_camera
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 Limits = tuple[float, float]

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.capture.pace import frame_rate, is_pause
 from mien.driving.motion import check_times
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 

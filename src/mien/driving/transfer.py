@@ -9,7 +9,9 @@ from torch import Tensor
 from mien.driving.expression_map import fit_expression_map
 from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.runtime.named import within_lids
 

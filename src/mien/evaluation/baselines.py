@@ -9,7 +9,8 @@ from torch import Tensor
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.trained_frames import TrainedFrames, look_at_trained
 from mien.render.mesh import render_mesh
-from mien.training.footage import Frame, vertex_colors
+from mien.training.footage.frames import Frame
+from mien.training.footage.mesh_colors import vertex_colors
 
 
 @dataclass(frozen=True, eq=False)

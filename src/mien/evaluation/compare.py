@@ -15,7 +15,7 @@ from mien.evaluation.metrics_file import (
     read_figures,
 )
 from mien.metric_names import COLUMNS
-from mien.training import read_run_config
+from mien.training.run import read_run_config
 
 
 @dataclass(frozen=True, eq=False)

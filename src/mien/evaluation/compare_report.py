@@ -33,7 +33,7 @@ from mien.pictures import Box, data_uri, error_heat, picture_uri, to_uint8
 from mien.plots import Axes, Series, line_chart
 from mien.progress import track_progress
 from mien.storage import write_atomically
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
 
 _FRAMES = 5
 _PICTURE_SIZE = 320

@@ -10,23 +10,26 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from mien.avatar import load_avatar, neutral_of
-from mien.avatar.avatar import Avatar
+from mien.avatar.avatar import Avatar, neutral_of
+from mien.avatar.files import load_avatar
 from mien.camera import Camera
-from mien.capture import Capture, read_capture, read_capture_hash
+from mien.capture.capture import Capture
+from mien.capture.store import read_capture, read_capture_hash
 from mien.capture.video import write_video
-from mien.driving import drive, rest_before
+from mien.driving.rest import rest_before
+from mien.driving.transfer import drive
 from mien.errors import UserError
 from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion, measure_motion, transfer_figures
 from mien.evaluation.videos import labeled_row, match_sizes
-from mien.face import FaceParams, most_frontal_camera
 from mien.face.checks import check_face_params
+from mien.face.params import FaceParams, most_frontal_camera
 from mien.pictures import to_uint8
 from mien.progress import track_progress
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking import Tracking, check_tracking_of, read_tracking
-from mien.training.footage import evenly_spread
+from mien.tracking.files import check_tracking_of, read_tracking
+from mien.tracking.tracking import Tracking
+from mien.training.footage.frames import evenly_spread
 
 _MAX_FRAMES = 100
 _MEANS = (

@@ -7,16 +7,12 @@ from pathlib import Path
 from mien.errors import UserError
 from mien.evaluation.metrics import Border
 from mien.evaluation.scoring import ScoreSettings, lpips_metric
-from mien.tracking import Scoring
-from mien.training.footage import (
-    BENCHMARK_SPLIT,
-    NAMED_SPLIT,
-    OWN_SPLIT,
-    TEST_CAMERAS,
-    Frame,
-    Sequence,
-    imported_from,
-)
+from mien.tracking.scoring import Scoring
+from mien.training.footage.benchmark_split import BENCHMARK_SPLIT, TEST_CAMERAS
+from mien.training.footage.frames import Frame
+from mien.training.footage.named_split import NAMED_SPLIT
+from mien.training.footage.own_split import OWN_SPLIT, imported_from
+from mien.training.footage.sequence import Sequence
 
 _ALEX, _VGG = "lpips-alex", "lpips-vgg"
 

@@ -26,7 +26,9 @@ from mien.locks import hold
 from mien.perceptual.lpips import load_lpips
 from mien.ranges import check_ranges
 from mien.storage import file_digest, write_json
-from mien.training import GAINS, read_coverage, read_curves, read_run_config, read_training_summary, run_camera
+from mien.training.footage.filmed import read_coverage
+from mien.training.frame_gains import GAINS
+from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
 
 _RECIPE = 4
 """Version of the scoring. It is raised whenever the same frame would get other figures."""

@@ -11,15 +11,20 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera
-from mien.face import FaceParams, part_boxes
+from mien.face.params import FaceParams
+from mien.face.parts import part_boxes
 from mien.gaussians import Gaussians
 from mien.pictures import Box
-from mien.render import close_holes, rasterize
+from mien.render import rasterize
+from mien.render.closing import close_holes
 from mien.render.rendering import Rendering
 from mien.render.validation import drawable
-from mien.tracking import Scoring
-from mien.training import lit
-from mien.training.footage import Frame, Sequence, clothes_mask, composite, foreground_colors
+from mien.tracking.scoring import Scoring
+from mien.training.footage.clothes import clothes_mask
+from mien.training.footage.foreground import foreground_colors
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence, composite
+from mien.training.frame_gains import lit
 
 FaceSource = Literal["as_tracked", "corrected"]
 """Face parameters of held-out frames: as the tracker left them, or corrected by what training changed in neighbouring

@@ -7,13 +7,15 @@ right. It uses the pixels that are scored, so it is no figure of a prediction, a
 
 import torch
 
-from mien.avatar import FaceTuning, Progress, frozen
+from mien.avatar.avatar import frozen
+from mien.avatar.schedules import Progress
+from mien.avatar.settings import FaceTuning
 from mien.evaluation.experiment import Experiment, target_image
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.render import rasterize
 from mien.training.adam import Adam
 from mien.training.face_track import FaceTrack
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
 from mien.training.photometric import photometric_loss
 
 LOSS = "mean absolute difference of colours over the whole picture"

@@ -28,7 +28,8 @@ from mien.pictures import Box
 from mien.progress import progress_bar, say
 from mien.storage import read_json, write_json
 from mien.tracking.scoring import head_crop
-from mien.training.footage import composite, evenly_spread
+from mien.training.footage.frames import evenly_spread
+from mien.training.footage.sequence import composite
 
 SCORES_FORMAT, SCORES_VERSION = "mien.scores", 1
 CROPS_FORMAT, CROPS_VERSION = "mien.crops", 1

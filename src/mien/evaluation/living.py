@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from mien import runtime
-from mien.avatar import Avatar, make_portable
+from mien.avatar.avatar import Avatar
+from mien.avatar.baking import make_portable
 from mien.camera import Camera
 from mien.capture.video import write_video
 from mien.errors import UserError
@@ -16,8 +17,9 @@ from mien.progress import track_progress
 from mien.runtime.camera_paths import fitted, zoom_for_all
 from mien.runtime.filmed import head_angles
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.training.footage import Coverage, filmed_yaws
-from mien.training.whole_head import with_soft_cut
+from mien.training.footage.coverage import Coverage
+from mien.training.footage.filmed import filmed_yaws
+from mien.training.whole_head.soft_cut import with_soft_cut
 
 FILM = "film.mp4"
 """Name of the film in a run's folder."""

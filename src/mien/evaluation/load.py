@@ -7,17 +7,22 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.avatar import load_avatar
-from mien.capture import read_capture_hash
+from mien.avatar.files import load_avatar
+from mien.capture.store import read_capture_hash
 from mien.config import decode
 from mien.errors import UserError
 from mien.evaluation.dataset_protocols import counted_frames, dataset_protocol, scores_whole_mattes
 from mien.evaluation.experiment import Edges, Experiment, FaceSource
-from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
-from mien.tracking import read_scoring, read_scoring_hash
-from mien.training import Sequence, TrainSettings, check_data, read_face_track, read_gains, read_run_config
-from mien.training.footage import Frame, clothes_digest, held_out_of, read_clothes, sequence_of, training_frames
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.tracking.scoring_files import read_scoring, read_scoring_hash
+from mien.training.footage.clothes import clothes_digest, read_clothes
+from mien.training.footage.frames import Frame, held_out_of, training_frames
+from mien.training.footage.sequence import Sequence, sequence_of
+from mien.training.frame_gains import read_gains
+from mien.training.run import check_data, read_face_track, read_run_config
+from mien.training.settings import TrainSettings
 
 
 def load_experiments(

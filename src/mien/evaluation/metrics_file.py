@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from mien.evaluation.experiment import Edges
-from mien.face import PARTS
+from mien.face.parts import PARTS
 from mien.inside import is_one_line
 from mien.metric_names import METRICS
 from mien.storage import expect_whole, read_json

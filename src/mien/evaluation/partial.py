@@ -11,7 +11,7 @@ from mien.evaluation.scoring import Scores
 from mien.inside import open_to_append
 from mien.limits import checked_whole
 from mien.storage import write_atomically
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
 
 _MAX_BYTES = 256 << 20
 """Largest file that is read, in bytes. A frame takes some hundred bytes."""

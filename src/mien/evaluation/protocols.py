@@ -46,7 +46,7 @@ from mien.parallel import stream_in_threads
 from mien.perceptual.lpips import load_lpips
 from mien.progress import progress_bar
 from mien.ranges import Range
-from mien.training.footage import Frame, spread_frames
+from mien.training.footage.frames import Frame, spread_frames
 
 AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"
 OPENED, UNCLOTHED, OVER_DARK = "opened", "without_clothes", "over_dark"

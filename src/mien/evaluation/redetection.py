@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from mien.capture.faces import MeshReader
 from mien.rotation import align_centered
-from mien.tracking.landmarks import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
+from mien.tracking.landmarks.groups import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
 MEASURED_BY = "MediaPipe face mesh, 478 points in 3D, each picture by itself"
 _RIGID = np.array(NOSE + EYE_CORNERS)

@@ -36,7 +36,7 @@ from mien.evaluation.protocols import Evaluation
 from mien.metric_names import COLUMNS
 from mien.pages import LIVING_PAGE, render
 from mien.storage import write_atomically
-from mien.training.footage import Coverage
+from mien.training.footage.coverage import Coverage
 
 _ROWS = {
     "avatar": "Avatar",

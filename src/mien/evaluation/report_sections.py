@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.evaluation.experiment import DARK, Experiment, avatar_image, head_box, target_image
 from mien.evaluation.living import SIDE, Living, strip, to_bytes
 from mien.evaluation.metrics import crop_to
@@ -18,7 +18,9 @@ from mien.evaluation.protocols import AVATAR, MESH, OVER_DARK, Evaluation
 from mien.pictures import Box, error_heat, picture_uri, to_uint8
 from mien.plots import Axes, Series, line_chart
 from mien.render.mesh import render_mesh
-from mien.training.footage import Coverage, Frame, confidence_picture, filmed_words
+from mien.training.footage.coverage import Coverage
+from mien.training.footage.filmed import confidence_picture, filmed_words
+from mien.training.footage.frames import Frame
 
 _PICTURE_SIZE = 400
 _OVERLAY_SIZE = 300

@@ -15,10 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.evaluation.metrics import Border, Windows, crop_to, l1, psnr, ssim
-from mien.face import PARTS
+from mien.face.parts import PARTS
 from mien.metric_names import METRICS
-from mien.perceptual import MIN_SIDE, Backbone, PerceptualDistance, load_perceptual
+from mien.perceptual.distance import MIN_SIDE, PerceptualDistance, load_perceptual
 from mien.perceptual.lpips import Lpips, load_lpips
+from mien.perceptual.weights import Backbone
 from mien.pictures import Box, to_uint8
 from mien.threads import asked_threads
 

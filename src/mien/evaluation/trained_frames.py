@@ -11,7 +11,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit
 from mien.parallel import stream_in_threads
-from mien.training.footage import Frame, spread_frames
+from mien.training.footage.frames import Frame, spread_frames
 
 
 @dataclass(frozen=True, eq=False)

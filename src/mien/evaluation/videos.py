@@ -17,7 +17,7 @@ from mien.parallel import stream_in_threads
 from mien.picture_files import write_png
 from mien.pictures import WHITE, Box, error_heat, shrink, side_by_side, to_uint8
 from mien.progress import track_progress
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
 
 _MAX_SIDE = 440
 _BAR = 26

@@ -5,8 +5,7 @@ GPUs run such networks of bound Gaussians. Pages run those of others on the proc
 
 import numpy as np
 
-from mien.runtime import MeshBound, PortableAvatar, Rig, Static
-from mien.runtime.baked import ExpressionChanges, FeatureChanges
+from mien.runtime.baked import ExpressionChanges, FeatureChanges, MeshBound, PortableAvatar, Rig, Static
 
 _UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
 """A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""

@@ -16,9 +16,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
+from mien.face.model import FaceModel
 from mien.face.npz import read_npz
+from mien.face.params import FaceParams
 from mien.inside import open_to_read
 from mien.limits import MAX_NUMBER
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle

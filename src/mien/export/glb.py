@@ -22,9 +22,9 @@ from mien.export.splats import unit_quats
 from mien.export.texture import FRONT_VIEWS, Shot, Surface, bake_texture
 from mien.files import check_writable
 from mien.picture_files import encode_picture
-from mien.runtime import Face, Gaussians, MeshBound, PortableAvatar, Rig
+from mien.runtime.baked import MeshBound, PortableAvatar, Rig
 from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
-from mien.runtime.posing import SH_C0, rig_points
+from mien.runtime.posing import SH_C0, Face, Gaussians, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 
 FORMAT, VERSION = "mien.glb", 1

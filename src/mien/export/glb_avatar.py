@@ -10,7 +10,7 @@ import numpy as np
 
 from mien.errors import UserError
 from mien.export.glb_file import Glb, GlbWriter, read_glb
-from mien.runtime import PortableAvatar
+from mien.runtime.baked import PortableAvatar
 from mien.runtime.file import from_arrays, to_arrays
 
 EXTENSION, VERSION = "MIEN_gaussian_avatar", 1

@@ -17,7 +17,8 @@ from jaxtyping import Float32
 from mien.errors import UserError
 from mien.export.bound_features import bound_features
 from mien.export.rows import with_rows
-from mien.runtime import BlendSkinned, Face, MeshBound, PortableAvatar, Static
+from mien.runtime.baked import BlendSkinned, MeshBound, PortableAvatar, Static
+from mien.runtime.posing import Face
 
 FORMAT, VERSION = "mien.packed", 1
 

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Int
 
-from mien.runtime import BakedAvatar, BlendSkinned, MeshBound, Static
+from mien.runtime.baked import BakedAvatar, BlendSkinned, MeshBound, Static
 
 Baked = TypeVar("Baked", bound=BakedAvatar)
 

@@ -15,9 +15,10 @@ from mien import _native
 from mien.errors import UserError
 from mien.export.packed import Motion, pack
 from mien.export.rows import with_rows
-from mien.runtime import Avatar, Camera, Gaussians, PortableAvatar, presets_for
-from mien.runtime.named import GAZE_NAMES, is_gaze
-from mien.runtime.posing import SH_C0
+from mien.runtime.avatar import Avatar
+from mien.runtime.baked import Camera, PortableAvatar
+from mien.runtime.named import GAZE_NAMES, is_gaze, presets_for
+from mien.runtime.posing import SH_C0, Gaussians
 from mien.runtime.rotation import axis_angle_from_matrix, compose_rigid, matrix_from_axis_angle
 
 _SIDE = 256

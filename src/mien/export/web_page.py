@@ -18,7 +18,8 @@ from mien.export.page_head import Described, head_part, write_poster
 from mien.export.thinning import fitted
 from mien.export.webcam import POLICY, WebcamFiles, webcam_part
 from mien.files import check_writable, write_atomically
-from mien.runtime import PortableAvatar, camera_paths
+from mien.runtime import camera_paths
+from mien.runtime.baked import PortableAvatar
 
 TEMPLATE = Path(__file__).with_name("page.html")
 WEBGPU = Path(__file__).with_name("webgpu.js")

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.face import FaceModel
 from mien.face.chart import find_outside
 from mien.face.constants import FACE
 from mien.face.mirror import triangle_geometry
+from mien.face.model import FaceModel
 
 _FACE = ("skin", "face", "nose")
 _SKIN = (*_FACE, "ears", "eyelids", "eye_sockets")

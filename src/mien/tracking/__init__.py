@@ -6,18 +6,13 @@ from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
-    from mien.tracking.fitting import has_enough_faces
+    from mien.tracking.fitting.shot import has_enough_faces
     from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
     from mien.tracking.neck_line import fit_neck_lines
     from mien.tracking.pipeline import track, track_subject
-    from mien.tracking.report import (
-        frontal_camera,
-        overlay_stride,
-        residual_report,
-        write_overlay,
-        write_overlay_sheet,
-        write_residual_report,
-    )
+    from mien.tracking.report.contact_sheet import write_overlay_sheet
+    from mien.tracking.report.overlay import frontal_camera, overlay_stride, write_overlay
+    from mien.tracking.report.residuals import residual_report, write_residual_report
     from mien.tracking.scoring import Scoring, head_crop, head_cutter, head_mask, make_scoring
     from mien.tracking.scoring_files import (
         check_scoring_cut,

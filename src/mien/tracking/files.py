@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.errors import UserError
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.inside import check_tree, is_one_line
 from mien.limits import MAX_NUMBER, camera_fault
 from mien.locks import read_beside_writers

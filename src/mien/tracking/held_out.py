@@ -7,10 +7,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.tracking.descent import follow_by_descent
-from mien.tracking.fitting import CameraBatch, Fit, Shot, StageCache, Watch, explaining_singular
-from mien.tracking.landmarks import LandmarkModel, follow_landmarks
-from mien.tracking.pixels import PhotometricFit, follow_photometrically, turn_light
+from mien.tracking.descent.schedule import follow_by_descent
+from mien.tracking.fitting.fit import Fit, Watch
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import Shot, explaining_singular
+from mien.tracking.fitting.views import CameraBatch
+from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.landmarks.stages import follow_landmarks
+from mien.tracking.pixels.outcome import turn_light
+from mien.tracking.pixels.refine import follow_photometrically
+from mien.tracking.pixels.texture import PhotometricFit
 from mien.tracking.settings import TrackingSettings
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.tracking.constants import TRACKING
 from mien.tracking.neck_line import bottom_vertices, neck_vertices
 

@@ -10,34 +10,24 @@ import torch
 from mien.capture.backend import detector_of
 from mien.capture.capture import Capture
 from mien.errors import UserError
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.inside import remove_tree
 from mien.progress import say
-from mien.tracking.descent import fit_by_descent
-from mien.tracking.fitting import (
-    Fit,
-    Shot,
-    StageCache,
-    Watch,
-    explaining_singular,
-    ignore_progress,
-    layout_of,
-    lenses_of,
-    shot_of,
-)
+from mien.tracking.descent.schedule import fit_by_descent
+from mien.tracking.fitting.fit import Fit, Watch, ignore_progress
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import Shot, explaining_singular, lenses_of, shot_of
 from mien.tracking.held_out import Stages, follow_held_out
-from mien.tracking.landmarks import (
-    DetectorResponse,
-    LandmarkModel,
-    all_landmarks,
-    as_tracking,
-    fit_landmarks,
-    read_response,
-    reduce_face_model,
-    without_turn_habits,
-)
-from mien.tracking.pixels import refine_photometrically, with_pixels
-from mien.tracking.report import DONE, Preview
+from mien.tracking.landmarks.detector_response import DetectorResponse, read_response
+from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
+from mien.tracking.landmarks.outcome import as_tracking
+from mien.tracking.landmarks.stages import fit_landmarks
+from mien.tracking.landmarks.term import all_landmarks
+from mien.tracking.landmarks.turn_habits import without_turn_habits
+from mien.tracking.pixels.outcome import with_pixels
+from mien.tracking.pixels.refine import refine_photometrically
+from mien.tracking.report.preview import DONE, Preview
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.picture_files import PictureStack
 from mien.progress import track_progress
 from mien.render.mesh import rasterize_mesh

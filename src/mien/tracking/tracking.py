@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 
 PARTS = ("mouth", "nose", "eyes")
 """Parts of a face that something may cover (`Tracking.covered`)."""

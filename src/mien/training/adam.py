@@ -11,7 +11,9 @@ from torch import Tensor
 from mien import _native
 from mien.adam import BETA1, BETA2, EPSILON, FactoredMoments
 from mien.arrays import unpacked
-from mien.avatar import Moments, ParameterGroup, Progress
+from mien.avatar.avatar import ParameterGroup
+from mien.avatar.schedules import Progress
+from mien.avatar.store import Moments
 
 
 class Update(NamedTuple):

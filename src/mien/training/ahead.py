@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 import cv2
 import torch
 
-from mien.training.footage import FrameOrder, Target, Targets, background_at
+from mien.training.footage.frames import FrameOrder, background_at
+from mien.training.footage.sequence import Target, Targets
 from mien.training.settings import TrainSettings
 
 Result = TypeVar("Result")

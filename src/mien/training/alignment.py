@@ -16,10 +16,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.avatar import DEFAULT_METHOD, Avatar, FaceTuning, Moments, ParameterGroup, Rate, frozen, move_avatar
+from mien.avatar.avatar import Avatar, ParameterGroup, frozen, move_avatar
+from mien.avatar.methods import DEFAULT_METHOD
+from mien.avatar.schedules import Rate
+from mien.avatar.settings import FaceTuning
+from mien.avatar.store import Moments
 from mien.config import overlay
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, concatenate
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams, concatenate
 from mien.progress import progress_bar
 from mien.render.rasterize import rasterize_each
 from mien.storage import read_tensors, write_tensors
@@ -27,7 +32,8 @@ from mien.threads import one_torch_thread
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.constants import TRAINING
 from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
-from mien.training.footage import Frame, Sequence, Target, Targets, evenly_spread, training_frames
+from mien.training.footage.frames import Frame, evenly_spread, training_frames
+from mien.training.footage.sequence import Sequence, Target, Targets
 from mien.training.frame_gains import lit, read_gains
 from mien.training.photometric import photometric_loss
 from mien.training.run import read_face_track

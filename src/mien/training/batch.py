@@ -12,24 +12,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
-from mien.avatar import ParameterGroup, PerceptualLoss, Posed, Progress
+from mien.avatar.avatar import ParameterGroup, Posed
+from mien.avatar.schedules import Progress
+from mien.avatar.settings import PerceptualLoss
 from mien.camera import Camera
-from mien.face import concatenate
+from mien.face.params import concatenate
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
 from mien.training.ahead import Result, TargetQueue
 from mien.training.checkpoint import TrainingState
 from mien.training.constants import TRAINING
-from mien.training.footage import (
-    FOOTAGE,
-    Frame,
-    FrameOrder,
-    Target,
-    Targets,
-    background_at,
-    crop_random,
-)
+from mien.training.footage.constants import FOOTAGE
+from mien.training.footage.frames import Frame, FrameOrder, background_at, crop_random
+from mien.training.footage.sequence import Target, Targets
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
 from mien.training.parts import BatchFrame
 from mien.training.settings import TrainSettings

@@ -11,11 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.adam import Moments
-from mien.avatar import ParameterGroup, Rate
+from mien.avatar.avatar import ParameterGroup
+from mien.avatar.schedules import Rate
 from mien.errors import UserError
 from mien.render.rendering import Rendering
 from mien.training.constants import TRAINING
-from mien.training.footage import Frame, Sequence
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence
 from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
 

@@ -7,16 +7,17 @@ import torch
 from torch import Tensor
 
 from mien.adam import FactoredMoments
-from mien.avatar import Avatar, Moments
+from mien.avatar.avatar import Avatar
 from mien.avatar.files import overwrite
+from mien.avatar.store import Moments
 from mien.errors import UserError
 from mien.progress import say
 from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.system import peak_memory_mb
 from mien.training.adam import Adam
-from mien.training.density_control import DensityStrategy
+from mien.training.density_control.strategy import DensityStrategy
 from mien.training.face_track import FaceTrack
-from mien.training.footage import Coverage
+from mien.training.footage.coverage import Coverage
 from mien.training.parts import TrainingPart
 
 _KEPT_CHECKPOINTS = 2

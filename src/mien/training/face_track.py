@@ -8,8 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.avatar import FaceTuning, Moments, ParameterGroup
-from mien.face import FaceParams
+from mien.avatar.avatar import ParameterGroup
+from mien.avatar.settings import FaceTuning
+from mien.avatar.store import Moments
+from mien.face.params import FaceParams
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training.constants import TRAINING
 

@@ -16,13 +16,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.capture import is_light_changing
+from mien.capture.quality import is_light_changing
 from mien.errors import UserError
 from mien.render.rendering import Rendering
 from mien.storage import read_tensors
 from mien.training.camera_colors import LearnedColors, recolored
 from mien.training.constants import TRAINING
-from mien.training.footage import Frame, Sequence
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence
 from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
 

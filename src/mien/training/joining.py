@@ -5,7 +5,8 @@ from collections.abc import Callable
 from mien.training.camera_colors import camera_colors_part
 from mien.training.frame_gains import frame_gains_part
 from mien.training.parts import Preparation, TrainingPart
-from mien.training.whole_head import prepare_inside, prepare_whole_head
+from mien.training.whole_head.mouth_interior import prepare_inside
+from mien.training.whole_head.part import prepare_whole_head
 
 
 def prepare_parts(given: Preparation) -> Callable[[], tuple[TrainingPart, ...]]:

@@ -12,13 +12,19 @@ from typing import Any
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar, DensityControl, ParameterGroup, Photometric, Posed, Progress
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed
+from mien.avatar.density import DensityControl
+from mien.avatar.schedules import Progress
+from mien.avatar.settings import Photometric
 from mien.camera import Camera
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.render.rendering import Rendering
-from mien.training.density_control import DensityStrategy
+from mien.training.density_control.strategy import DensityStrategy
 from mien.training.face_track import FaceTrack
-from mien.training.footage import Coverage, Frame, Sequence, Target, measure_coverage
+from mien.training.footage.coverage import Coverage, measure_coverage
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence, Target
 from mien.training.losses import PerceptualGoal
 from mien.training.settings import TrainSettings
 

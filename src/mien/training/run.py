@@ -14,20 +14,27 @@ import numpy as np
 import torch
 
 import mien
-from mien.avatar import Avatar, MethodConfig, measure_filmed, method_of, write_avatar
+from mien.avatar.avatar import Avatar
+from mien.avatar.files import write_avatar
+from mien.avatar.filmed import measure_filmed
+from mien.avatar.methods import method_of
+from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.config import encode
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
 from mien.face.checks import check_face_params
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.inside import check_tree, is_plain_name
 from mien.limits import camera_fault
 from mien.locks import WAIT, check_free
 from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
-from mien.tracking import Tracking
+from mien.tracking.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
-from mien.training.footage import Coverage, Sequence, write_coverage
+from mien.training.footage.coverage import Coverage
+from mien.training.footage.filmed import write_coverage
+from mien.training.footage.sequence import Sequence
 from mien.training.settings import PRESETS, TrainSettings
 
 _FORMAT, _VERSION = "mien.run", 1

@@ -13,24 +13,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
-from mien.avatar import (
-    Avatar,
-    FaceTuning,
-    MethodConfig,
-    Posed,
-    Progress,
-    load_avatar,
-    measure_filmed,
-    method_named,
-    method_of,
-    move_avatar,
-)
+from mien.avatar.avatar import Avatar, Posed, move_avatar
+from mien.avatar.files import load_avatar
+from mien.avatar.filmed import measure_filmed
+from mien.avatar.methods import method_named, method_of
+from mien.avatar.schedules import Progress
+from mien.avatar.settings import FaceTuning, MethodConfig
 from mien.devices import choose_device, like_on
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, concatenate
 from mien.face.checks import check_face_params
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams, concatenate
 from mien.locks import hold
-from mien.perceptual import load_training_features
+from mien.perceptual.features import load_training_features
 from mien.progress import Advance, progress_bar
 from mien.render.rendering import Rendering
 from mien.render.validation import CannotDrawError
@@ -53,25 +48,23 @@ from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.constants import TRAINING
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack, turns_from_mean
-from mien.training.footage import (
+from mien.training.footage.coverage import measure_coverage, representative_frames
+from mien.training.footage.frames import (
     FrameOrder,
-    Sequence,
-    Targets,
     camera_extent,
     density_random,
     expression_rarity,
-    measure_coverage,
-    representative_frames,
     resolved,
     training_frames,
-    vertex_colors,
 )
+from mien.training.footage.mesh_colors import vertex_colors
+from mien.training.footage.sequence import Sequence, Targets
 from mien.training.joining import prepare_parts
 from mien.training.losses import train_psnr
 from mien.training.parts import Preparation, Step, passed
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.settings import TrainSettings
-from mien.training.whole_head import fitted_faces
+from mien.training.whole_head.outline_fit import fitted_faces
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""

@@ -14,9 +14,9 @@ from jaxtyping import Float32, UInt8
 
 from mien import runtime
 from mien.errors import UserError
-from mien.export import Motion
-from mien.runtime import Face
+from mien.export.packed import Motion
 from mien.runtime.filmed import within_filmed_inputs
+from mien.runtime.posing import Face
 from mien.viewer.drawing import (
     BACKGROUNDS,
     MAX_SIDE,

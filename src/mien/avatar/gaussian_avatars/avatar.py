@@ -23,7 +23,8 @@ from mien.avatar.ops.expression_changes import ExpressionActivations, expression
 from mien.avatar.ops.triangle_penalties import triangle_penalties
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.gaussians import stack_timesteps
 from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound

@@ -53,7 +53,9 @@ from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.avatar.surface_places import sample_surface
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, head_poses
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.rotation import multiply_quaternions

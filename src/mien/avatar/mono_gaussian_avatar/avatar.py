@@ -42,7 +42,9 @@ from mien.avatar.schedules import TRAINED, Progress
 from mien.avatar.settings import RefillSettings
 from mien.avatar.store import GaussianStore
 from mien.avatar.surface_places import sample_surface
-from mien.face import FaceModel, FaceParams, head_poses
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.face.posing import head_poses
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.render.rendering import Rendering
 from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned

@@ -21,7 +21,8 @@ from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.surface_places import at_places, random_places
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.runtime.baked import Rig
 

@@ -13,8 +13,9 @@ from mien.arrays import unpacked
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel, FaceParams, head_poses
-from mien.face.posing import compiled_model, has_native_posing
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.face.posing import compiled_model, has_native_posing, head_poses
 from mien.gaussians import Gaussians
 
 _LOCAL = ("means", "quats", "log_scales", "opacity_logits")

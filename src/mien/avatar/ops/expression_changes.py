@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 from mien.arrays import native, recycled, unpacked
 from mien.avatar.constants import AVATAR
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 
 MARGIN = 0.1
 """How far activations can get beyond what training saw along them, as a share of it."""

@@ -35,8 +35,10 @@ from mien.avatar.store import GaussianStore
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, head_poses
 from mien.face.head_parts import head_parts
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.face.posing import head_poses
 from mien.gaussians import sh_from_rgb
 from mien.render.mesh import shade, vertex_normals
 from mien.render.rendering import Rendering

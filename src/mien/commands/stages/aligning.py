@@ -9,17 +9,22 @@ from typing import Any
 
 import torch
 
-from mien.capture import read_capture
+from mien.capture.store import read_capture
 from mien.commands.stages.training import read_together
 from mien.errors import UserError
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.inside import remove_tree
 from mien.locks import hold
 from mien.progress import say
 from mien.rotation import axis_angle_from_matrix
 from mien.storage import expect_whole, read_tensors, write_tensors
-from mien.tracking import Tracking, read_tracking, write_tracking
-from mien.training import AlignmentSettings, Sequence, TrainSettings, align, outdated_sequences
+from mien.tracking.files import read_tracking, write_tracking
+from mien.tracking.tracking import Tracking
+from mien.training.alignment import align
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.footage.sequence import Sequence
+from mien.training.run import outdated_sequences
+from mien.training.settings import TrainSettings
 from mien.workspace import Workspace
 
 _RECIPE = 3

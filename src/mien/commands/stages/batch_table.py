@@ -11,18 +11,21 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from mien.avatar import DEFAULT_METHOD
-from mien.batch import RESULT_COLUMNS, WORKSPACE, Row, is_url, with_fingerprint
+from mien.avatar.methods import DEFAULT_METHOD
+from mien.batch.plan import WORKSPACE, Row, with_fingerprint
+from mien.batch.results import RESULT_COLUMNS
+from mien.batch.store import is_url
 from mien.bounded import parse_json, read_bytes
-from mien.capture import CaptureSettings
+from mien.capture.settings import CaptureSettings
 from mien.commands import create
 from mien.commands.complaints import complaint_of
 from mien.commands.options import TrainOptions, check_method, with_settings
 from mien.errors import UserError
 from mien.inside import is_plain_name, listed
 from mien.tables import table_rows, text_of, with_point
-from mien.tracking import ScoringSettings, TrackingSettings
-from mien.training import AlignmentSettings, TrainSettings
+from mien.tracking.settings import ScoringSettings, TrackingSettings
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.settings import TrainSettings
 from mien.workspace import check_no_workspace
 
 _MAX_TABLE_BYTES = 64 << 20

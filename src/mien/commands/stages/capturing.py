@@ -3,8 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mien.capture import Capture, CaptureSettings, capture_cameras, capture_video_parts
 from mien.capture.calibration import read_calibration
+from mien.capture.capture import Capture
+from mien.capture.from_cameras import capture_cameras
+from mien.capture.from_video import capture_video_parts
+from mien.capture.settings import CaptureSettings
 from mien.commands.stages.names import rig_name, sequence_name
 from mien.errors import UserError
 from mien.progress import say

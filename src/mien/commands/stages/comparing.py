@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from mien.avatar import MethodConfig
+from mien.avatar.settings import MethodConfig
 from mien.commands.stages.evaluating import run_evaluation_stage
 from mien.commands.stages.quality import (
     StageTimes,
@@ -18,16 +18,19 @@ from mien.commands.stages.training import run_training_stage
 from mien.errors import UserError
 from mien.evaluation.metrics_file import protocol_means
 from mien.evaluation.protocols import EvaluationSettings
-from mien.face import load_face_model
+from mien.face.loading import load_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table
 from mien.lab.benchmarking.timing import measure_machine
-from mien.lab.synthetic import ReferenceCapture, reference_named
+from mien.lab.synthetic.references import ReferenceCapture, reference_named
 from mien.locks import WAIT, hold
 from mien.progress import say
 from mien.storage import file_digest, read_json, write_atomically, write_json
 from mien.terminal import show
-from mien.training import PRESETS, Sequence, TrainSettings, read_sequence, read_training_summary, train
-from mien.training.footage import training_frames
+from mien.training.footage.frames import training_frames
+from mien.training.footage.sequence import Sequence, read_sequence
+from mien.training.run import read_training_summary
+from mien.training.settings import PRESETS, TrainSettings
+from mien.training.trainer import train
 from mien.workspace import COMPARED, Workspace
 
 _FORMAT, _VERSION = "mien.bench_compare", 1

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 
 from mien import runtime
 from mien.errors import UserError
-from mien.formats import Format, Options, format_of
+from mien.formats.format import Format, Options
+from mien.formats.registry import format_of
 from mien.progress import say
-from mien.runtime import PortableAvatar
+from mien.runtime.baked import PortableAvatar
 
 if TYPE_CHECKING:
     import mien.avatar
@@ -53,7 +54,7 @@ class FileContent:
         """Return the Gaussians at rest. This needs torch."""
         import torch
 
-        from mien.export import in_world
+        from mien.export.world_space import in_world
         from mien.gaussians import Gaussians
 
         posed = self._posed()

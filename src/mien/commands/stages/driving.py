@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mien.avatar import load_avatar
-from mien.capture import CaptureSettings
+from mien.avatar.files import load_avatar
+from mien.capture.settings import CaptureSettings
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.capture.source import FrameSelection, list_images, open_source
 from mien.commands.options import NEUTRALS, check_driver, check_neutral, holds_pictures, is_tracked_sequence
@@ -18,24 +18,19 @@ from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.names import is_picture
 from mien.commands.stages.pictures import draw, posed_softly, view, warn_of_white
 from mien.commands.stages.tracking import run_tracking_stage
-from mien.driving import (
-    Driver,
-    drive,
-    facing,
-    keep_to_filmed,
-    read_recording,
-    read_tracked_driver,
-    rest_of,
-    with_neutral,
-)
+from mien.driving.drivers import Driver, read_recording, read_tracked_driver
+from mien.driving.keeping import keep_to_filmed
+from mien.driving.neutral import with_neutral
+from mien.driving.rest import facing, rest_of
+from mien.driving.transfer import drive
 from mien.export.output import plan_output
 from mien.export.pictures import write_pictures
-from mien.face import FaceModel
 from mien.face.cache import cache_folder, cache_is_kept
+from mien.face.model import FaceModel
 from mien.pictures import side_by_side
 from mien.progress import say, track_progress
 from mien.storage import file_digest, write_atomically
-from mien.tracking import TrackingSettings
+from mien.tracking.settings import TrackingSettings
 from mien.training.run import filmed_range, run_camera
 from mien.workspace import Workspace, open_workspace
 

@@ -14,8 +14,8 @@ from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.text import dataset_line, driven_line, protocol_lines
 from mien.inside import check_tree
 from mien.progress import say
-from mien.training import NAMED_SPLIT, read_run_config
-from mien.training.footage import DRIVING, driving_sequences
+from mien.training.footage.named_split import DRIVING, NAMED_SPLIT, driving_sequences
+from mien.training.run import read_run_config
 from mien.workspace import Workspace, open_workspace
 
 

@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mien.capture import CaptureSettings
+from mien.capture.settings import CaptureSettings
 from mien.capture.video import probe_video
 from mien.errors import UserError
 from mien.inside import listed
 from mien.overall import Piece
-from mien.tracking import TrackingSettings
-from mien.training import AlignmentSettings, TrainSettings
+from mien.tracking.settings import TrackingSettings
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.settings import TrainSettings
 
 _FIND, _CAPTURE, _LANDMARKS, _PIXELS, _SCORING, _OVERLAY = 0.005, 0.036, 0.062, 0.07, 0.015, 0.055
 _SHARED_PIXELS = 10.0
@@ -55,7 +56,7 @@ def expected_pieces(
         overlay: Frames in the overlay: auto, all or none.
         alignment: Settings of the alignment. None if there is none.
     """
-    from mien.tracking import overlay_stride  # it needs torch
+    from mien.tracking.report.overlay import overlay_stride  # it needs torch
 
     pieces, total = [], sum(frames)
     for count in frames:

@@ -7,18 +7,25 @@ from pathlib import Path
 
 import torch
 
-from mien.avatar import Avatar, as_array, bake_rig, load_avatar, make_portable
+from mien.avatar.avatar import Avatar
+from mien.avatar.baking import as_array, bake_rig, make_portable
+from mien.avatar.files import load_avatar
 from mien.commands.expression import with_expression
 from mien.commands.stages.driving import open_driver
-from mien.driving import drive, facing, rest_of
-from mien.export import MeshModel, Motion, in_world
-from mien.face import FaceParams
-from mien.formats import Format, Options, numbered
+from mien.driving.rest import facing, rest_of
+from mien.driving.transfer import drive
+from mien.export.glb import MeshModel
+from mien.export.packed import Motion
+from mien.export.world_space import in_world
+from mien.face.params import FaceParams
+from mien.formats.format import Format, Options
+from mien.formats.registry import numbered
 from mien.gaussians import Gaussians
 from mien.progress import say, track_progress
-from mien.runtime import MeshBound, PortableAvatar
-from mien.training import read_coverage, read_face_track, run_camera
-from mien.training.whole_head import with_soft_cut
+from mien.runtime.baked import MeshBound, PortableAvatar
+from mien.training.footage.filmed import read_coverage
+from mien.training.run import read_face_track, run_camera
+from mien.training.whole_head.soft_cut import with_soft_cut
 from mien.workspace import Workspace
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from mien.avatar import Avatar, load_avatar
+from mien.avatar.avatar import Avatar
+from mien.avatar.files import load_avatar
 from mien.camera import Camera
-from mien.capture import read_capture
+from mien.capture.store import read_capture
 from mien.capture.video import write_video
 from mien.datasets.submission import (
     MONO_PEOPLE,
@@ -22,16 +23,17 @@ from mien.datasets.submission import (
     view_task,
 )
 from mien.errors import UserError
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.inside import remove_tree
 from mien.pictures import to_uint8
 from mien.progress import say, track_progress
-from mien.render import close_holes, rasterize
+from mien.render import rasterize
+from mien.render.closing import close_holes
 from mien.render.validation import drawable
 from mien.storage import replace_folder
 from mien.terminal import counted
-from mien.tracking import read_tracking
-from mien.training import check_data, read_face_track, read_run_config
+from mien.tracking.files import read_tracking
+from mien.training.run import check_data, read_face_track, read_run_config
 from mien.workspace import Workspace
 
 _CRF = 14

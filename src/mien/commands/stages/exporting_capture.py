@@ -5,10 +5,14 @@ from pathlib import Path
 
 from mien.commands.stages.training import fill_in_own_split, read_together
 from mien.config import decode
-from mien.datasets.layouts import Layout, MatteKind, filmed_frames, write_layout
+from mien.datasets.layouts.filmed import filmed_frames
+from mien.datasets.layouts.layout import Layout, MatteKind
+from mien.datasets.layouts.writing import write_layout
 from mien.errors import UserError
 from mien.progress import say
-from mien.training import OWN_SPLIT, Split, TrainSettings, read_own_split, read_run_config
+from mien.training.footage.own_split import OWN_SPLIT, read_own_split
+from mien.training.run import read_run_config
+from mien.training.settings import Split, TrainSettings
 from mien.workspace import Workspace
 
 

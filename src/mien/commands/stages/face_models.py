@@ -5,16 +5,18 @@ from pathlib import Path
 
 from mien.commands.stages.names import no_model_file
 from mien.errors import UserError
-from mien.face import FaceModel, add_face_model, load_face_model, read_added_source
 from mien.face.cache import cache_folder
 from mien.face.ict import NEUTRAL, is_ict_folder
-from mien.face.loading import is_built_in
+from mien.face.listing import read_added_source
+from mien.face.loading import add_face_model, is_built_in, load_face_model
+from mien.face.model import FaceModel
 from mien.face.model_files import SUFFIXES, default_name, licence_of, read_model_file
 from mien.face.teeth import TOOTH_VERTICES, VERTICES
 from mien.locks import hold
 from mien.progress import say
 from mien.storage import file_digest
-from mien.tracking.landmarks import EmbeddingSettings, embed_landmarks, with_regions_by_landmarks
+from mien.tracking.landmarks.embedding import EmbeddingSettings, embed_landmarks
+from mien.tracking.landmarks.regions import with_regions_by_landmarks
 
 FIRST_PICTURES = 80
 """Number of pictures in the first round, when lips and brows are not known. The second round paints these, and uses the

@@ -1,6 +1,6 @@
 """Lines that tell people what a dataset holds."""
 
-from mien.datasets import Clip, Findings
+from mien.datasets.dataset import Clip, Findings
 from mien.terminal import counted
 
 _MAX_CLIPS = 12

@@ -14,20 +14,23 @@ import torch
 from jaxtyping import UInt8
 
 from mien import runtime
-from mien.avatar import as_array
+from mien.avatar.baking import as_array
 from mien.camera import Camera
 from mien.capture.camera_names import CameraName
 from mien.capture.video import write_video
 from mien.commands.picture import PictureOptions
 from mien.commands.stages.viewing import Place, Viewed, open_viewed
 from mien.commands.stages.viewing_motions import switch_of
-from mien.driving.live import FollowOptions
+from mien.driving.live.follower import FollowOptions
 from mien.errors import UserError
 from mien.export.pixels import to_rgb
 from mien.pictures import side_by_side
 from mien.progress import say
 from mien.storage import cannot_write
-from mien.viewer import CameraSwitch, Door, Seen, Session, serve
+from mien.viewer.access import Door
+from mien.viewer.following import CameraSwitch
+from mien.viewer.server import serve
+from mien.viewer.session import Seen, Session
 
 FPS = 25
 """Frames a second of a recording."""

@@ -8,21 +8,20 @@ from pathlib import Path
 
 import torch
 
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.commands.stages.face_models import face_model_of
 from mien.commands.stages.import_footage import write_footage
 from mien.commands.stages.names import check_new_run, check_new_sequence
 from mien.commands.stages.tracking import run_tracking_stage
-from mien.datasets import Dataset, Footage, ReadSequence, TrackedSequence, TrainedAvatar, write_sequence
-from mien.datasets.writing import OVERLAY
+from mien.datasets.dataset import Dataset, Footage, ReadSequence, TrackedSequence, TrainedAvatar
+from mien.datasets.writing import OVERLAY, write_sequence
 from mien.inside import remove_tree
 from mien.locks import check_free, hold
 from mien.progress import say
 from mien.terminal import counted
-from mien.tracking import TrackingSettings
-from mien.training import write_imported_run
-from mien.training.run import BUSY_REMEDY
+from mien.tracking.settings import TrackingSettings
+from mien.training.run import BUSY_REMEDY, write_imported_run
 from mien.workspace import Workspace
 
 _DISTANCE = 1.2

@@ -9,11 +9,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from mien.avatar import Avatar, make_portable
+from mien.avatar.avatar import Avatar
+from mien.avatar.baking import make_portable
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.progress import say
-from mien.runtime import write_portable
+from mien.runtime.file import write_portable
 from mien.system import PARENT_VARIABLE, lower_priority
 
 LEAST_SECONDS = 2.0

@@ -9,18 +9,19 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.commands.picture import PictureOptions
 from mien.export.pixels import to_rgb, to_rgba
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.gaussians import Gaussians
 from mien.progress import say
-from mien.render import close_holes, rasterize
+from mien.render import rasterize
+from mien.render.closing import close_holes
 from mien.render.validation import drawable
 from mien.runtime.camera_paths import zoom_for_all
-from mien.training import read_run_config
-from mien.training.whole_head import shares_left
+from mien.training.run import read_run_config
+from mien.training.whole_head.soft_cut import shares_left
 
 _GLANCE, _FAINT = 128, 0.1
 """Largest side of the small pictures that tell where an avatar is, in pixels, and the opacity that counts."""

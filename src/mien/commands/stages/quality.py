@@ -11,22 +11,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.avatar import method_named
-from mien.capture import CaptureSettings, read_capture, read_capture_hash
+from mien.avatar.methods import method_named
+from mien.capture.settings import CaptureSettings
+from mien.capture.store import read_capture, read_capture_hash
 from mien.commands.stages.aligning import one_camera, run_alignment_stage
 from mien.commands.stages.capturing import run_capture_stage
 from mien.commands.stages.evaluating import run_evaluation_stage, run_sequences
 from mien.commands.stages.tracking import run_tracking_stage
 from mien.commands.stages.training import run_training_stage
 from mien.errors import UserError
-from mien.evaluation import read_metrics
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import protocol_means
+from mien.evaluation.metrics_file import protocol_means, read_metrics
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
-from mien.face import load_face_model
+from mien.face.loading import load_face_model
 from mien.inside import remove_tree
 from mien.lab.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
 from mien.lab.benchmarking.unseen_views import (
@@ -36,15 +36,22 @@ from mien.lab.benchmarking.unseen_views import (
     score_side_views,
     write_unseen_chart,
 )
-from mien.lab.synthetic import REFERENCES, ReferenceCapture, read_truth, reference_named
+from mien.lab.synthetic.references import REFERENCES, ReferenceCapture, reference_named
+from mien.lab.synthetic.truth import read_truth
 from mien.locks import WAIT, hold
 from mien.picture_files import write_png
 from mien.progress import say
 from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.terminal import show
-from mien.tracking import Tracking, TrackingSettings, make_scoring, read_tracking, write_scoring, write_tracking
-from mien.training import PRESETS, AlignmentSettings, TrainSettings, read_training_summary
-from mien.training.footage import Frame
+from mien.tracking.files import read_tracking, write_tracking
+from mien.tracking.scoring import make_scoring
+from mien.tracking.scoring_files import write_scoring
+from mien.tracking.settings import TrackingSettings
+from mien.tracking.tracking import Tracking
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.footage.frames import Frame
+from mien.training.run import read_training_summary
+from mien.training.settings import PRESETS, TrainSettings
 from mien.workspace import Workspace
 
 _FORMAT, _VERSION = "mien.bench_quality", 1

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.driving import ARKIT_NAMES
-from mien.face import FaceModel, FaceParams
+from mien.driving.motion import ARKIT_NAMES
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.pictures import WHITE, picture_grid
 from mien.render.camera_paths import orbit
 from mien.runtime.baked import Filmed

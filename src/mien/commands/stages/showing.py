@@ -5,15 +5,17 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from mien.avatar import load_avatar
+from mien.avatar.files import load_avatar
 from mien.commands.stages.exporting import RunContent, Series
 from mien.errors import UserError
 from mien.evaluation.living import FILM, living, write_film
-from mien.export import Motion, write_page
+from mien.export.packed import Motion
+from mien.export.web_page import write_page
 from mien.files import write_atomically
 from mien.pages import LIVING_PAGE
 from mien.progress import say
-from mien.training import read_coverage, read_run_config, run_camera
+from mien.training.footage.filmed import read_coverage
+from mien.training.run import read_run_config, run_camera
 from mien.workspace import Workspace
 
 MOVIE = "me.mp4"

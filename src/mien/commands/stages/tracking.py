@@ -8,35 +8,29 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
-from mien.capture import Capture, read_capture, read_capture_hash
+from mien.capture.capture import Capture
+from mien.capture.store import read_capture, read_capture_hash
 from mien.capture.video import count_frames
 from mien.commands.stages.face_models import face_model_of
 from mien.datasets.writing import OVERLAY
 from mien.errors import UserError
-from mien.face import FaceModel, load_face_model
 from mien.face.checks import check_face_params
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
 from mien.files import remove_leftovers
 from mien.inside import remove_tree
 from mien.locks import hold
 from mien.progress import say
-from mien.tracking import (
-    ScoringSettings,
-    Tracking,
-    TrackingSettings,
-    check_scoring_cut,
-    check_tracking_of,
-    has_enough_faces,
-    make_scoring,
-    overlay_stride,
-    read_tracking,
-    scoring_exists,
-    track_subject,
-    write_overlay,
-    write_residual_report,
-    write_scoring,
-    write_tracking,
-)
-from mien.training import outdated_sequences
+from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
+from mien.tracking.fitting.shot import has_enough_faces
+from mien.tracking.pipeline import track_subject
+from mien.tracking.report.overlay import overlay_stride, write_overlay
+from mien.tracking.report.residuals import write_residual_report
+from mien.tracking.scoring import make_scoring
+from mien.tracking.scoring_files import check_scoring_cut, scoring_exists, write_scoring
+from mien.tracking.settings import ScoringSettings, TrackingSettings
+from mien.tracking.tracking import Tracking
+from mien.training.run import outdated_sequences
 from mien.workspace import Workspace
 
 _TRACKING_RECIPE = 12

@@ -2,28 +2,21 @@
 
 from contextlib import ExitStack
 
-from mien.avatar import MethodConfig
-from mien.capture import read_capture
+from mien.avatar.settings import MethodConfig
+from mien.capture.store import read_capture
 from mien.commands.stages.live_view import LiveView
-from mien.face import FaceModel, load_face_model
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
 from mien.locks import read_beside_writers
 from mien.progress import say
 from mien.terminal import counted
-from mien.training import (
-    NamedSplit,
-    Sequence,
-    TrainSettings,
-    check_untouched,
-    read_own_split,
-    read_sequence,
-    read_training_summary,
-    train,
-    with_benchmark_split,
-    with_named_split,
-    with_own_split,
-)
-from mien.training.run import is_finished
-from mien.training.trainer import check_trackings
+from mien.training.footage.benchmark_split import with_benchmark_split
+from mien.training.footage.named_split import NamedSplit, with_named_split
+from mien.training.footage.own_split import read_own_split, with_own_split
+from mien.training.footage.sequence import Sequence, read_sequence
+from mien.training.run import check_untouched, is_finished, read_training_summary
+from mien.training.settings import TrainSettings
+from mien.training.trainer import check_trackings, train
 from mien.workspace import Workspace
 
 

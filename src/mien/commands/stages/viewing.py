@@ -16,10 +16,15 @@ from mien import runtime
 from mien.capture.camera_names import devices
 from mien.errors import UserError
 from mien.progress import say
-from mien.runtime import MeshBound, PortableAvatar, read_portable
+from mien.runtime.baked import MeshBound, PortableAvatar
+from mien.runtime.file import read_portable
 from mien.stops import Terminated
 from mien.system import PARENT_VARIABLE, end_this_process
-from mien.viewer import CameraSwitch, Door, Mesh, Session, address_of, is_loopback, listen, serve
+from mien.viewer.access import Door, is_loopback
+from mien.viewer.drawing import Mesh
+from mien.viewer.following import CameraSwitch
+from mien.viewer.server import address_of, listen, serve
+from mien.viewer.session import Session
 
 if TYPE_CHECKING:
     import mien.face

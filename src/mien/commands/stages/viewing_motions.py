@@ -8,22 +8,29 @@ import numpy as np
 import torch
 
 from mien import runtime
-from mien.avatar import as_array, bake_rig, load_avatar, make_portable
+from mien.avatar.baking import as_array, bake_rig, make_portable
+from mien.avatar.files import load_avatar
 from mien.capture.camera_names import CameraName, camera_named
 from mien.capture.live_camera import LiveCamera
 from mien.commands.stages.driving import open_driver
 from mien.commands.stages.viewing import Viewed, mesh_of
-from mien.driving import drive, facing, keep_to_filmed, rest_of
-from mien.driving.live import Follower, FollowOptions
+from mien.driving.keeping import keep_to_filmed
+from mien.driving.live.follower import Follower, FollowOptions
+from mien.driving.rest import facing, rest_of
+from mien.driving.transfer import drive
 from mien.errors import UserError
-from mien.export import Motion
-from mien.face import FaceModel, FaceParams, load_face_model
+from mien.export.packed import Motion
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.progress import say
-from mien.runtime import PortableAvatar
-from mien.training import read_coverage, run_camera
-from mien.training.run import filmed_range
-from mien.training.whole_head import with_soft_cut
-from mien.viewer import CameraSwitch, Clip, Mesh, Session
+from mien.runtime.baked import PortableAvatar
+from mien.training.footage.filmed import read_coverage
+from mien.training.run import filmed_range, run_camera
+from mien.training.whole_head.soft_cut import with_soft_cut
+from mien.viewer.drawing import Mesh
+from mien.viewer.following import CameraSwitch
+from mien.viewer.session import Clip, Session
 from mien.workspace import open_workspace
 
 

@@ -9,10 +9,13 @@ from jaxtyping import Float, UInt8
 from mien.camera import Camera
 from mien.datasets.flame_poses import AXES, in_front
 from mien.datasets.layouts.layout import MatteKind
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle
-from mien.training import Sequence, TrainSettings
-from mien.training.footage import composite, foreground_colors, held_out_of, training_frames
+from mien.training.footage.foreground import foreground_colors
+from mien.training.footage.frames import held_out_of, training_frames
+from mien.training.footage.sequence import Sequence, composite
+from mien.training.settings import TrainSettings
 
 _WHITE = np.full(3, 255, np.uint8)
 

@@ -10,7 +10,7 @@ from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, pad
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
 from mien.errors import UserError
-from mien.export import flame_params_of
+from mien.export.flame_params import flame_params_of
 from mien.picture_files import write_png
 from mien.progress import track_progress
 

@@ -20,7 +20,7 @@ from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, pad
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
 from mien.datasets.nersemble_benchmark import TEST_ENDING, TRACKING
-from mien.export import flame_params_of
+from mien.export.flame_params import flame_params_of
 from mien.progress import say
 
 _SHAPES, _EXPRESSIONS = 300, 100

@@ -15,7 +15,7 @@ from mien.inside import remove_tree
 from mien.picture_files import write_png
 from mien.pictures import Box
 from mien.terminal import counted
-from mien.tracking import head_crop
+from mien.tracking.scoring import head_crop
 
 README = "README.txt"
 SCORING = "scoring"

@@ -9,15 +9,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien.avatar import as_array
+from mien.avatar.baking import as_array
 from mien.driving.constants import DRIVING
 from mien.driving.keeping import keep_to_filmed
 from mien.driving.live.landmark_fit import Fitted, LandmarkFit
 from mien.driving.live.one_euro import OneEuro
 from mien.driving.rest import kept_share, rest_of
 from mien.driving.transfer import drive
-from mien.face import FaceModel, FaceParams
-from mien.runtime import Face, Filmed
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.runtime.baked import Filmed
+from mien.runtime.posing import Face
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 State = Literal["waiting", "learning", "following", "resting"]

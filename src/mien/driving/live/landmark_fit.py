@@ -14,12 +14,15 @@ from jaxtyping import Float
 from mien.capture.backend import choose_detector
 from mien.driving.constants import DRIVING
 from mien.driving.rest import kept_share
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import TrackingSettings
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import layout_of
-from mien.tracking.landmarks import EYE_CORNERS, NOSE, landmark_weights, read_response, reduce_face_model
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.landmarks.detector_response import read_response
+from mien.tracking.landmarks.groups import EYE_CORNERS, NOSE, landmark_weights
+from mien.tracking.landmarks.model import reduce_face_model
+from mien.tracking.settings import TrackingSettings
 
 _OPENCV = np.diag([1.0, -1.0, -1.0])
 _DAMPING = 1e-6

@@ -13,30 +13,24 @@ from torch import Tensor
 
 import mien
 from mien import _native
-from mien.avatar import Avatar, MethodConfig, load_avatar
+from mien.avatar.avatar import Avatar
+from mien.avatar.files import load_avatar
+from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.config import decode, encode
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import psnr
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.files import read_json, write_json
 from mien.lab.analysis.spec import AnalysisOptions
 from mien.progress import say
-from mien.training import (
-    Sequence as TrainedSequence,
-)
-from mien.training import (
-    TrainSettings,
-    check_data,
-    read_curves,
-    read_run_config,
-    read_sequence,
-    read_training_summary,
-    run_camera,
-    train,
-)
+from mien.training.footage.sequence import Sequence as TrainedSequence
+from mien.training.footage.sequence import read_sequence
+from mien.training.run import check_data, read_curves, read_run_config, read_training_summary, run_camera
+from mien.training.settings import TrainSettings
+from mien.training.trainer import train
 
 _KEPT, _VERSION = "mien.analysis.kept", 1
 _MAX_NUMBER = 1e12

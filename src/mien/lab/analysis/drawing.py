@@ -6,9 +6,9 @@ from pathlib import Path
 import torch
 
 from mien import _native
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.camera import Camera
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.render import rasterize
 from mien.system import peak_memory_mb
 from mien.threads import one_torch_thread

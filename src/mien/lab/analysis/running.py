@@ -19,7 +19,7 @@ from mien.locks import hold
 from mien.picture_files import write_png
 from mien.progress import say
 from mien.storage import expect_whole, file_digest, read_json, write_json
-from mien.training import read_run_config, read_training_summary
+from mien.training.run import read_run_config, read_training_summary
 
 FORMAT, VERSION = "mien.analysis", 1
 PAGE, RECORD = "analysis.html", "analysis.json"

@@ -7,8 +7,8 @@ import torch
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.scoring import score_pictures
-from mien.perceptual import PerceptualDistance, load_perceptual
-from mien.training.footage import spread_frames
+from mien.perceptual.distance import PerceptualDistance, load_perceptual
+from mien.training.footage.frames import spread_frames
 
 METRICS = ("head_psnr", "head_ssim", "head_perceptual")
 _FRAMES = 16

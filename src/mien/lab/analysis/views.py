@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.camera import Camera
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.pictures import WHITE, Box, to_uint8
 from mien.render import rasterize
 from mien.render.mesh import Headlight, render_mesh

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mien.face import load_face_model
+from mien.face.loading import load_face_model
 from mien.lab.benchmarking.render import draw, draw_and_differentiate
 from mien.lab.benchmarking.scenes import Scene, head_scene
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, device_row, time_function

@@ -6,10 +6,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from mien.lab.synthetic import Truth
+from mien.lab.synthetic.truth import Truth
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import Tracking, frontal_camera
-from mien.tracking.landmarks import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
+from mien.tracking.landmarks.groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
+from mien.tracking.report.overlay import frontal_camera
+from mien.tracking.tracking import Tracking
 
 LIDS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS)
 """MediaPipe's pairs of landmarks across the eyes' openings (`LIDS`), and of the eyes' corners (`_CORNERS`)."""

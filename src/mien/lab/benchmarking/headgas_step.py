@@ -10,9 +10,11 @@ from itertools import count as counting
 import torch
 
 from mien import _native, runtime
-from mien.avatar import HeadGas, make_portable
+from mien.avatar.baking import make_portable
+from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig
-from mien.face import FaceModel, load_face_model
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
 from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
 from mien.lab.benchmarking.train_step import (
@@ -25,7 +27,8 @@ from mien.lab.benchmarking.train_step import (
     runtime_frame,
 )
 from mien.training.checkpoint import TrainingState
-from mien.training.footage import FrameOrder, Targets, training_frames
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, SIZE = 30_000, (512, 512)

@@ -9,13 +9,17 @@ from itertools import count as counting
 import torch
 
 from mien import _native, runtime
-from mien.avatar import MonoGaussianAvatar, MonoGaussianAvatarConfig, make_portable
-from mien.face import FaceModel, load_face_model
+from mien.avatar.baking import make_portable
+from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
+from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
 from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
 from mien.lab.benchmarking.train_step import SETTINGS, TIMESTEPS, benchmark_sequence, paint_targets, runtime_frame
 from mien.training.checkpoint import TrainingState
-from mien.training.footage import FrameOrder, Targets, training_frames
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, FRAME_COUNT, SIZE = 10_000, 30_000, (512, 512)

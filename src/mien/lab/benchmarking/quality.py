@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from mien.capture import Capture
-from mien.face import FaceModel
+from mien.capture.capture import Capture
+from mien.face.model import FaceModel
 from mien.lab.benchmarking.following import (
     Following,
     blink_following,
@@ -17,9 +17,10 @@ from mien.lab.benchmarking.following import (
     still_timesteps,
     turn_following,
 )
-from mien.lab.synthetic import Truth
+from mien.lab.synthetic.truth import Truth
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import Tracking, residual_report
+from mien.tracking.report.residuals import residual_report
+from mien.tracking.tracking import Tracking
 
 _MIN_FACING = 0.2
 """Smallest cosine between a visible vertex's normal and the direction to the camera."""

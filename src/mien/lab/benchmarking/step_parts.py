@@ -14,8 +14,9 @@ from unittest.mock import patch
 import torch
 
 from mien import _native
-from mien.avatar import DEFAULT_METHOD
-from mien.face import FaceModel, load_face_model
+from mien.avatar.methods import DEFAULT_METHOD
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
 from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.train_step import (
     TIMESTEPS,
@@ -25,11 +26,12 @@ from mien.lab.benchmarking.train_step import (
     training_case,
 )
 from mien.terminal import counted
-from mien.training import PRESETS, trainer
+from mien.training import trainer
 from mien.training.checkpoint import TrainingState
-from mien.training.footage import FrameOrder, Targets, training_frames
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Targets
 from mien.training.parts import TrainingPart
-from mien.training.settings import TrainSettings
+from mien.training.settings import PRESETS, TrainSettings
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, SIZE = 45_000, (512, 512)

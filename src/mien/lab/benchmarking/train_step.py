@@ -12,18 +12,21 @@ import torch
 from torch import Tensor
 
 from mien import _native, runtime
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.camera import Camera
-from mien.capture import Capture
-from mien.face import FaceModel, FaceParams, load_face_model
+from mien.capture.capture import Capture
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
 from mien.render import rasterize
-from mien.tracking import Tracking
+from mien.tracking.tracking import Tracking
 from mien.training.ahead import targets_ahead
 from mien.training.checkpoint import TrainingState
-from mien.training.footage import FrameOrder, Sequence, Targets, training_frames
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Sequence, Targets
 from mien.training.settings import TrainSettings
 from mien.training.trainer import TrainingData, start, step
 

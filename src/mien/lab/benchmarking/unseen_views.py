@@ -13,21 +13,24 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture import Capture
+from mien.capture.capture import Capture
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.scoring import Scores, ScoreSettings, as_8_bit, mean_scores, perceptual_metric, score_pictures
 from mien.files import write_atomically
-from mien.lab.synthetic import Truth
 from mien.lab.synthetic.recipe import SIDES
+from mien.lab.synthetic.truth import Truth
 from mien.parallel import stream_in_threads
 from mien.pictures import Box
 from mien.progress import track_progress
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
-from mien.tracking import NeckParts, head_crop, head_cutter
-from mien.training.footage import composite, foreground_colors, measure_coverage
-from mien.training.whole_head import complete_colors, vertex_means
+from mien.tracking.neck_cut import NeckParts
+from mien.tracking.scoring import head_crop, head_cutter
+from mien.training.footage.coverage import measure_coverage
+from mien.training.footage.foreground import foreground_colors
+from mien.training.footage.sequence import composite
+from mien.training.whole_head.completion import complete_colors, vertex_means
 
 AVATAR, MESH = "avatar", "mesh"
 _TILE = 160

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from mien import exact
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.lab.synthetic.posing import landmark_positions, rest_vertices
 
 # MediaPipe's landmark indices. "right" is the subject's right.

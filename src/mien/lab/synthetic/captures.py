@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mien.camera import Camera
-from mien.capture import Capture, write_capture
+from mien.capture.capture import Capture
 from mien.capture.faces import LANDMARKS, LandmarkDetector
+from mien.capture.store import write_capture
 from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.face.loading import face_model_edition
@@ -24,7 +25,7 @@ from mien.lab.synthetic.scene import SyntheticScene
 from mien.lab.synthetic.truth import hash_surface, truth_of, write_truth
 from mien.progress import progress_bar, say, track_progress
 from mien.storage import read_json, write_json
-from mien.tracking import Tracking
+from mien.tracking.tracking import Tracking
 
 FORMAT, VERSION = "mien.synthetic_capture", 1
 _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"

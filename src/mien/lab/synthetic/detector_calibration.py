@@ -22,12 +22,13 @@ from torch import Tensor
 from mien.capture.backend import Detector
 from mien.capture.faces import LandmarkDetector
 from mien.errors import UserError
-from mien.face import FaceModel, load_face_model
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.progress import say, track_progress
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking.landmarks import DetectorResponse, read_response, response_path, write_response
+from mien.tracking.landmarks.detector_response import DetectorResponse, read_response, response_path, write_response
 
 _FIRST_SEED = 500
 """First seed, far from those of the reference captures, so that nobody is both calibrated on and measured on."""

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float
 
 from mien import exact
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.lab.synthetic.arithmetic import smoothstep
 from mien.lab.synthetic.posing import rest_joints
 from mien.lab.synthetic.recipe import Segment, SegmentKind, SyntheticRecipe

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien import exact
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep
 from mien.lab.synthetic.posing import rest_vertices
 

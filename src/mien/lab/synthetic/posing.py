@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from mien import exact
 from mien.camera import Camera
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.runtime.rotation import matrix_from_axis_angle
 
 

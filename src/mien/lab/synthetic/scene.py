@@ -13,7 +13,9 @@ from jaxtyping import Float, UInt8
 
 from mien import exact
 from mien.camera import Camera, look_at
-from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.lab.synthetic.motion import generate_motion
 from mien.lab.synthetic.off_model import bend_off_model
 from mien.lab.synthetic.painter import develop, draw, paint_wall, to_uint8
@@ -21,8 +23,8 @@ from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions, 
 from mien.lab.synthetic.recipe import SIDES, SyntheticRecipe
 from mien.lab.synthetic.subject import Subject, build_subject, pose_subject
 from mien.parallel import stream_in_threads
-from mien.tracking import Tracking
 from mien.tracking.neck_line import fit_neck_lines
+from mien.tracking.tracking import Tracking
 
 _MAX_AZIMUTH = 72.0
 """Largest angle to either side of a ring, in degrees."""

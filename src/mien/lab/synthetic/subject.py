@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float, Int
 
 from mien import exact
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.lab.synthetic.accessories import Glasses, RigidMesh, build_glasses, build_shirt, stack_meshes
 from mien.lab.synthetic.anatomy import CHIN, SIDES, Anatomy, measure_anatomy
 from mien.lab.synthetic.facial_hair import RootedStrands, SkinStrands, grow_beard, grow_brows, grow_lashes

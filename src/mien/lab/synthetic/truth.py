@@ -13,7 +13,8 @@ from mien.errors import UserError
 from mien.lab.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure_anatomy
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.storage import read_arrays, read_json, write_arrays, write_json
-from mien.tracking import Tracking, read_tracking, write_tracking
+from mien.tracking.files import read_tracking, write_tracking
+from mien.tracking.tracking import Tracking
 
 FORMAT, VERSION = "mien.synthetic_truth", 1
 _JSON, _ARRAYS, _TRACKING = "truth.json", "truth.safetensors", "tracking"

@@ -28,7 +28,7 @@ from mien.tracking.descent.terms import (
     smoothness_term,
     without_smooth_difference,
 )
-from mien.tracking.fitting import StageCache
+from mien.tracking.fitting.resume import StageCache
 
 _PIECE = "descent"
 _RATES = {"lights": "light", "log_focals": "focal"}

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.adam import Moments
-from mien.face import most_frontal_camera
+from mien.face.params import most_frontal_camera
 from mien.progress import Advance
 from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import apply_adam
@@ -26,7 +26,7 @@ from mien.tracking.descent.terms import (
     visibility_of,
     without_smooth_difference,
 )
-from mien.tracking.fitting import StageCache
+from mien.tracking.fitting.resume import StageCache
 
 
 def fit_appearance(descent: Descent) -> None:

@@ -9,21 +9,18 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from mien.camera import Camera
-from mien.face import FaceModel, Landmarks
+from mien.face.model import FaceModel, Landmarks
 from mien.render.mesh_gradients import LitMesh, mesh_edges
-from mien.tracking.fitting import (
-    HIDING_REGIONS,
-    CameraBatch,
-    Fit,
-    ParameterLayout,
-    SequenceFit,
-    Shot,
-    Smoothness,
-    Subject,
-    smoothness_of,
-)
-from mien.tracking.landmarks import LEFT_IRIS, RIGHT_IRIS, LandmarkModel, LandmarkTerm, all_landmarks, quiet_landmarks
-from mien.tracking.pixels import PhotometricFit, Pictures, even_light, texture_space
+from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, SequenceFit, Subject, smoothness_of
+from mien.tracking.fitting.parameters import ParameterLayout
+from mien.tracking.fitting.shot import Shot
+from mien.tracking.fitting.solver import Smoothness
+from mien.tracking.fitting.views import CameraBatch
+from mien.tracking.landmarks.groups import LEFT_IRIS, RIGHT_IRIS
+from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, quiet_landmarks
+from mien.tracking.pixels.pictures import Pictures
+from mien.tracking.pixels.texture import PhotometricFit, even_light, texture_space
 from mien.tracking.settings import PaperSettings, TrackingSettings
 
 _STIFF_REGIONS = ("eyes", "irises", "eyelids", "teeth", "tongue", "mouth", "eye_sockets", "scalp", "neck", "ears")

@@ -10,9 +10,11 @@ from mien.progress import progress_bar
 from mien.tracking.descent.epochs import Descent
 from mien.tracking.descent.frames import fit_appearance, fit_sequence, measure_visibility, recenter
 from mien.tracking.descent.scene import PaperScene, PaperState, first_state, paper_scene
-from mien.tracking.fitting import Course, Fit, Shot, StageCache, Watch
-from mien.tracking.landmarks import LandmarkModel
-from mien.tracking.pixels import PhotometricFit, SkinTexture, texture_space
+from mien.tracking.fitting.fit import Course, Fit, Watch
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import Shot
+from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.pixels.texture import PhotometricFit, SkinTexture, texture_space
 from mien.tracking.settings import TrackingSettings
 
 

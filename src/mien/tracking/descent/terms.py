@@ -14,13 +14,14 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 from mien.camera import Camera
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.render.mesh import MeshFragments, rasterize_mesh, vertex_normals
 from mien.render.mesh_gradients import image_points, mesh_loss
 from mien.tracking.constants import TRACKING
 from mien.tracking.descent.scene import PaperScene, PaperState, SequenceScene
-from mien.tracking.fitting import CameraBatch, Smoothness
-from mien.tracking.landmarks import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
+from mien.tracking.fitting.solver import Smoothness
+from mien.tracking.fitting.views import CameraBatch
+from mien.tracking.landmarks.groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 
 _GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 """Pairs of upper and lower landmarks. Their distances show how far eyes and mouth are open."""

@@ -7,11 +7,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import HIDING_REGIONS, ParameterLayout
-from mien.tracking.landmarks import LEFT_EYELIDS, LEFT_LID_PAIRS, RIGHT_EYELIDS, RIGHT_LID_PAIRS
+from mien.tracking.fitting.fit import HIDING_REGIONS
+from mien.tracking.fitting.parameters import ParameterLayout
+from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_LID_PAIRS, RIGHT_EYELIDS, RIGHT_LID_PAIRS
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,9 @@ from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids.colors import EyeColors, learn_colors
 from mien.tracking.eyelids.crops import EyeCrop, eye_crop
 from mien.tracking.eyelids.eyes import Eye, eyes_of
-from mien.tracking.fitting import Fit, SequenceFit, Shot
-from mien.tracking.landmarks import LandmarkModel
+from mien.tracking.fitting.fit import Fit, SequenceFit
+from mien.tracking.fitting.shot import Shot
+from mien.tracking.landmarks.model import LandmarkModel
 
 
 def place_lids(

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.capture.backend import Detector
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.tracking.constants import TRACKING
 
 _COMMAND = "python -m mien.lab.synthetic.detector_calibration"

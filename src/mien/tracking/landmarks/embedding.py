@@ -17,7 +17,8 @@ from mien.camera import Camera, camera_from_fov
 from mien.capture.faces import LANDMARKS
 from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams, Landmarks
+from mien.face.model import FaceModel, Landmarks
+from mien.face.params import FaceParams
 from mien.progress import track_progress
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform

@@ -8,7 +8,10 @@ from torch import Tensor
 
 from mien.rotation import axis_angle_from_matrix
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import CameraBatch, Subject, Views, minimize_frames, pose_only
+from mien.tracking.fitting.fit import Subject
+from mien.tracking.fitting.parameters import pose_only
+from mien.tracking.fitting.solver import minimize_frames
+from mien.tracking.fitting.views import CameraBatch, Views
 from mien.tracking.landmarks.groups import rigid_weights
 from mien.tracking.landmarks.model import LandmarkModel
 from mien.tracking.landmarks.term import LandmarkTerm, landmark_term

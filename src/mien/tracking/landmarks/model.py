@@ -7,9 +7,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.rotation import left_jacobian, matrix_from_axis_angle
-from mien.tracking.fitting import CameraBatch, ParameterLayout
+from mien.tracking.fitting.parameters import ParameterLayout
+from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.detector_response import DetectorResponse, unknown_response
 from mien.tracking.settings import TrackingSettings
 

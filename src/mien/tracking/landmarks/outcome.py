@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking.fitting import SequenceFit, Shot, Subject
+from mien.tracking.fitting.fit import SequenceFit, Subject
+from mien.tracking.fitting.shot import Shot
 from mien.tracking.landmarks.model import LandmarkModel
 from mien.tracking.landmarks.term import all_landmarks
 from mien.tracking.neck_line import fit_neck_lines

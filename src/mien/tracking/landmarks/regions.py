@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from mien.face import FaceModel
 from mien.face.chart import edge_connected, find_outside
+from mien.face.model import FaceModel
 from mien.tracking.constants import TRACKING
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 

@@ -9,13 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import (
+from mien.tracking.fitting.fit import Fit, SequenceFit, Subject
+from mien.tracking.fitting.solver import (
     Bounds,
-    Fit,
     NormalEquations,
-    SequenceFit,
     SharedEquations,
-    Subject,
     join_frames,
     join_shared,
     place_shared,

@@ -10,23 +10,21 @@ from torch import Tensor
 
 from mien.progress import progress_bar
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import (
-    CameraBatch,
+from mien.tracking.fitting.fit import (
     Course,
     Fit,
     SequenceFit,
-    Shot,
-    Smoothness,
-    StageCache,
     Subject,
     Watch,
     choose_keyframes,
     fit_of,
-    minimize_frames,
     smoothness_of,
-    solve_chain,
     widen,
 )
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import Shot
+from mien.tracking.fitting.solver import Smoothness, minimize_frames, solve_chain
+from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.head_pose import fit_head_pose
 from mien.tracking.landmarks.model import LandmarkModel
 from mien.tracking.landmarks.shared_fit import fit_bias, fit_shared

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import CameraBatch, NormalEquations, SequenceFit, SharedEquations, Subject, Views
+from mien.tracking.fitting.fit import SequenceFit, Subject
+from mien.tracking.fitting.solver import NormalEquations, SharedEquations
+from mien.tracking.fitting.views import CameraBatch, Views
 from mien.tracking.landmarks.detector_response import DetectorResponse
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS, landmark_weights
 from mien.tracking.landmarks.model import LandmarkModel, Linearization

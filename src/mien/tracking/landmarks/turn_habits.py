@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.tracking.fitting import SequenceFit, Subject
+from mien.tracking.fitting.fit import SequenceFit, Subject
 from mien.tracking.landmarks.term import LandmarkTerm
 
 _MIN_TURN = 1e-4

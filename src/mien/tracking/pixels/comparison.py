@@ -9,10 +9,10 @@ from torch import Tensor
 from mien import _native
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.render.mesh import vertex_normals
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import CameraBatch, batch_of
+from mien.tracking.fitting.views import CameraBatch, batch_of
 from mien.tracking.pixels.pictures import Picture, Pictures
 from mien.tracking.pixels.surface import PosedSurface
 from mien.tracking.pixels.texture import Sighting, SkinTexture, texture_space

@@ -14,13 +14,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.capture.capture import Capture
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import HIDING_REGIONS, batch_of
-from mien.tracking.landmarks import BROWS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
+from mien.tracking.fitting.fit import HIDING_REGIONS
+from mien.tracking.fitting.views import batch_of
+from mien.tracking.landmarks.groups import BROWS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 from mien.tracking.pixels.comparison import window_of
 from mien.tracking.pixels.pictures import Picture, Pictures
 from mien.tracking.tracking import PARTS, Tracking

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.parallel import map_in_threads
 from mien.progress import say
 from mien.render.mesh import sh_basis
-from mien.tracking.fitting import Shot
+from mien.tracking.fitting.shot import Shot
 from mien.tracking.pixels.comparison import model_pictures
 from mien.tracking.pixels.covered import covered_parts
 from mien.tracking.pixels.texture import PhotometricFit, SkinTexture

@@ -19,7 +19,9 @@ from mien.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.render.mesh_gradients import mesh_edges
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import CameraBatch, NormalEquations, SharedEquations, Subject, Views
+from mien.tracking.fitting.fit import Subject
+from mien.tracking.fitting.solver import NormalEquations, SharedEquations
+from mien.tracking.fitting.views import CameraBatch, Views
 from mien.tracking.pixels.surface import SurfaceModel, by_log_focal
 
 _HIDDEN_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "eyes", "irises", "eyelids")

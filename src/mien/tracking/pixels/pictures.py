@@ -11,7 +11,7 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import CameraBatch
+from mien.tracking.fitting.views import CameraBatch
 
 
 @dataclass(frozen=True, eq=False)

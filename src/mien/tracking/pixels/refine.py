@@ -11,21 +11,14 @@ from torch import Tensor
 from mien.parallel import map_in_threads
 from mien.progress import progress_bar, say
 from mien.tracking.constants import TRACKING
-from mien.tracking.eyelids import place_lids
-from mien.tracking.fitting import (
-    Course,
-    Fit,
-    NormalEquations,
-    SequenceFit,
-    Shot,
-    Smoothness,
-    StageCache,
-    Subject,
-    Watch,
-    smoothness_of,
-    solve_chain,
-)
-from mien.tracking.landmarks import LandmarkModel, LandmarkTerm, all_landmarks, fit_bias, quiet_landmarks
+from mien.tracking.eyelids.placing import place_lids
+from mien.tracking.fitting.fit import Course, Fit, SequenceFit, Subject, Watch, smoothness_of
+from mien.tracking.fitting.resume import StageCache
+from mien.tracking.fitting.shot import Shot
+from mien.tracking.fitting.solver import NormalEquations, Smoothness, solve_chain
+from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.landmarks.shared_fit import fit_bias
+from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, quiet_landmarks
 from mien.tracking.pixels.outline import OutlineTerm, outline_term
 from mien.tracking.pixels.pictures import Pictures
 from mien.tracking.pixels.shared import SharedPrior, step_shared

@@ -9,16 +9,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import (
-    Fit,
-    SequenceFit,
-    choose_keyframes,
-    join_frames,
-    join_shared,
-    place_shared,
-    solve_arrow,
-)
-from mien.tracking.landmarks import move_subject
+from mien.tracking.fitting.fit import Fit, SequenceFit, choose_keyframes
+from mien.tracking.fitting.solver import join_frames, join_shared, place_shared, solve_arrow
+from mien.tracking.landmarks.term import move_subject
 from mien.tracking.pixels.outline import OutlineTerm
 from mien.tracking.pixels.term import PhotometricTerm
 

@@ -7,10 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.render.mesh import vertex_normals
 from mien.rotation import left_jacobian, matrix_from_axis_angle
-from mien.tracking.fitting import CameraBatch, ParameterLayout
+from mien.tracking.fitting.parameters import ParameterLayout
+from mien.tracking.fitting.views import CameraBatch
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,11 @@ from torch import Tensor
 from mien import _native
 from mien.parallel import map_in_threads
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import CameraBatch, NormalEquations, ParameterLayout, SharedEquations, Subject, join_frames
-from mien.tracking.landmarks import LandmarkTerm
+from mien.tracking.fitting.fit import Subject
+from mien.tracking.fitting.parameters import ParameterLayout
+from mien.tracking.fitting.solver import NormalEquations, SharedEquations, join_frames
+from mien.tracking.fitting.views import CameraBatch
+from mien.tracking.landmarks.term import LandmarkTerm
 from mien.tracking.pixels.pictures import Pictures
 from mien.tracking.pixels.surface import PosedSurface, SurfaceModel, by_log_focal
 from mien.tracking.pixels.texture import Sighting

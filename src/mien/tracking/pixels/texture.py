@@ -13,10 +13,10 @@ from torch import Tensor
 
 from mien import _native
 from mien.camera import Camera
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.render.mesh import MeshFragments, rasterize_mesh
 from mien.tracking.constants import TRACKING
-from mien.tracking.fitting import HIDING_REGIONS, Fit, fit_of
+from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, fit_of
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.surface import PosedSurface
 

@@ -12,12 +12,13 @@ from jaxtyping import Float, UInt8
 
 from mien.capture.capture import Capture
 from mien.capture.video import write_video
-from mien.face import FaceModel, most_frontal_camera
+from mien.face.model import FaceModel
+from mien.face.params import most_frontal_camera
 from mien.parallel import stream_in_threads
 from mien.progress import track_progress
 from mien.render.mesh import Headlight, render_mesh
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
-from mien.tracking.pixels import model_pictures, window_of
+from mien.tracking.pixels.comparison import model_pictures, window_of
 from mien.tracking.report.heat import dimmed, draw_legend, heat_map, write_text
 from mien.tracking.report.rig import seen_from_front, visible_landmarks
 from mien.tracking.tracking import Tracking

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.capture.capture import Capture
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.pages import render
 from mien.pictures import picture_uri, shrink
 from mien.storage import write_atomically

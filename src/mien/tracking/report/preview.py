@@ -11,14 +11,18 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from mien.capture.capture import Capture
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.pages import render
 from mien.picture_files import encode_picture
 from mien.pictures import data_uri
 from mien.storage import write_atomically
-from mien.tracking.fitting import Fit, SequenceFit, Shot
-from mien.tracking.landmarks import LandmarkModel, as_tracking
-from mien.tracking.pixels import PhotometricFit, appearance_of, model_pictures
+from mien.tracking.fitting.fit import Fit, SequenceFit
+from mien.tracking.fitting.shot import Shot
+from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.landmarks.outcome import as_tracking
+from mien.tracking.pixels.comparison import model_pictures
+from mien.tracking.pixels.outcome import appearance_of
+from mien.tracking.pixels.texture import PhotometricFit
 from mien.tracking.report.contact_sheet import SheetFrame, strip
 from mien.tracking.report.heat import write_text
 from mien.tracking.report.overlay import OverlayPainter, frontal_camera

@@ -10,7 +10,8 @@ Strategies see a `GaussianStore`, the posed Gaussians, the rendering, and the me
 but never the method. They keep statistics with one entry per Gaussian, which checkpoints save.
 """
 
-from mien.avatar import DensityControl, FixedDensity, GaussianStore, GradientDensity, RefillDensity
+from mien.avatar.density import DensityControl, FixedDensity, GradientDensity, RefillDensity
+from mien.avatar.store import GaussianStore
 from mien.training.density_control.gradient import GradientStrategy
 from mien.training.density_control.refill import RefillStrategy
 from mien.training.density_control.strategy import DensityStrategy, FixedStrategy

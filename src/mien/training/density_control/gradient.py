@@ -32,7 +32,10 @@ from torch import Tensor
 
 from mien import _native
 from mien.arrays import is_native, unpacked
-from mien.avatar import GaussianStore, GradientDensity, Posed, Progress
+from mien.avatar.avatar import Posed
+from mien.avatar.density import GradientDensity
+from mien.avatar.schedules import Progress
+from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
 

@@ -18,7 +18,10 @@ is one count per tensor, goes on.
 import torch
 from torch import Tensor
 
-from mien.avatar import GaussianStore, Posed, Progress, RefillDensity
+from mien.avatar.avatar import Posed
+from mien.avatar.density import RefillDensity
+from mien.avatar.schedules import Progress
+from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
 

@@ -7,7 +7,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from mien.avatar import GaussianStore, Posed, Progress
+from mien.avatar.avatar import Posed
+from mien.avatar.schedules import Progress
+from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 
 Random = Callable[[], torch.Generator]

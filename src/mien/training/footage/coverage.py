@@ -13,11 +13,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking import NeckCut, NeckParts, fit_neck_cut
+from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
 from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.mesh_colors import sample_picture

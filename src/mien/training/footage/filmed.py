@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
-from mien.face import FaceModel
+from mien.face.model import FaceModel
 from mien.render.camera_paths import turned_camera
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.runtime.baked import Filmed

@@ -6,8 +6,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from mien.camera import Camera
-from mien.face import FaceModel
 from mien.face.head_parts import head_parts
+from mien.face.model import FaceModel
 from mien.render.mesh import rasterize_mesh
 from mien.training.footage.constants import FOOTAGE
 

@@ -8,7 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.training.footage.constants import FOOTAGE

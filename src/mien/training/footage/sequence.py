@@ -12,12 +12,17 @@ from torch import Tensor
 from mien import _native
 from mien.arrays import is_native
 from mien.camera import Camera
-from mien.capture import Capture, read_capture, read_capture_hash
+from mien.capture.capture import Capture
+from mien.capture.store import read_capture, read_capture_hash
 from mien.errors import UserError
-from mien.face import FaceModel, part_boxes
+from mien.face.model import FaceModel
+from mien.face.parts import part_boxes
 from mien.locks import read_beside_writers
 from mien.pictures import Box
-from mien.tracking import Scoring, Tracking, check_tracking_of, read_scoring, read_tracking
+from mien.tracking.files import check_tracking_of, read_tracking
+from mien.tracking.scoring import Scoring
+from mien.tracking.scoring_files import read_scoring
+from mien.tracking.tracking import Tracking
 from mien.training.footage.foreground import soft_colors
 from mien.training.footage.hidden import hidden_triangles
 

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
-from mien.tracking import NeckParts, fit_neck_cut
+from mien.face.model import FaceModel
+from mien.tracking.neck_cut import NeckParts, fit_neck_cut
 from mien.training.whole_head.constants import WHOLE_HEAD
 
 

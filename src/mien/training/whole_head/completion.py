@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.face import FaceModel, mirror_triangles
 from mien.face.head_parts import HeadParts, head_parts, mouth_colors
-from mien.face.mirror import triangle_geometry
+from mien.face.mirror import mirror_triangles, triangle_geometry
+from mien.face.model import FaceModel
 from mien.render.mesh import shade
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.spreading import Surface

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.camera import Camera
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.gaussians import SH_C0
 from mien.render import rasterize
 from mien.training.whole_head.constants import WHOLE_HEAD

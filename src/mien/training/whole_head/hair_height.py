@@ -8,12 +8,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
-from mien.training.footage import Frame, Sequence, spread_frames
+from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.sequence import Sequence
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.spreading import Surface
 

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.avatar import Avatar, BoundSurface, SurfacePrior
+from mien.avatar.avatar import Avatar
+from mien.avatar.bound_surface import BoundSurface, SurfacePrior
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.training.whole_head.constants import WHOLE_HEAD

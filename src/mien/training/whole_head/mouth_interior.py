@@ -12,11 +12,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mien.avatar import Avatar, BoundSurface, Posed
+from mien.avatar.avatar import Avatar, Posed
+from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.constants import AVATAR
 from mien.face.head_parts import head_parts
 from mien.gaussians import sh_from_rgb
-from mien.training.footage import Coverage, cover_random, inside_triangles
+from mien.training.footage.coverage import Coverage
+from mien.training.footage.frames import cover_random
+from mien.training.footage.hidden import inside_triangles
 from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
 from mien.training.whole_head.completion import complete_colors
 from mien.training.whole_head.constants import WHOLE_HEAD

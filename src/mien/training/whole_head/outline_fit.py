@@ -18,11 +18,13 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from mien.camera import Camera
-from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.parallel import stream_in_threads
 from mien.threads import one_torch_thread
-from mien.training.footage import Frame, Sequence, spread_frames
+from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import fills_sides

@@ -7,9 +7,11 @@ from dataclasses import replace
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.avatar import Avatar, BoundSurface
+from mien.avatar.avatar import Avatar
+from mien.avatar.bound_surface import BoundSurface
 from mien.render.rendering import Rendering
-from mien.training.footage import resolved, side_random, with_shown_angles
+from mien.training.footage.filmed import with_shown_angles
+from mien.training.footage.frames import resolved, side_random
 from mien.training.parts import Preparation, Step, TrainingPart
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.constants import WHOLE_HEAD

@@ -16,14 +16,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.avatar import Avatar, Posed, Progress
+from mien.avatar.avatar import Avatar, Posed
+from mien.avatar.schedules import Progress
 from mien.camera import Camera
-from mien.face import FaceModel, FaceParams
 from mien.face.head_parts import head_parts
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.render import rasterize
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import NeckParts, fit_neck_cut, head_mask
+from mien.tracking.neck_cut import NeckParts, fit_neck_cut
+from mien.tracking.scoring import head_mask
 from mien.training.whole_head.completion import vertex_means
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen

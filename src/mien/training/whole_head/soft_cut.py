@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.gaussians import world_means
-from mien.runtime import PortableAvatar
-from mien.tracking import NeckCut, NeckParts, fit_neck_cut
+from mien.runtime.baked import PortableAvatar
+from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
 from mien.training.whole_head.constants import WHOLE_HEAD
 
 _PART = 4096

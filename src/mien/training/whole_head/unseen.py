@@ -16,22 +16,21 @@ from torch import Tensor
 from torch.nn.functional import softshrink
 
 from mien.arrays import clear_rows
-from mien.avatar import Avatar, DensityControl, GaussianStore, Photometric, SurfacePrior
-from mien.face import FaceModel, FaceParams
+from mien.avatar.avatar import Avatar
+from mien.avatar.bound_surface import SurfacePrior
+from mien.avatar.density import DensityControl
+from mien.avatar.settings import Photometric
+from mien.avatar.store import GaussianStore
 from mien.face.head_parts import head_parts
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.render.rendering import Rendering
-from mien.training.footage import (
-    Coverage,
-    Frame,
-    Sequence,
-    drawn_share,
-    hidden_triangles,
-    measure_coverage,
-    smoothstep,
-    spread_frames,
-)
+from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
+from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.hidden import hidden_triangles
+from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.completion import complete_colors, vertex_means

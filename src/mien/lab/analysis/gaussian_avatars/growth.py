@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mien.avatar import GaussianAvatarsConfig
+from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.errors import UserError
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.result import Chart, PartResult, Table

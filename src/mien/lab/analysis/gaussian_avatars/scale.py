@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mien.avatar import GaussianAvatarsConfig
+from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.lab.analysis.context import Context, Variant, mean_psnr
 from mien.lab.analysis.drawing import measure_in_turn
 from mien.lab.analysis.result import Chart, PartResult, Table
 from mien.plots import Axes, Series
 from mien.storage import file_digest
-from mien.training.footage import spread_frames
+from mien.training.footage.frames import spread_frames
 
 _LAST = 0.2
 """Share of a training, at its end, that step times are taken from."""

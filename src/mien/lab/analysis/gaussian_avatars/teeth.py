@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.avatar import Avatar
+from mien.avatar.avatar import Avatar
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to, psnr
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.lab.analysis.context import Context, Variant, mean_psnr
 from mien.lab.analysis.result import PartResult, Picture, Table
 from mien.lab.analysis.views import draw_avatar, mouth_box, mouth_camera

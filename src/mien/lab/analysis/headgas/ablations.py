@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from mien import _native
-from mien.avatar import HeadGasConfig
+from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.headgas.settings import Variant as VariantName
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to
@@ -17,10 +17,10 @@ from mien.lab.analysis.headgas.trained import busy_face
 from mien.lab.analysis.result import PartResult, Picture, Table
 from mien.lab.analysis.scoring import METRICS, held_out_scores, perceptual_metric
 from mien.lab.analysis.views import labeled
-from mien.perceptual import PerceptualDistance
+from mien.perceptual.distance import PerceptualDistance
 from mien.pictures import side_by_side, to_uint8
 from mien.storage import file_digest
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
 
 PAPER: dict[str, tuple[str, int | None, float | None, float]] = {
     "no_blending": ("without blending", 135_000, 8.0, 29.38),

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mien.avatar import HeadGas
+from mien.avatar.headgas.avatar import HeadGas
 from mien.capture.video import write_video
-from mien.face import FaceModel, FaceParams
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas.trained import trained_range, with_expression
 from mien.lab.analysis.result import Film, PartResult, Picture, Table

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.face import FaceParams
+from mien.face.params import FaceParams
 from mien.lab.analysis.context import Context
 from mien.runtime.filmed import head_angles
 

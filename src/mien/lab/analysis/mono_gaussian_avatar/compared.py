@@ -4,7 +4,7 @@ from dataclasses import replace
 from math import log
 from typing import Any
 
-from mien.avatar import MonoGaussianAvatarConfig
+from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.evaluation.experiment import avatar_image, target_image
 from mien.evaluation.metrics import crop_to
 from mien.lab.analysis.context import Context, Variant
@@ -12,9 +12,9 @@ from mien.lab.analysis.mono_gaussian_avatar.subsets import frontal_quarter, mask
 from mien.lab.analysis.result import PartResult, Picture, Table
 from mien.lab.analysis.scoring import METRICS, held_out_scores, perceptual_metric
 from mien.lab.analysis.views import labeled
-from mien.perceptual import PerceptualDistance
+from mien.perceptual.distance import PerceptualDistance
 from mien.pictures import side_by_side, to_uint8
-from mien.training.footage import training_frames
+from mien.training.footage.frames import training_frames
 
 _LEAST = 16
 """Smallest side of training pictures, in pixels."""

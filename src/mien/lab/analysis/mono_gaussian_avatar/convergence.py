@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mien.avatar import Avatar, Progress
+from mien.avatar.avatar import Avatar
+from mien.avatar.schedules import Progress
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -17,16 +18,16 @@ from mien.plots import Axes, Series
 from mien.progress import progress_bar
 from mien.render import rasterize
 from mien.threads import one_torch_thread
-from mien.training.footage import (
+from mien.training.footage.frames import (
     Frame,
     FrameOrder,
-    Targets,
     camera_extent,
     expression_rarity,
     resolved,
     spread_frames,
     training_frames,
 )
+from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, pretrain, start, step
 
 TIMES = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)

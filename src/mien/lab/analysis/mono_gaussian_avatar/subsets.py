@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.runtime.filmed import head_angles
-from mien.training import Sequence
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence
 
 FRONTAL_SHARE, MIXED_SHARE = 0.25, 0.5
 """Shares of the frames in the two subsets."""

@@ -10,7 +10,7 @@ from mien.errors import UserError
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.load import load_experiments
 from mien.lab.analysis.study.settings import StudySettings
-from mien.training.footage import Frame
+from mien.training.footage.frames import Frame
 
 _MIN_FRAMES = 2
 _SHORTEST = 0.5
