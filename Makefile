@@ -34,7 +34,7 @@ $(VENV)/.built: $(VENV)/.packages pyproject.toml $(NATIVE)
 build: setup
 
 # MediaPipe's face landmarker for pages, for `mien export --webcam` and the wheel: one package of npm, in a version that
-# sends nothing (src/mien/export/webcam.py checks its files by hash). Everything else works without it.
+# sends nothing (src/mien/formats/shared/webcam.py checks its files by hash). Everything else works without it.
 LANDMARKER := src/mien/export/landmarker
 TASKS_VISION := @mediapipe/tasks-vision@0.10.35
 landmarker: $(LANDMARKER)/vision_wasm_internal.wasm.xz

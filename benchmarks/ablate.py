@@ -25,9 +25,9 @@ from typing import Any, NamedTuple
 
 import mien
 from mien.cli import main as run_mien
+from mien.disk.workspace import open_workspace
 from mien.errors import UserError
-from mien.terminal import show
-from mien.workspace import open_workspace
+from mien.machine.terminal import show
 
 Change = tuple[Any, str, Any]
 """The constants of a room, the name of one of them, and its other value."""
@@ -97,8 +97,8 @@ def run_name(label: str, options: Sequence[str]) -> str:
 
 def measure(folder: Path, label: str, change: Change | None, options: Sequence[str]) -> Figures:
     """Train a workspace with a change, and score the run without baselines, ST-LPIPS and videos."""
-    from mien.commands.stages.evaluating import run_evaluation_stage
     from mien.evaluation.protocols import EvaluationSettings
+    from mien.pipeline.evaluate import run_evaluation_stage
 
     quick = EvaluationSettings(perceptual=False, baselines=False, video_frames=0)
     with changed(change) if change else nullcontext():

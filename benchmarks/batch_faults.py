@@ -25,7 +25,7 @@ from mien.batch.progress import batch_progress, progress_text
 from mien.batch.row import row_process
 from mien.batch.steps import do_with
 from mien.cli import main as mien
-from mien.files import read_json
+from mien.disk.files import read_json
 
 Fault = tuple[str, str, str, Callable[[int], object]]
 """A row, words of its log, what is done then, and how, given the row's process."""

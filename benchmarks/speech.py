@@ -19,9 +19,9 @@ import numpy as np
 from scipy.signal import resample_poly
 
 import mien.runtime
-from mien.capture.sound import RATE
 from mien.driving.motion import ARKIT_NAMES
-from mien.driving.speech import motion_of_sound
+from mien.driving.sources.speech import motion_of_sound
+from mien.media.sound import RATE
 
 SENTENCES = {
     "chosen": (

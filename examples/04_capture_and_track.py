@@ -10,12 +10,12 @@ from pathlib import Path
 from mien.capture import capture_video
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture_hash
+from mien.disk.workspace import Workspace
 from mien.face import load_face_model
 from mien.tracking import track, write_tracking
 from mien.tracking.report.overlay import write_overlay
 from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import write_scoring
-from mien.workspace import Workspace
 
 
 def main() -> None:

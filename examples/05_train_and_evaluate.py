@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 
 from mien.avatar import GaussianAvatarsConfig
+from mien.disk.workspace import open_workspace
 from mien.evaluation import evaluate
 from mien.face import load_face_model
 from mien.training import TrainSettings, read_sequence, train
-from mien.workspace import open_workspace
 
 
 def main() -> None:

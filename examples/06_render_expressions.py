@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from mien.avatar import load_avatar
+from mien.disk.workspace import open_workspace
 from mien.render import rasterize
 from mien.render.camera_paths import orbit
 from mien.training.run import run_camera
-from mien.workspace import open_workspace
 
 EXPRESSIONS = {"jawOpen": 0.5, "mouthSmileLeft": 0.8, "eyeBlinkLeft": 1.0, "browInnerUp": 0.8}
 ANGLES = (-20, -7, 7, 20)

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from mien.avatar import load_avatar, neutral_of
-from mien.capture.video import write_video
+from mien.disk.workspace import open_workspace
 from mien.driving import drive
+from mien.media.video import write_video
 from mien.render import rasterize
 from mien.training import read_sequence
 from mien.training.run import run_camera
-from mien.workspace import open_workspace
 
 
 @torch.no_grad()

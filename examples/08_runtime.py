@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mien import runtime
-from mien.export.pixels import png_bytes, to_rgb
+from mien.media.pixels import png_bytes, to_rgb
 
 
 def main() -> None:

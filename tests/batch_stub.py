@@ -20,7 +20,7 @@ from mien.batch.drive import Driver
 from mien.batch.plan import Batch
 from mien.batch.row import RowFailedError, row_process
 from mien.batch.store import fetched
-from mien.stops import orderly_stops
+from mien.machine.stops import orderly_stops
 
 PROGRAM = (sys.executable, str(Path(__file__).resolve()))
 

@@ -25,26 +25,26 @@ from fuzzing.dataset_faults import faulty_dataset
 from fuzzing.faults import Place, faulty_file, faulty_place
 from fuzzing.material import tiny_flame
 from mien.capture import read_capture
-from mien.capture.calibration import read_calibration
+from mien.capture.cameras.calibration import read_calibration
 from mien.capture.settings import CaptureSettings
-from mien.capture.video import read_video_frames, write_video
 from mien.cli import main
 from mien.commands.stages import import_footage
-from mien.commands.stages.importing import run_import_stage
 from mien.datasets import matting, overlay, sequences
 from mien.datasets.dataset import Footage
 from mien.datasets.registry import datasets
 from mien.datasets.writing import write_sequence
+from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.face.coefficients import coefficient_head
-from mien.face.flame import flame_face_model, read_flame
 from mien.face.loading import add_face_model
 from mien.face.model import Landmarks
+from mien.face.models.coefficients import coefficient_head
+from mien.face.models.flame import flame_face_model, read_flame
 from mien.limits import camera_fault
+from mien.media.video import read_video_frames, write_video
+from mien.pipeline.import_dataset import run_import_stage
 from mien.training import read_sequence
-from mien.training.footage.own_split import read_own_split
-from mien.workspace import Workspace
+from mien.training.splits.own import read_own_split
 from toy_workspace import write_toy_workspace
 
 SIDE = 32

@@ -15,7 +15,7 @@ import torch
 from flame_like import exact_landmarks, flame_like, posed_as_flame, write_npz
 from mien.camera import Camera
 from mien.face import FaceModel, load_face_model
-from mien.face.flame import flame_face_model, read_flame
+from mien.face.models.flame import flame_face_model, read_flame
 from mien.render.mesh import render_mesh
 from mien.rotation import matrix_from_axis_angle
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from dataset_scene import SIDE, Scene, draw, head_view, projected
-from mien.capture.video import write_video
+from mien.media.video import write_video
 from mien.rotation import matrix_from_axis_angle
 from recordings import live_link_face
 

@@ -16,7 +16,7 @@ from mien.capture.store import read_capture_hash
 from mien.evaluation.experiment import Experiment
 from mien.face import FaceParams
 from mien.gaussians import sh_from_rgb
-from mien.pictures import to_uint8
+from mien.media.pictures import to_uint8
 from mien.render import rasterize
 from mien.render.camera_paths import orbit
 from mien.tracking import write_tracking

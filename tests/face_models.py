@@ -11,7 +11,7 @@ from flame_like import exact_landmarks, flame_like, write_npz
 from gnm_like import gnm_landmarks, gnm_like
 from mien.face import FaceModel, load_face_model
 from mien.face.model import Landmarks
-from mien.face.model_files import read_model_file
+from mien.face.models.model_files import read_model_file
 from mien.tracking.landmarks.regions import with_regions_by_landmarks
 
 NAMES = ("anny", "flame", "gnm", "ict")

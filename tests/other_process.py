@@ -10,7 +10,7 @@ from pathlib import Path
 _SCRIPT = """
 import json, sys
 from pathlib import Path
-from mien.locks import hold
+from mien.disk.locks import hold
 for line in sys.stdin:
     with hold(*map(Path, json.loads(line))):
         print("held", flush=True)

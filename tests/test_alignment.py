@@ -17,7 +17,7 @@ from mien.avatar.schedules import Rate
 from mien.avatar.store import Moments
 from mien.cli import main
 from mien.commands.create import Command as Create
-from mien.commands.options import TrainOptions
+from mien.commands.parsing.options import TrainOptions
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import l1
 from mien.face import FaceParams
@@ -179,7 +179,7 @@ def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.setattr(f"mien.commands.stages.{stage}.load_face_model", lambda name: toy_face_model())
     write_toy_workspace(tmp_path / "W")
     # What shows a tracking needs landmarks, which toys have not.
-    monkeypatch.setattr("mien.commands.stages.tracking.show_tracking", lambda *given: None)
+    monkeypatch.setattr("mien.pipeline.track.show_tracking", lambda *given: None)
     return tmp_path / "W"
 
 

@@ -22,7 +22,7 @@ from mien.cli import main
 from mien.face import FaceModel
 from mien.lab.analysis.gaussian_avatars import growth, speed
 from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
-from mien.plots import Axes, Series
+from mien.pages.plots import Axes, Series
 from mien.storage import write_tensors
 from mien.training.run import read_curves
 from shared_things import MadeOnce, toy_workspace

@@ -15,7 +15,6 @@ import train_toy
 from capture_helpers import tree_bytes
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.settings import GradientSettings, PerceptualLoss, Photometric
-from mien.capture.video import count_frames
 from mien.cli import main
 from mien.gaussians import Gaussians
 from mien.lab.analysis.context import Context
@@ -24,6 +23,7 @@ from mien.lab.analysis.headgas.basis import start_of_bases
 from mien.lab.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
 from mien.lab.analysis.spec import AnalysisOptions
 from mien.lab.analysis.views import head_camera, labeled, mouth_camera
+from mien.media.video import count_frames
 from mien.runtime.filmed import head_angles
 from shared_things import MadeOnce
 from toy_scene import toy_camera, toy_face, toy_face_model

@@ -26,20 +26,20 @@ from capture_helpers import write_gradient_video
 from mien.avatar import load_avatar
 from mien.avatar.files import write_avatar
 from mien.capture import write_capture
-from mien.capture.video import write_video
 from mien.cli import main
+from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation.metrics_file import read_metrics
 from mien.export.glb import write_glb
-from mien.export.output import plan_output
-from mien.export.pictures import write_pictures
+from mien.media.output import plan_output
+from mien.media.video import write_video
+from mien.media.writing import write_pictures
 from mien.storage import read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
 from mien.tracking import write_tracking
 from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.training.checkpoint import checkpoint_files
 from mien.training.run import read_run_config, read_training_summary
-from mien.workspace import Workspace, open_workspace
 from needs import NO_MOUNT
 from shared_things import MadeOnce, toy_workspace
 from toy_scene import toy_sequence
@@ -168,7 +168,7 @@ def test_a_full_disk_or_memory_anywhere_is_no_bug(
     def fail(_: object) -> None:
         raise error
 
-    monkeypatch.setattr("mien.workspace.Workspace.sequence_names", fail)
+    monkeypatch.setattr("mien.disk.workspace.Workspace.sequence_names", fail)
     assert main(["track", str(tmp_path)]) == 2
     assert words in capsys.readouterr().err
 

@@ -23,10 +23,10 @@ from mien.batch.results import write_results
 from mien.batch.row import attempt, run_row
 from mien.batch.steps import write_strip
 from mien.cli import main
-from mien.commands.stages.batch_table import read_table
+from mien.commands.batch_table import read_table
+from mien.disk.files import write_atomically
+from mien.disk.locks import hold
 from mien.errors import UserError
-from mien.files import write_atomically
-from mien.locks import hold
 from other_process import Holder
 
 

@@ -16,11 +16,11 @@ from mien.batch.plan import Batch, State
 from mien.batch.results import latex_table, markdown_table, means_by, write_results
 from mien.batch.steps import write_strip
 from mien.batch.wall import write_wall
-from mien.capture.video import write_video
 from mien.cli import main
 from mien.commands import batch as batch_command
-from mien.commands.stages.batch_table import for_all_rows, read_table
+from mien.commands.batch_table import for_all_rows, read_table
 from mien.errors import UserError
+from mien.media.video import write_video
 from test_startup import HEAVY, modules_after
 from web_case import violations
 

@@ -12,13 +12,13 @@ import pytest
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.commands.bench import Compare
-from mien.commands.stages import comparing
-from mien.commands.stages.comparing import Budget, CompareSettings
+from mien.disk.workspace import Workspace
 from mien.face.loading import add_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
+from mien.pipeline import comparing
+from mien.pipeline.comparing import Budget, CompareSettings
 from mien.training import PRESETS, trainer
 from mien.training.run import read_run_config, read_training_summary
-from mien.workspace import Workspace
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 

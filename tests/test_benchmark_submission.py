@@ -14,11 +14,11 @@ from dataset_scene import NoDetector, Scene, drawn_person
 from dataset_writers import BENCHMARK_SCALE, write_benchmark
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.avatar.settings import FaceTuning
-from mien.capture.video import probe_video
 from mien.cli import main
 from mien.datasets import overlay
 from mien.face import load_face_model
 from mien.face.loading import add_face_model
+from mien.media.video import probe_video
 from mien.training import read_sequence, train
 from plain_settings import plain_config, plain_run
 from shared_things import MadeOnce, toy_workspace

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from mien.camera import Camera, look_at
-from mien.capture.calibration import CalibratedCamera
-from mien.capture.calibration_check import advise_on, warn_of_misfit
-from mien.capture.head_path import consensus, find_head_path
-from mien.capture.reading_fit import Ranked, advice_of, is_wrong, rank_readings, ties_of
-from mien.capture.readings import Reading, readings_of
+from mien.capture.cameras.calibration import CalibratedCamera
+from mien.capture.cameras.calibration_check import advise_on, warn_of_misfit
+from mien.capture.cameras.head_path import consensus, find_head_path
+from mien.capture.cameras.reading_fit import Ranked, advice_of, is_wrong, rank_readings, ties_of
+from mien.capture.cameras.readings import Reading, readings_of
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.rotation import invert_rigid

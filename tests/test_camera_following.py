@@ -10,9 +10,7 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.capture.camera_names import camera_named
-from mien.capture.faces import LandmarkDetector
-from mien.capture.video import probe_video, read_video_frames, write_video
+from mien.capture.person.faces import LandmarkDetector
 from mien.cli import main
 from mien.commands.stages import viewing_motions
 from mien.driving.constants import DRIVING
@@ -23,6 +21,8 @@ from mien.face import load_face_model
 from mien.lab.synthetic import RECIPES
 from mien.lab.synthetic.recipe import Segment
 from mien.lab.synthetic.scene import SyntheticScene
+from mien.media.camera_names import camera_named
+from mien.media.video import probe_video, read_video_frames, write_video
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime import write_portable
 from mien.viewer.drawing import View

@@ -15,10 +15,10 @@ import torch
 from capture_helpers import interrupt_at, scan_texture, tree_bytes, write_rig
 from mien.camera import Camera, look_at
 from mien.capture import from_cameras
-from mien.capture.calibration import read_calibration
+from mien.capture.cameras.calibration import read_calibration
+from mien.capture.cameras.head_path import choose_crops, find_head_path
 from mien.capture.capture import Capture
 from mien.capture.from_cameras import capture_cameras
-from mien.capture.head_path import choose_crops, find_head_path
 from mien.capture.settings import CaptureSettings
 from mien.cli import main
 from mien.errors import UserError

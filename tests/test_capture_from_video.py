@@ -19,8 +19,8 @@ from capture_helpers import (
 from mien.capture import capture_video, process, read_capture
 from mien.capture.from_video import capture_video_parts
 from mien.capture.settings import CaptureSettings
-from mien.capture.video import write_video
 from mien.errors import UserError
+from mien.media.video import write_video
 
 
 @pytest.fixture(scope="module")

@@ -14,15 +14,15 @@ import color_charts
 from capture_helpers import write_rig
 from dataset_writers import FRONTAL, write_nersemble
 from mien.camera import Camera
-from mien.capture.calibration import read_calibration
-from mien.capture.color_correction import ColorCorrection
-from mien.capture.crop import whole_picture
-from mien.capture.given import read_given
+from mien.capture.cameras.calibration import read_calibration
+from mien.capture.person.crop import whole_picture
+from mien.capture.person.given import read_given
 from mien.capture.settings import CaptureSettings
-from mien.capture.source import FrameSelection, open_source
 from mien.cli import main
 from mien.commands.stages import import_footage
 from mien.errors import UserError
+from mien.media.color_correction import ColorCorrection
+from mien.media.source import FrameSelection, open_source
 from mien.render.camera_paths import read_cameras
 
 WIDTH, HEIGHT = 320, 240

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mien.capture import capture_video
+from mien.capture.person.screen import screen_matte, screen_of, without_screen
 from mien.capture.quality import is_light_changing, measure_face, quality_report, relative_quality
-from mien.capture.screen import screen_matte, screen_of, without_screen
 from mien.capture.settings import CaptureSettings
 from mien.storage import read_json
 

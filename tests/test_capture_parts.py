@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from capture_helpers import face_picture, light_of
-from mien.capture.crop import choose_crop, whole_picture
-from mien.capture.faces import LandmarkDetector, second_difference_jitter
 from mien.capture.from_video import capture_video_parts
-from mien.capture.given import read_landmarks
-from mien.capture.matte import refine_matte
-from mien.capture.plate import plate_matte
+from mien.capture.person.crop import choose_crop, whole_picture
+from mien.capture.person.faces import LandmarkDetector, second_difference_jitter
+from mien.capture.person.given import read_landmarks
+from mien.capture.person.matte import refine_matte
+from mien.capture.person.plate import plate_matte
 from mien.capture.quality import measure_face, quality_report, relative_quality
 from mien.capture.settings import CaptureSettings
-from mien.capture.tone import srgb_signal
-from mien.capture.video import read_lazily, write_video
 from mien.errors import UserError
+from mien.media.tone import srgb_signal
+from mien.media.video import read_lazily, write_video
 from mien.storage import write_arrays
 
 

@@ -13,21 +13,21 @@ import pytest
 
 from capture_helpers import face_picture, interrupt_at, tree_bytes
 from mien.capture import capture_video, process, read_capture
-from mien.capture.crop import Crop
-from mien.capture.faces import MAX_FACES, LandmarkDetector
 from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
-from mien.capture.people import choose_person
+from mien.capture.person.crop import Crop
+from mien.capture.person.faces import MAX_FACES, LandmarkDetector
+from mien.capture.person.people import choose_person
+from mien.capture.person.survey import Survey
 from mien.capture.process import LandmarkFollower
 from mien.capture.settings import CaptureSettings
-from mien.capture.survey import Survey
-from mien.capture.video import write_video
 from mien.cli import main
-from mien.commands.stages.capturing import run_capture_stage
+from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
-from mien.workspace import Workspace
+from mien.media.video import write_video
+from mien.pipeline.capture import run_capture_stage
 
 FPS, FRAMES = 10.0, 11
 WIDTH, HEIGHT = 400, 240

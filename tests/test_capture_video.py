@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from capture_helpers import BT2020, encode, hdr_signal, light_of, to_planes, write_gradient_video, write_planes
-from mien.capture.camera_names import CameraName
-from mien.capture.colors import Colors
-from mien.capture.live_camera import LiveCamera
-from mien.capture.tone import HLG, PQ, roll_off, srgb_signal
-from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
 from mien.errors import UserError
+from mien.media.camera_names import CameraName
+from mien.media.colors import Colors
+from mien.media.live_camera import LiveCamera
+from mien.media.tone import HLG, PQ, roll_off, srgb_signal
+from mien.media.video import count_frames, probe_video, read_video_frames, write_video
 
 COLORS = np.array([[200, 120, 100], [90, 60, 50], [40, 90, 60], [20, 30, 120], [128, 128, 128], [0, 0, 0]])
 """Colours of sRGB below the knee, like those of faces."""

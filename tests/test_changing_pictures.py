@@ -13,9 +13,9 @@ from mien.capture import capture_video
 from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
 from mien.capture.settings import CaptureSettings
-from mien.capture.source import FrameSelection, open_source
-from mien.capture.video import read_lazily, write_video
 from mien.errors import UserError
+from mien.media.source import FrameSelection, open_source
+from mien.media.video import read_lazily, write_video
 
 SMALL = CaptureSettings(size=200, crop="none", shortest_part=0.2)
 

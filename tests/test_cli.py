@@ -16,8 +16,8 @@ import pytest
 
 from forked import ForkServer
 from mien.cli import COMMANDS, main
-from mien.commands.help_text import readable
-from mien.files import write_atomically
+from mien.commands.parsing.help_text import readable
+from mien.disk.files import write_atomically
 
 Told = pytest.CaptureFixture[str]
 
@@ -134,7 +134,7 @@ def test_a_capture_that_is_damaged_or_gone_is_named(tmp_path: Path, capsys: Told
 def test_a_bug_keeps_its_traceback_in_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr(sys, "argv", ["mien", "\x1b[2J\udcff"])
-    monkeypatch.setattr("mien.workspace.Workspace.sequence_names", lambda self: 1 / 0)
+    monkeypatch.setattr("mien.disk.workspace.Workspace.sequence_names", lambda self: 1 / 0)
     assert main(["track", str(tmp_path)]) == 1
     shown = capsys.readouterr().err
     assert "bug in mien" in shown

@@ -11,9 +11,8 @@ from PIL import Image
 import dataset_checks as checks
 import dataset_writers as writers
 from dataset_scene import Scene, draw, drawn_person, head_view, projected, unfound
-from mien.capture.calibration import read_calibration
+from mien.capture.cameras.calibration import read_calibration
 from mien.capture.settings import CaptureSettings
-from mien.capture.video import write_video
 from mien.commands.stages import import_footage
 from mien.datasets import sequences
 from mien.datasets.dataset import Clip, FilmedSequence, Footage, TrackedSequence
@@ -21,9 +20,10 @@ from mien.datasets.nerface import viewmats_from_nerface
 from mien.datasets.registry import datasets, find_dataset
 from mien.errors import UserError
 from mien.face import load_face_model
+from mien.media.video import write_video
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
-from mien.training.footage.own_split import OwnSplit
+from mien.training.splits.own import OwnSplit
 
 
 @pytest.fixture

@@ -18,10 +18,11 @@ from mien.datasets.pictures import read_picture
 from mien.datasets.registry import find_dataset
 from mien.datasets.writing import write_sequence
 from mien.errors import UserError
-from mien.face import FaceModel, teeth
-from mien.face.flame import flame_face_model, read_flame
+from mien.face import FaceModel
+from mien.face.models import teeth
+from mien.face.models.flame import flame_face_model, read_flame
 from mien.training.footage.clothes import clothes_mask
-from mien.training.footage.own_split import OwnSplit
+from mien.training.splits.own import OwnSplit
 
 CHECKED = ("insta", "imavatar", "vhap, one camera")
 """One layout of each importer, whose calls are checked."""

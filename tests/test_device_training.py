@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import mien.devices
+import mien.machine.devices
 import train_toy
 from mien import _native
 from mien.adam import FactoredMoments
@@ -23,10 +23,10 @@ from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render
-from mien.devices import choose_device, like_on
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.gaussians import Gaussians
+from mien.machine.devices import choose_device, like_on
 from mien.render.rendering import Rendering
 from mien.training import TrainSettings, batch, train, trainer
 from mien.training.checkpoint import TrainingState
@@ -95,7 +95,7 @@ def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, capsys) -> None:
     needs = "needs a CUDA GPU and gsplat.*uv pip install"
     for gsplat, words in ((None, needs), (object(), "torch .*nvidia-smi")):
-        monkeypatch.setattr(mien.devices, "find_spec", lambda name, gsplat=gsplat: gsplat)
+        monkeypatch.setattr(mien.machine.devices, "find_spec", lambda name, gsplat=gsplat: gsplat)
         with pytest.raises(UserError, match=f"--device cuda: {words}"):
             choose_device("cuda")
     assert choose_device("auto").type == choose_device("cpu").type == "cpu"

@@ -11,23 +11,23 @@ import torch
 from mien.avatar import neutral_of
 from mien.camera import camera_from_fov
 from mien.capture.capture import Capture
-from mien.capture.pace import frame_rate, pace_report
-from mien.capture.video import probe_video, write_video
-from mien.commands.stages import driving
-from mien.commands.stages.driving import open_driver, run_driving_stage
+from mien.disk.workspace import Workspace
 from mien.driving import drive
-from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.drivers import Driver, read_tracked_driver
-from mien.driving.live_link_face import read_live_link_face
 from mien.driving.motion import ARKIT_NAMES, Motion, gaze_of
-from mien.driving.sides import PAIRS
+from mien.driving.sources.blendshape_json import read_blendshape_json
+from mien.driving.sources.live_link_face import read_live_link_face
+from mien.driving.sources.sides import PAIRS
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import FaceParams, load_face_model
+from mien.media.pace import frame_rate, pace_report
+from mien.media.video import probe_video, write_video
+from mien.pipeline import drive as driving
+from mien.pipeline.drive import open_driver, run_driving_stage
 from mien.render.camera_paths import orbit, turned_camera, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.tracking import Tracking
-from mien.workspace import Workspace
 from recordings import LAYOUTS, row, write_csv
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model, toy_sequence
@@ -172,7 +172,7 @@ def test_the_rate_of_a_csv_can_be_given(tmp_path: Path) -> None:
 
 PERFORMERS = [name for pair in PAIRS for name in pair]
 OBSERVERS = {"Live Link Face (.csv)": ("jawLeft", "jawRight", "mouthLeft", "mouthRight")}
-"""Coefficients whose left is the right of the face, by source: `mien.driving.sides` once more, on purpose."""
+"""Coefficients whose left is the right of the face, by source: `mien.driving.sources.sides` once more, on purpose."""
 SLIDES = ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
 
 

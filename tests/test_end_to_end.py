@@ -19,9 +19,9 @@ from forked import ForkServer
 from fuzzing.kills import TRACK
 from mien import runtime, tracking
 from mien.avatar.methods import DEFAULT_METHOD
-from mien.capture.video import probe_video
 from mien.cli import COMMANDS, main
 from mien.face.loading import add_face_model
+from mien.media.video import probe_video
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace

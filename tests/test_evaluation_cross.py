@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment, two_cameras, write_run, write_sequence
-from mien.capture.video import probe_video
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import cross
 from mien.evaluation.cross import cross_reenactment, load_driven
 from mien.evaluation.redetection import angle_degrees, measure_motion, transfer_figures
 from mien.face.params import most_frontal_camera
+from mien.media.video import probe_video
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import write_tracking
 from plain_settings import plain_run

@@ -16,7 +16,7 @@ from mien.evaluation.fitting import FittedFaces, fit_face
 from mien.evaluation.metrics import l1
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.text import protocol_lines
+from mien.evaluation.report.text import protocol_lines
 from mien.tracking.scoring import Scoring
 from plain_settings import plain_config
 from shared_things import MadeOnce, toy_workspace

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from evaluation_case import make_experiment, write_run, write_sequence
-from mien.capture.video import write_video
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import evaluate
@@ -17,6 +16,7 @@ from mien.evaluation.image_folders import ImageFolders, read_crops, score_folder
 from mien.evaluation.metrics import psnr
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
+from mien.media.video import write_video
 from mien.storage import read_json
 from plain_settings import plain_run
 

@@ -17,7 +17,6 @@ import torch
 
 from evaluation_case import SIZE, make_experiment, two_cameras, write_run, write_sequence
 from mien.capture.store import read_capture_hash
-from mien.capture.video import probe_video, read_video_frames
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation import evaluate, protocols
@@ -29,10 +28,11 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import read_metrics
 from mien.evaluation.protocols import EvaluationSettings, evaluate_frames
+from mien.evaluation.report.text import comparison_text, protocol_lines
 from mien.evaluation.scoring import METRICS
-from mien.evaluation.text import comparison_text, protocol_lines
 from mien.evaluation.videos import choose_video_frames, match_sizes
-from mien.pictures import to_uint8
+from mien.media.pictures import to_uint8
+from mien.media.video import probe_video, read_video_frames
 from mien.storage import read_tensors, write_json, write_tensors
 from mien.tracking.scoring_files import write_scoring
 from mien.training import read_sequence

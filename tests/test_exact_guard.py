@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from exact_guard import InexactError, exact_guard
-from mien import exact
 from mien.avatar.methods import DEFAULT_METHOD
+from mien.machine import exact
 from mien.training import trainer
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets

@@ -25,27 +25,27 @@ from fuzzing.material import new_avatar, tiny_flame
 from fuzzing.repairs import joined, split
 from mien import runtime
 from mien.avatar.baking import make_portable
-from mien.bounded import parse_json
-from mien.capture import given
-from mien.capture.crop import whole_picture
-from mien.capture.faces import LANDMARKS
-from mien.capture.given import GivenMattes, read_landmarks
+from mien.capture.person import given
+from mien.capture.person.crop import whole_picture
+from mien.capture.person.faces import LANDMARKS
+from mien.capture.person.given import GivenMattes, read_landmarks
 from mien.cli import main
+from mien.disk.reading import parse_json
 from mien.driving import drive, motion
-from mien.driving.blendshape_json import read_blendshape_json
-from mien.driving.live_link_face import read_live_link_face
+from mien.driving.sources.blendshape_json import read_blendshape_json
+from mien.driving.sources.live_link_face import read_live_link_face
 from mien.errors import UserError
 from mien.export import ply, read_ply, write_ply
 from mien.export.glb_avatar import EXTENSION, read_glb_avatar
-from mien.export.glb_file import GlbWriter, read_glb
 from mien.export.ply import property_names
 from mien.export.sog import read_sog, write_sog
 from mien.export.usd import read_usd, write_usd
 from mien.face.checks import check_face_params
-from mien.face.flame import read_flame
+from mien.face.models.flame import read_flame
+from mien.formats.shared.glb_file import GlbWriter, read_glb
 from mien.gaussians import Gaussians
 from mien.limits import rigid_fault
-from mien.picture_files import decode_png, png_fits
+from mien.media.picture_files import decode_png, png_fits
 from mien.runtime.checks import check
 from mien.training import train
 from recordings import row, write_csv, write_json
@@ -228,7 +228,7 @@ def test_huge_numbers_lines_and_gaps_of_recordings(tmp_path: Path, monkeypatch: 
     for read in (read_live_link_face, read_blendshape_json):
         refused(read, sparse(csv, motion.MAX_FILE_BYTES + 1), "has more than 134,217,728 bytes")
     monkeypatch.setattr(motion, "MAX_MOMENTS", 5_000)
-    monkeypatch.setattr("mien.tables.MAX_CELLS_BYTES", 1 << 20)
+    monkeypatch.setattr("mien.disk.tables.MAX_CELLS_BYTES", 1 << 20)
     csv.write_text("Timecode,EyeBlinkLeft\n" + "12,12,12,12,12,12,12,12,12\n" * 5000)
     refused(read_live_link_face, csv, "it has too many values; cut it into shorter tables")
     for rows, words in CSV:

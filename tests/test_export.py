@@ -15,18 +15,18 @@ import torch
 
 from mien import runtime
 from mien.camera import camera_from_fov
-from mien.capture.video import probe_video
 from mien.cli import main
-from mien.commands.picture import PictureOptions
-from mien.commands.stages.pictures import draw
 from mien.errors import UserError
 from mien.export import in_world, read_ply, write_ply
-from mien.export.output import plan_output
-from mien.export.pictures import write_pictures
-from mien.export.pixels import to_rgb, to_rgba
 from mien.export.ply import property_names
 from mien.export.spz import read_spz
 from mien.gaussians import Gaussians, sh_from_rgb
+from mien.media.output import plan_output
+from mien.media.pixels import to_rgb, to_rgba
+from mien.media.video import probe_video
+from mien.media.writing import write_pictures
+from mien.pipeline.draw import draw
+from mien.pipeline.picture_options import PictureOptions
 from mien.render import rasterize
 from mien.render.camera_paths import read_cameras, sway, write_cameras
 from mien.rotation import matrix_from_axis_angle, rigid_transform

@@ -22,24 +22,24 @@ from mien.camera import Camera
 from mien.capture import write_capture
 from mien.capture.store import read_capture_hash
 from mien.cli import main
-from mien.commands.stages import training
-from mien.commands.stages.exporting_capture import settings_of
 from mien.datasets import matting, overlay, sequences
 from mien.datasets.layouts.filmed import Filmed, filmed_frames
 from mien.datasets.layouts.registry import find_layout
 from mien.datasets.layouts.writing import write_layout
 from mien.datasets.pictures import read_picture
 from mien.datasets.sequences import tracked_sequence
+from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.evaluation.image_folders import ImageFolders, score_folders
-from mien.export.flame_params import face_of_flame_params
 from mien.face import FaceModel
+from mien.formats.shared.flame_params import face_of_flame_params
+from mien.pipeline import train as training
+from mien.pipeline.export_dataset import settings_of
 from mien.tracking import write_tracking
 from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.training import TrainSettings
 from mien.training.footage.sequence import Sequence
-from mien.workspace import Workspace
 from toy_workspace import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked

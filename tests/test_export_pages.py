@@ -16,11 +16,11 @@ from mien.avatar.baking import make_portable
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.errors import UserError
-from mien.export.packed import unpacked
-from mien.export.rows import with_rows
-from mien.export.thinning import contributions
 from mien.export.web_page import write_packed, write_page
-from mien.export.webcam import OWN, POLICY, VERSION, find_webcam_files, own_model
+from mien.formats.shared.packed import unpacked
+from mien.formats.shared.rows import with_rows
+from mien.formats.shared.thinning import contributions
+from mien.formats.shared.webcam import OWN, POLICY, VERSION, find_webcam_files, own_model
 from test_runtime import SIZE, new_avatar
 from toy_scene import toy_camera
 from web_case import WEB, drawn_head, faces_of, tasks_vision
@@ -164,7 +164,7 @@ def test_a_model_without_its_second_part_is_explained(
     model = tmp_path / "any.task"
     model.write_bytes(own_model())
     shutil.copy(OWN / "face_landmarker.task.xz.1", tmp_path)
-    monkeypatch.setattr("mien.export.webcam.OWN", tmp_path)
+    monkeypatch.setattr("mien.formats.shared.webcam.OWN", tmp_path)
     told = refused(page, capsys)
     assert "mien's source distribution leaves out" in told
     assert "--webcam-model" in told

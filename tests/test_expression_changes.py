@@ -27,7 +27,7 @@ from mien.avatar.ops.expression_changes import (
 from mien.avatar.ops.feature_network import Layers, feature_network_reference
 from mien.avatar.schedules import Progress, Rate
 from mien.errors import UserError
-from mien.export.packed import pack
+from mien.formats.shared.packed import pack
 from mien.gaussians import Gaussians
 from mien.runtime.checks import baked_fault
 from mono_avatars import pictured

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from mien.camera import camera_from_fov
-from mien.face import FaceModel, FaceParams, anny_identity, load_face_model
-from mien.face.anny_identity import principal_components
+from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.constants import FACE
+from mien.face.models import anny_identity
+from mien.face.models.anny_identity import principal_components
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.tracking.neck_line import bottom_vertices

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from mien.cli import main
-from mien.commands.stages import driving
 from mien.errors import UserError
 from mien.face import cache, listing, load_face_model, loading
 from mien.face.listing import available_face_models
+from mien.pipeline import drive as driving
 from small_face_model import make_small_face_model
 
 

@@ -20,7 +20,7 @@ from mien.datasets.overlay import check_overlay
 from mien.datasets.steadiness import Steadiness, measure_steadiness
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
-from mien.face.flame import flame_face_model, read_flame
+from mien.face.models.flame import flame_face_model, read_flame
 from mien.tracking.landmarks.regions import with_regions_by_landmarks
 
 pytestmark = pytest.mark.unchecked

@@ -19,20 +19,13 @@ from mien.avatar.filmed import measure_filmed
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.camera import Camera, camera_from_fov
 from mien.cli import main
-from mien.commands.stages import driving
-from mien.commands.stages.sheets import (
-    TURNTABLE_TILES,
-    Tile,
-    expression_tiles,
-    filmed_tiles,
-    nearer_tiles,
-    turntable_tiles,
-)
-from mien.commands.stages.viewing import viewed_file
 from mien.driving.keeping import keep_to_filmed
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
+from mien.pipeline import drive as driving
+from mien.pipeline.sheets import TURNTABLE_TILES, Tile, expression_tiles, filmed_tiles, nearer_tiles, turntable_tiles
+from mien.pipeline.view import viewed_file
 from mien.render.camera_paths import orbit
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.runtime.baked import Filmed

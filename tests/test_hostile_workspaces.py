@@ -20,6 +20,7 @@ from damage import edit_json
 from mien.capture import read_capture
 from mien.capture.frame_files import CacheWriter, FrameLayout, FrameWriter
 from mien.cli import main
+from mien.disk.workspace import Workspace, check_new_workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation.experiment import Frame
@@ -33,7 +34,6 @@ from mien.tracking.scoring_files import read_scoring
 from mien.tracking.settings import TrackingSettings
 from mien.training import read_sequence, trainer
 from mien.training.run import read_run_config
-from mien.workspace import Workspace, check_new_workspace, open_workspace
 from shared_things import MadeOnce, evaluated_workspace
 from toy_scene import toy_face_model, toy_sequence
 
@@ -238,7 +238,7 @@ def test_a_picture_larger_than_it_should_be_is_not_decoded(workspace: Path, monk
     """Its header claims 30,000 x 30,000 pixels."""
     folder = workspace / "sequences/clip"
     decoded: list[object] = []
-    monkeypatch.setattr("mien.picture_files.cv2.imdecode", lambda *arguments: decoded.append(arguments))
+    monkeypatch.setattr("mien.media.picture_files.cv2.imdecode", lambda *arguments: decoded.append(arguments))
     shutil.rmtree(folder / "capture/cache")
     for file, read in (
         (folder / "capture/frames/front/000000.png", lambda: read_capture(folder / "capture")),

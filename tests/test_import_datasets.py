@@ -14,17 +14,17 @@ import pytest
 from dataset_scene import NoDetector, Scene, drawn_person, unfound
 from dataset_writers import write_imavatar, write_insta
 from mien.avatar import load_avatar
-from mien.capture.source import read_image
 from mien.cli import main
-from mien.commands.stages import importing
 from mien.datasets import overlay, sequences
+from mien.disk.files import write_json
 from mien.face.loading import add_face_model
-from mien.files import write_json
+from mien.media.source import read_image
+from mien.pipeline import import_dataset as importing
 from mien.runtime import load as load_portable
 from mien.training import TrainSettings, read_sequence
 from mien.training.footage.frames import training_frames
-from mien.training.footage.own_split import OwnSplit, read_own_split, with_own_split, write_own_split
 from mien.training.run import read_face_track
+from mien.training.splits.own import OwnSplit, read_own_split, with_own_split, write_own_split
 from shared_things import MadeOnce, toy_workspace
 from toy_workspace import write_toy_workspace
 

@@ -11,8 +11,8 @@ from av.filter import Graph
 
 from capture_helpers import encode
 from mien.capture.deinterlacing import Deinterlace
-from mien.capture.fields import FieldOrder, combs, deinterlace
-from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames
+from mien.media.fields import FieldOrder, combs, deinterlace
+from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames
 
 HEIGHT, WIDTH, FRAMES = 96, 128, 6
 FIRST = {"tff": 0, "bff": 1}

@@ -7,16 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from mien.capture import backend
-from mien.capture.faces import FaceFinder, LandmarkDetector, MeshReader
 from mien.capture.from_video import open_job
-from mien.capture.litert.mesh import Mesh
-from mien.capture.matte import Segmenter
+from mien.capture.person import backend
+from mien.capture.person.faces import FaceFinder, LandmarkDetector, MeshReader
+from mien.capture.person.litert.mesh import Mesh
+from mien.capture.person.matte import Segmenter
 from mien.capture.settings import CaptureSettings
-from mien.capture.video import read_video_frames
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
-from mien.picture_files import write_png
+from mien.media.picture_files import write_png
+from mien.media.video import read_video_frames
 
 pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mien.capture.camera_names import CameraName, camera_named, is_camera
-from mien.capture.live_camera import LiveCamera
-from mien.capture.video import write_video
 from mien.errors import UserError
+from mien.media.camera_names import CameraName, camera_named, is_camera
+from mien.media.live_camera import LiveCamera
+from mien.media.video import write_video
 from web_case import until
 
 FPS = 25
@@ -54,7 +54,7 @@ def test_names_of_cameras_and_devices_that_are_none(tmp_path: Path, monkeypatch:
             camera_named(f"camera:{name}", None)
     with pytest.raises(UserError, match="there is no /dev/video99.*camera:clip.mp4|there is no /dev/video99.*these"):
         camera_named("camera:/dev/video99", "v4l2")
-    monkeypatch.setattr("mien.capture.camera_names.DEVICES", tmp_path)
+    monkeypatch.setattr("mien.media.camera_names.DEVICES", tmp_path)
     for name in ("video10", "video2", "null"):
         (tmp_path / name).touch()
     with pytest.raises(UserError, match=f"one of these: {tmp_path}/video2, {tmp_path}/video10$"):

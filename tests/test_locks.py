@@ -21,11 +21,11 @@ import numpy as np
 import pytest
 
 from capture_helpers import assert_same_capture, random_capture
-from mien import locks
 from mien.capture import read_capture, write_capture
+from mien.disk import locks
+from mien.disk.files import replace_folder
+from mien.disk.locks import BeingWrittenError, hold, holder_of, lock_file, read_beside_writers
 from mien.errors import CannotWriteError, UserError
-from mien.files import replace_folder
-from mien.locks import BeingWrittenError, hold, holder_of, lock_file, read_beside_writers
 from mien.tracking import read_tracking, write_tracking
 from other_process import Holder
 from toy_scene import toy_face_model, toy_tracking
@@ -68,7 +68,7 @@ def test_children_do_not_keep_the_lock_of_a_parent_that_has_died(tmp_path: Path)
     script = """
 import os, subprocess, sys, time
 from pathlib import Path
-from mien.locks import hold
+from mien.disk.locks import hold
 place = Path(sys.argv[1])
 with hold(place):
     ended = os.fork()

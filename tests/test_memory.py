@@ -9,9 +9,9 @@ import torch
 
 from bounded_memory import MIB, allocating_at_most
 from capture_helpers import random_capture
-from mien import picture_files
 from mien.capture import read_capture, write_capture
-from mien.picture_files import map_pictures
+from mien.media import picture_files
+from mien.media.picture_files import map_pictures
 from mien.tracking import track
 from mien.tracking.fitting import solver
 from mien.tracking.landmarks import stages, term

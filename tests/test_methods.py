@@ -26,9 +26,9 @@ from mien.avatar.store import GaussianStore, Moments
 from mien.errors import UserError
 from mien.export.glb import MeshModel, write_glb
 from mien.export.glb_avatar import read_glb_avatar
-from mien.export.packed import pack
 from mien.export.web_page import write_page
 from mien.face import FaceModel
+from mien.formats.shared.packed import pack
 from mien.render import rasterize
 from mien.training import TrainSettings
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.commands.expression import tell_of_unfilmed, with_expression
-from mien.commands.stages.sheets import expression_tiles
 from mien.errors import UserError
 from mien.export.glb import morph_targets
 from mien.face import FaceModel, load_face_model
+from mien.pipeline.expression import tell_of_unfilmed, with_expression
+from mien.pipeline.sheets import expression_tiles
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.named import EYES, GAZE_NAMES, MOST_UP, presets, presets_for
 from mien.runtime.posing import rig_points

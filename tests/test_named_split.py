@@ -13,15 +13,15 @@ from capture_helpers import random_capture
 from known import known
 from mien.capture import write_capture
 from mien.cli import main
-from mien.commands.stages import training as training_stage
-from mien.commands.stages.evaluating import driver_folders
 from mien.errors import UserError
+from mien.pipeline import train as training_stage
+from mien.pipeline.evaluate import driver_folders
 from mien.tracking import write_tracking
 from mien.training import PRESETS, TrainSettings
-from mien.training.footage.benchmark_split import with_benchmark_split
 from mien.training.footage.frames import training_frames
-from mien.training.footage.named_split import SEQUENCES, driving_sequences, split_by_name, with_named_split
 from mien.training.settings import doubly_held_out
+from mien.training.splits.benchmark import with_benchmark_split
+from mien.training.splits.named import SEQUENCES, driving_sequences, split_by_name, with_named_split
 from toy_scene import toy_face_model, toy_sequence, toy_tracking
 
 FOLDERS = (

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from mien.avatar import neutral_of
-from mien.commands.options import check_neutral
-from mien.commands.stages.driving import open_driver
+from mien.commands.parsing.options import check_neutral
 from mien.driving import drive
 from mien.driving.constants import DRIVING
 from mien.driving.drivers import Driver
@@ -17,6 +16,7 @@ from mien.driving.neutral import with_neutral
 from mien.driving.rest import facing, kept_share, rest_of
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
+from mien.pipeline.drive import open_driver
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from small_face_model import make_small_face_model
 from test_motion import row, write_csv

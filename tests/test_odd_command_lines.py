@@ -12,11 +12,11 @@ import pytest
 
 from damage import edit_json
 from mien.cli import main
-from mien.commands.stages.names import doubled_videos
+from mien.disk.workspace import Workspace
 from mien.errors import UserError
+from mien.pipeline.names import doubled_videos
 from mien.tracking import read_tracking
 from mien.tracking.settings import TrackingSettings
-from mien.workspace import Workspace
 from shared_things import MadeOnce, toy_workspace
 
 SKEWED = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": (2 * np.eye(4)).tolist(), "width": 32, "height": 32}
@@ -111,8 +111,8 @@ def test_a_current_tracking_and_landmarks_of_no_face_are_said(
     assert main(["track", "W", "--again"]) == 2
     assert "no face fits the landmarks" in capsys.readouterr().err
     current = {"clip": read_tracking(place / "W/sequences/clip/tracking")}
-    monkeypatch.setattr("mien.commands.stages.tracking._current_trackings", lambda *_, **__: current)
-    monkeypatch.setattr("mien.commands.stages.tracking.show_tracking", lambda *_: None)
+    monkeypatch.setattr("mien.pipeline.track._current_trackings", lambda *_, **__: current)
+    monkeypatch.setattr("mien.pipeline.track.show_tracking", lambda *_: None)
     assert main(["track", "W"]) == 0
     assert "clip: the tracking is current, nothing to do" in capsys.readouterr().err
 

@@ -22,15 +22,15 @@ from av.stream import Disposition
 
 from capture_helpers import BT709, BT2020, encode, face_picture, hdr_signal, light_of, to_planes, write_planes
 from mien.capture import capture_video, read_capture
-from mien.capture.camera_names import CameraName
 from mien.capture.capture import Capture
-from mien.capture.live_camera import LiveCamera
 from mien.capture.settings import CaptureSettings
-from mien.capture.sound import read_sound
-from mien.capture.tone import HLG, srgb_signal
-from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
 from mien.cli import main
 from mien.errors import UserError
+from mien.media.camera_names import CameraName
+from mien.media.live_camera import LiveCamera
+from mien.media.sound import read_sound
+from mien.media.tone import HLG, srgb_signal
+from mien.media.video import count_frames, probe_video, read_video_frames, write_video
 from test_capture_parts import streak
 from test_interlaced import flagged, write, write_single_fields
 

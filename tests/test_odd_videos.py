@@ -18,18 +18,18 @@ import pytest
 from av.stream import Disposition
 
 from capture_helpers import encode, write_gradient_video
-from mien.capture.crop import whole_picture
-from mien.capture.display import Display
-from mien.capture.given import GivenMattes
-from mien.capture.picture import MAX_PICTURE_PIXELS, announced_size, decode_picture
-from mien.capture.source import FrameSelection, open_source, read_image
-from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
-from mien.capture.video_file import MAX_FRAME_PIXELS
+from mien.capture.person.crop import whole_picture
+from mien.capture.person.given import GivenMattes
 from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation.image_source import read_picture
-from mien.export.output import plan_output
-from mien.export.pictures import write_pictures
+from mien.media.decoding import MAX_PICTURE_PIXELS, announced_size, decode_picture
+from mien.media.display import Display
+from mien.media.output import plan_output
+from mien.media.source import FrameSelection, open_source, read_image
+from mien.media.video import count_frames, probe_video, read_video_frames, write_video
+from mien.media.video_file import MAX_FRAME_PIXELS
+from mien.media.writing import write_pictures
 
 pytestmark = pytest.mark.unchecked
 NAMES = (

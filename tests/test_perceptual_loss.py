@@ -15,9 +15,9 @@ from mien import _native
 from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.errors import UserError
 from mien.face import FaceModel
+from mien.media.pictures import Box
 from mien.perceptual.features import load_training_features
 from mien.perceptual.weights import weights_path
-from mien.pictures import Box
 from mien.render.rendering import Rendering
 from mien.training import TrainSettings, train
 from mien.training.footage.frames import crop_random

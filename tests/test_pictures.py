@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import torch
 
-from mien.pictures import error_heat, heat_colors, picture_grid, picture_uri, shrink, side_by_side, to_uint8
+from mien.media.pictures import error_heat, heat_colors, picture_grid, picture_uri, shrink, side_by_side, to_uint8
 
 
 def _flat(height: int, width: int, value: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Odd places give the same bytes, and what Linux, macOS and Windows do differently is in mien.system alone."""
+"""Odd places give the same bytes, and what Linux, macOS and Windows do differently is in mien.machine.system alone."""
 
 import hashlib
 import os
@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from capture_helpers import write_face_clip
-from mien import bounded, system
 from mien.cli import main
+from mien.disk import reading as bounded
+from mien.machine import system
 from needs import find_test_data
 from toy_workspace import write_toy_workspace
 

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mien.capture.video import write_video
 from mien.cli import main
+from mien.media.video import write_video
 from recordings import live_link_face, plain, table
 from shared_things import MadeOnce, toy_workspace
 

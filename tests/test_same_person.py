@@ -9,11 +9,11 @@ import pytest
 
 from capture_helpers import tree_bytes
 from mien.capture import capture_video
-from mien.capture.matte_owner import held, without_others
-from mien.capture.same_person import group_people, shape_difference
-from mien.capture.video import read_video_frames, write_video
+from mien.capture.person.matte_owner import held, without_others
+from mien.capture.person.same_person import group_people, shape_difference
 from mien.cli import main
 from mien.errors import UserError
+from mien.media.video import read_video_frames, write_video
 from mien.training.run import check_videos, is_part_of
 from toy_workspace import write_toy_workspace
 

@@ -14,7 +14,7 @@ from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.methods import METHODS
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import RefillSettings
-from mien.commands.settings_options import leaves
+from mien.commands.parsing.settings_options import leaves
 from mien.errors import UserError
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges
 from mien.training import PRESETS, TrainSettings, train, trainer

@@ -15,7 +15,7 @@ from mien.avatar.mono_gaussian_avatar.settings import PRESETS as mono_gaussian_a
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
 from mien.cli import main
-from mien.commands.stages import training
+from mien.pipeline import train as training
 from mien.training import PRESETS, TrainSettings
 from shared_things import toy_workspace
 from test_training_resume import RESULTS

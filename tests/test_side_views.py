@@ -15,13 +15,14 @@ from mien.avatar.methods import method_named
 from mien.avatar.schedules import Progress
 from mien.camera import camera_from_fov
 from mien.cli import main
-from mien.commands.picture import PictureOptions
-from mien.commands.stages import pictures
-from mien.commands.stages.exporting import RunContent
-from mien.commands.stages.pictures import posed_softly
+from mien.disk.workspace import open_workspace
 from mien.export.web_page import write_packed
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.gaussians import world_means
+from mien.pipeline import draw as pictures
+from mien.pipeline.draw import posed_softly
+from mien.pipeline.export import RunContent
+from mien.pipeline.picture_options import PictureOptions
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.baked import MeshBound
@@ -33,7 +34,6 @@ from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
 from mien.training.whole_head.soft_cut import opacity_shares, with_soft_cut
 from mien.training.whole_head.unseen import fills_sides
-from mien.workspace import open_workspace
 from plain_settings import plain_gaussian_avatars
 from shared_things import MadeOnce, toy_workspace
 from test_methods import new_avatar

@@ -16,10 +16,10 @@ import torch
 from mien import extras, runtime
 from mien.avatar.baking import make_portable
 from mien.cli import COMMANDS, main
-from mien.export.packed import pack
-from mien.export.pixels import png_bytes
 from mien.export.web_page import write_page
+from mien.formats.shared.packed import pack
 from mien.licences.spdx import requirements_of
+from mien.media.pixels import png_bytes
 from mien.render import camera_paths as torchs
 from mien.runtime import camera_paths
 from test_runtime import new_avatar
@@ -160,7 +160,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_create_needs_no_package_of_another_extra():
     missing = {module for module, extra in extras.EXTRA_OF.items() if extra not in ("create", "video")}
-    assert "mien.commands.stages.training" in python_without(missing, STAGES).split()
+    assert "mien.pipeline.train" in python_without(missing, STAGES).split()
 
 
 def test_extras_bring_what_error_messages_say_and_the_base_install_asks_for_five_packages():

@@ -17,12 +17,12 @@ import cv2
 import pytest
 
 from forked import Forked, ForkServer
-from mien import stops
-from mien.capture.video import read_video_frames
 from mien.cli import main
-from mien.commands.stages import pictures
 from mien.evaluation.partial import PartialScores
-from mien.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Terminated, orderly_stops, stops_put_off
+from mien.machine import stops
+from mien.machine.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Terminated, orderly_stops, stops_put_off
+from mien.media.video import read_video_frames
+from mien.pipeline import draw as pictures
 from toy_workspace import write_toy_workspace
 
 KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated, signal.SIGHUP: HungUp}

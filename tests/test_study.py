@@ -14,7 +14,6 @@ import pytest
 
 import train_toy
 from mien.avatar.methods import METHODS
-from mien.capture.video import read_video_frames
 from mien.cli import main
 from mien.errors import UserError
 from mien.lab.analysis.study.clips import spans
@@ -22,6 +21,7 @@ from mien.lab.analysis.study.drawing import encode
 from mien.lab.analysis.study.files import QUESTIONS, read_all_answers, read_key
 from mien.lab.analysis.study.settings import StudySettings
 from mien.lab.analysis.study.shuffling import shuffled
+from mien.media.video import read_video_frames
 from mien.training import read_sequence, train
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace

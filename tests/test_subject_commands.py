@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from mien.avatar.methods import DEFAULT_METHOD
-from mien.capture.video import read_video_frames, write_video
 from mien.cli import main
 from mien.lab.synthetic.captures import write_synthetic_video
 from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.media.video import read_video_frames, write_video
 from mien.tracking import read_tracking
 
 pytestmark = pytest.mark.unchecked

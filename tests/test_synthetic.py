@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from exact_guard import exact_guard
-from mien import exact
 from mien.capture import read_capture
 from mien.errors import UserError
 from mien.lab.synthetic import RECIPES, synthesize
@@ -20,6 +19,7 @@ from mien.lab.synthetic.recipe import Segment
 from mien.lab.synthetic.references import REFERENCES, reference_named
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.lab.synthetic.truth import read_truth
+from mien.machine import exact
 from mien.render.mesh import vertex_normals
 from reference_signatures import drawn_signatures, signature_distance, stored_signatures
 

@@ -13,14 +13,15 @@ import pytest
 from rich.console import Console
 
 from forked import ForkServer
-from mien import progress, runtime
+from mien import runtime
 from mien.cli import main
 from mien.commands.stages.expected import count_scored, expected_pieces
 from mien.errors import UserError
+from mien.machine import progress
+from mien.machine.progress import progress_bar, say, whole_command
+from mien.machine.terminal import plain_name, printable, show
+from mien.machine.threads import MAX_THREADS, asked_threads, thread_count
 from mien.overall import Overall, Piece
-from mien.progress import progress_bar, say, whole_command
-from mien.terminal import plain_name, printable, show
-from mien.threads import MAX_THREADS, asked_threads, thread_count
 from mien.tracking.settings import TrackingSettings
 from mien.training import TrainSettings
 
@@ -120,7 +121,7 @@ def into_a_broken_pipe(words: list[str], number: int) -> int:
 def test_a_closed_output_is_not_taken_by_the_next_file(tmp_path: Path) -> None:
     """The next file that is opened does not take a closed output, or else a library's messages would land in it."""
     code = (
-        "import sys, os; from mien.terminal import open_closed_streams; open_closed_streams();"
+        "import sys, os; from mien.machine.terminal import open_closed_streams; open_closed_streams();"
         "file = open(sys.argv[1], 'wb'); os.write(1, b'chatter'); print('more'); sys.exit(file.fileno() < 3)"
     )
     path = tmp_path / "mine"

@@ -169,7 +169,7 @@ def test_an_interrupted_tracking_goes_on(case, shaping, apart, tracked, tmp_path
 
 @pytest.fixture
 def workspace(case, shaping, apart, tmp_path, monkeypatch) -> Path:
-    monkeypatch.setattr("mien.commands.stages.tracking.face_model_of", lambda choice: case.model)
+    monkeypatch.setattr("mien.pipeline.track.face_model_of", lambda choice: case.model)
     for capture in (apart.capture, shaping):
         write_capture(tmp_path / "out/sequences" / capture.name / "capture", capture)
     return tmp_path / "out"

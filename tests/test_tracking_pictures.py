@@ -13,9 +13,9 @@ import torch
 
 from mien.camera import Camera, look_at
 from mien.capture.capture import Capture
-from mien.capture.video import probe_video
 from mien.face import FaceModel
-from mien.parallel import stream_in_threads
+from mien.machine.parallel import stream_in_threads
+from mien.media.video import probe_video
 from mien.render.mesh import shade
 from mien.rotation import invert_rigid, matrix_from_axis_angle
 from mien.tracking import track
@@ -276,7 +276,7 @@ def test_cameras_that_misfit_together_are_warned_of(
     rig: Capture, model: FaceModel, tmp_path: Path, monkeypatch
 ) -> None:
     """No camera and no frame stands out if all have a wrong focal length."""
-    monkeypatch.setattr("mien.capture.reading_fit.INSIDE_OUT", -math.inf)  # The small model has no nose.
+    monkeypatch.setattr("mien.capture.cameras.reading_fit.INSIDE_OUT", -math.inf)  # The small model has no nose.
     longer = torch.tensor([[1.6, 1, 1], [1, 1.6, 1], [1, 1, 1]])
     told, page = told_of(rig, model, tmp_path, lambda camera: replace(camera, K=camera.K * longer))
     assert "Warning: all cameras together see landmarks" in told

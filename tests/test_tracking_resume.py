@@ -12,7 +12,7 @@ import torch
 
 from mien.capture import write_capture
 from mien.cli import main
-from mien.commands.stages import tracking as stage
+from mien.pipeline import track as stage
 from mien.tracking import track_subject
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.resume import StageCache

@@ -17,7 +17,7 @@ from mien.batch.plan import Batch
 from mien.batch.row import run_row
 from mien.batch.steps import do_with
 from mien.cli import main
-from mien.commands.stages.batch_table import read_table
+from mien.commands.batch_table import read_table
 from mien.datasets import matting, overlay, sequences
 from mien.evaluation import evaluate
 from mien.evaluation.protocols import EvaluationSettings

@@ -17,11 +17,11 @@ from known import known
 from mien.camera import Camera
 from mien.capture import read_capture
 from mien.capture.capture import Capture
-from mien.capture.video import write_video
 from mien.cli import main
 from mien.lab.synthetic import RECIPES
 from mien.lab.synthetic.recipe import Segment
 from mien.lab.synthetic.scene import SyntheticScene
+from mien.media.video import write_video
 from mien.training import read_sequence
 from mien.training.run import read_curves
 

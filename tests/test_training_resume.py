@@ -18,7 +18,7 @@ from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
 from mien.lab.benchmarking.train_step import training_case
-from mien.stops import Terminated
+from mien.machine.stops import Terminated
 from mien.storage import read_tensors, write_tensors
 from mien.training import train
 from mien.training.checkpoint import checkpoint_files

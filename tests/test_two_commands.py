@@ -11,7 +11,7 @@ import pytest
 from capture_helpers import tree_bytes
 from forked import Forked, ForkServer
 from mien.cli import main
-from mien.locks import lock_file
+from mien.disk.locks import lock_file
 from other_process import Holder
 from two_commands import RANK, Studio, beside, toy_studio
 

@@ -16,7 +16,6 @@ from mien.avatar import load_avatar
 from mien.capture import write_capture
 from mien.capture.capture import Capture
 from mien.cli import main
-from mien.commands.stages import face_models as stage
 from mien.errors import UserError
 from mien.face import FaceModel, load_face_model
 from mien.face.cache import cache_folder
@@ -25,6 +24,7 @@ from mien.face.listing import available_face_models
 from mien.face.model import Landmarks
 from mien.lab.synthetic import synthesize
 from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.pipeline import face_models as stage
 from mien.runtime import load as load_portable
 from mien.storage import file_digest, write_json
 from mien.tracking import read_tracking, track

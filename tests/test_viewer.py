@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mien import runtime
-from mien.capture.video import count_frames
 from mien.cli import main
 from mien.errors import UserError
-from mien.export.pixels import to_rgb
 from mien.face import load_face_model
+from mien.media.pixels import to_rgb
+from mien.media.video import count_frames
 from mien.runtime.posing import rig_points
 from mien.viewer.drawing import Mesh, View, words_about_view
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video

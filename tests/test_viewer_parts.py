@@ -20,9 +20,10 @@ from capture_helpers import tree_bytes
 from forked import ForkServer
 from mien import runtime
 from mien.avatar.baking import make_portable
-from mien.commands.stages import live_view, viewing
-from mien.commands.stages.live_view import LiveView
 from mien.errors import UserError
+from mien.pipeline import live_view
+from mien.pipeline import view as viewing
+from mien.pipeline.live_view import LiveView
 from mien.training import train
 from mien.viewer.access import Door, is_loopback
 from mien.viewer.drawing import View

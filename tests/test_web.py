@@ -13,10 +13,11 @@ import web_case as web
 from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.errors import UserError
-from mien.export import web_page, webcam
-from mien.export.bound_features import bound_features
-from mien.export.packed import pack
+from mien.export import web_page
 from mien.export.web_page import write_page
+from mien.formats.shared import webcam
+from mien.formats.shared.bound_features import bound_features
+from mien.formats.shared.packed import pack
 from mien.runtime.baked import AttributeNetwork, FeatureDirections, LinearBases
 from test_runtime import new_avatar
 from toy_scene import toy_camera

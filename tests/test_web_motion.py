@@ -9,17 +9,17 @@ import pytest
 import torch
 
 from mien import runtime
-from mien.capture.sound import RATE
 from mien.cli import main
 from mien.driving import drive
-from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.constants import DRIVING
-from mien.driving.live_link_face import read_live_link_face
 from mien.driving.rest import rest_of
-from mien.driving.sides import PAIRS
+from mien.driving.sources.blendshape_json import read_blendshape_json
+from mien.driving.sources.live_link_face import read_live_link_face
+from mien.driving.sources.sides import PAIRS
 from mien.driving.transfer import face_of_motion
 from mien.export.web_page import write_page
 from mien.face import FaceParams, load_face_model
+from mien.media.sound import RATE
 from recordings import COLUMNS, LAYOUTS, row, write_csv, write_json
 from test_driving_by_speech import synthesised, tone, write_wav
 from test_web_webcam import ALLOWED, FAKE

@@ -11,7 +11,7 @@ import torch
 
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.avatar.settings import FaceTuning, GradientSettings
-from mien.progress import Advance
+from mien.machine.progress import Advance
 from mien.training import train
 from plain_settings import plain_config, plain_run
 from toy_scene import toy_sequence

@@ -12,18 +12,18 @@ import cv2
 import numpy as np
 
 from forked import Forked, ForkServer
-from mien import locks
 from mien.capture.store import read_capture_hash
 from mien.cli import main
-from mien.commands.stages.tracking import tracking_fingerprint
+from mien.disk import locks
+from mien.disk.workspace import Workspace
 from mien.evaluation import living
 from mien.face.loading import add_face_model
+from mien.pipeline.track import tracking_fingerprint
 from mien.storage import write_arrays
 from mien.tracking import write_tracking
 from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.tracking.settings import TrackingSettings
-from mien.workspace import Workspace
 from toy_scene import toy_capture, toy_face_model, toy_tracking
 
 _TIMESTEPS, _SIZE = 5, 48

@@ -27,8 +27,8 @@ from mien.avatar.baking import make_portable
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig
-from mien.export.packed import Motion, pack, unpacked
 from mien.face import load_face_model
+from mien.formats.shared.packed import Motion, pack, unpacked
 from mien.runtime.baked import FeatureChanges
 from mien.runtime.posing import expression_changes, rig_points
 from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES, NO_TASKS_VISION

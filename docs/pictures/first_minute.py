@@ -26,12 +26,12 @@ import cv2
 import numpy as np
 
 from mien.cli import main
-from mien.commands.stages.sheets import named_picture
-from mien.commands.stages.showing import show_film, show_page
-from mien.pages import LIVING_PAGE
-from mien.pictures import picture_grid
+from mien.disk.workspace import open_workspace
+from mien.media.pictures import picture_grid
+from mien.pages.pages import LIVING_PAGE
+from mien.pipeline.create import show_film, show_page
+from mien.pipeline.sheets import named_picture
 from mien.tracking import read_tracking
-from mien.workspace import open_workspace
 
 HERE = Path(__file__).parent
 WEB = HERE.parent.parent / "web"

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from mien.cli import main
-from mien.commands.stages.sheets import named_picture
+from mien.pipeline.sheets import named_picture
 
 ROOT = Path(__file__).parent.parent.parent
 OUT = ROOT / "docs" / "images" / "demo.jpg"

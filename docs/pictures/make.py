@@ -22,12 +22,12 @@ from mien.capture import capture_video, write_capture
 from mien.capture.capture import Capture
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture_hash
-from mien.capture.video import write_video
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.lab.synthetic import RECIPES
 from mien.lab.synthetic.captures import write_synthetic_video
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
+from mien.media.video import write_video
 from mien.render import rasterize
 from mien.tracking import read_tracking, track, write_tracking
 from mien.tracking.scoring import make_scoring

@@ -17,12 +17,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import mien
-from mien.bounded import MAX_SIDE
+from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 from mien.extras import missing_package
-from mien.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
-from mien.terminal import drop_output, open_closed_streams, printable, show, tell
-from mien.threads import asked_threads, use_one_torch_thread
+from mien.machine.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
+from mien.machine.terminal import drop_output, open_closed_streams, printable, show, tell
+from mien.machine.threads import asked_threads, use_one_torch_thread
 
 GROUPS = {
     "Make an avatar": ("demo", "create", "capture", "track", "align", "train", "import", "batch"),
@@ -152,9 +152,9 @@ def _crash() -> int:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
-    from mien.commands.complaints import complaint_of
-    from mien.commands.help_text import at_a_glance, list_options, readable, without_details
-    from mien.commands.options import settings_groups, with_settings
+    from mien.commands.parsing.complaints import complaint_of
+    from mien.commands.parsing.help_text import at_a_glance, list_options, readable, without_details
+    from mien.commands.parsing.options import settings_groups, with_settings
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
@@ -211,7 +211,7 @@ def _for_all_rows(name: str, rest: list[str]) -> tuple[list[str], dict[str, list
     """The arguments of a sub-command, and the options of `mien create` that `mien batch` takes for all rows."""
     if name != "batch":
         return rest, {}
-    from mien.commands.stages.batch_table import for_all_rows
+    from mien.commands.batch_table import for_all_rows
 
     return for_all_rows(rest)
 

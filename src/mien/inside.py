@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from mien.bounded import NotOrdinaryError, open_handle
+from mien.disk.reading import NotOrdinaryError, open_handle
 from mien.errors import UserError
-from mien.system import BINARY, NO_LINK
+from mien.machine.system import BINARY, NO_LINK
 
 _MAX_NAME_BYTES = 255
 _OF_SYSTEMS = frozenset({"thumbs.db", "desktop.ini", "__macosx"})

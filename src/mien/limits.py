@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mien.bounded import MAX_SIDE
+from mien.disk.reading import MAX_SIDE
 
 MAX_NUMBER = 1e6
 """Largest magnitude of lengths in metres, coordinates in pixels, angles in radians, raw values and weights. Mien writes

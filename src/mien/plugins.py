@@ -11,7 +11,7 @@ from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
 from mien.errors import UserError
-from mien.terminal import tell
+from mien.machine.terminal import tell
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -1,4 +1,4 @@
-"""Files: everything from `mien.files`, and torch tensors as safetensors. Nothing here depends on what is stored."""
+"""Files: everything from `mien.disk.files`, and torch tensors as safetensors. Nothing here depends on what is stored."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import safetensors.torch
 from torch import Tensor
 
-from mien.files import (
+from mien.disk.files import (
     cannot_write,
     check_writable,
     expect_whole,

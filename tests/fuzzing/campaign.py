@@ -24,8 +24,8 @@ from fuzzing.faults import Place
 from fuzzing.judge import Bench, Result, limit_this_process, run_case, snapshot
 from fuzzing.kinds import SCRIPT
 from fuzzing.targets import TARGETS, Target, present, spread
-from mien import terminal
 from mien.errors import UserError
+from mien.machine import terminal
 
 BATCH = 150
 """Number of cases in a row in one process."""

@@ -28,7 +28,7 @@ from fuzzing.material import copy_of
 from fuzzing.targets import TARGETS, Target
 from fuzzing.values import SANE, VALUES, concrete, edit
 from mien.errors import UserError
-from mien.terminal import tell
+from mien.machine.terminal import tell
 
 SECONDS = 20.0
 """Longest time that a case may take, in seconds."""

@@ -83,7 +83,7 @@ class Place:
         """Draw a clip and run all stages undisturbed; keep the files before and after each."""
         self.box, self.kept, self._server = folder / "box", folder / "kept", server
         began, recipe = time.monotonic(), RECIPES["demo"]
-        subprocess.run([sys.executable, "-c", "import mien.commands.stages.evaluating"], check=True)
+        subprocess.run([sys.executable, "-c", "import mien.pipeline.evaluate"], check=True)
         self.seconds = {"start": time.monotonic() - began}
         self.box.mkdir(parents=True)
         small = replace(recipe, seconds=FRAMES / recipe.fps, width=SIDE, height=SIDE, supersample=1, texture_size=256)

@@ -25,29 +25,29 @@ from mien.avatar import Avatar, load_avatar
 from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import write_avatar
 from mien.avatar.methods import METHODS
-from mien.capture.sound import RATE
-from mien.capture.video import write_video
-from mien.config import encode
+from mien.disk.config import encode
 from mien.evaluation import evaluate
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import EvaluationSettings
 from mien.export import in_world, write_ply
 from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
 from mien.export.glb import MeshModel, write_glb
-from mien.export.packed import pack
 from mien.export.sog import write_sog
 from mien.export.spz import write_spz
 from mien.export.usd import write_usd
 from mien.face.cache import cache_folder
-from mien.face.flame import flame_face_model, read_flame
 from mien.face.listing import ADDED_RECIPE
 from mien.face.loading import load_face_model, write_face_model, write_landmarks
 from mien.face.model import Landmarks
+from mien.face.models.flame import flame_face_model, read_flame
+from mien.formats.shared.packed import pack
 from mien.lab.analysis.registry import ANALYSES
 from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.spec import AnalysisOptions, chosen_parts
 from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, write_key
 from mien.lab.analysis.study.shuffling import shuffled
+from mien.media.sound import RATE
+from mien.media.video import write_video
 from mien.runtime import write_portable
 from mien.storage import write_json
 from mien.tracking import track_subject

@@ -12,10 +12,10 @@ from fuzzing.faults import Place
 from fuzzing.material import ANALYSIS, PIECES, RUN, SEQUENCE, go_on
 from mien.avatar import load_avatar
 from mien.capture import read_capture
-from mien.capture.calibration import read_calibration
-from mien.capture.given import read_landmarks
-from mien.commands.config_file import read_config_file
-from mien.driving.speech import read_speech
+from mien.capture.cameras.calibration import read_calibration
+from mien.capture.person.given import read_landmarks
+from mien.commands.parsing.config_file import read_config_file
+from mien.driving.sources.speech import read_speech
 from mien.evaluation.image_folders import read_crops
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import read_metrics
@@ -26,7 +26,7 @@ from mien.export.glb_avatar import read_glb_avatar
 from mien.export.sog import read_sog
 from mien.export.spz import read_spz
 from mien.export.usd import read_usd
-from mien.face.flame import flame_face_model, read_flame
+from mien.face.models.flame import flame_face_model, read_flame
 from mien.render.camera_paths import read_cameras
 from mien.runtime import read_portable
 from mien.tracking import read_tracking

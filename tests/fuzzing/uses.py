@@ -22,36 +22,37 @@ from mien import cli
 from mien.avatar import load_avatar
 from mien.avatar.baking import make_portable
 from mien.avatar.methods import METHODS
-from mien.capture.calibration import CalibratedCamera
-from mien.capture.crop import whole_picture
-from mien.capture.given import GivenMattes
-from mien.capture.readings import readings_of
-from mien.capture.source import FrameSelection, open_source, read_image
-from mien.capture.video import count_frames, probe_video, read_video_frames
-from mien.commands.config_file import ConfigFile
-from mien.commands.options import TrainOptions, with_settings
-from mien.commands.stages.importing import front_camera
+from mien.capture.cameras.calibration import CalibratedCamera
+from mien.capture.cameras.readings import readings_of
+from mien.capture.person.crop import whole_picture
+from mien.capture.person.given import GivenMattes
+from mien.commands.parsing.config_file import ConfigFile
+from mien.commands.parsing.options import TrainOptions, with_settings
 from mien.datasets.dataset import TrainedAvatar
 from mien.datasets.registry import datasets, recognised
 from mien.datasets.writing import write_sequence
+from mien.disk.workspace import Workspace, open_workspace
 from mien.driving import drive
-from mien.driving.blendshape_json import read_blendshape_json
-from mien.driving.live_link_face import read_live_link_face
 from mien.driving.motion import Motion
+from mien.driving.sources.blendshape_json import read_blendshape_json
+from mien.driving.sources.live_link_face import read_live_link_face
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation.image_source import open_pictures, read_picture
 from mien.evaluation.metrics_file import read_metrics
 from mien.export import in_world, read_ply, write_ply
 from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
-from mien.export.glb_file import read_glb
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.face.flame import flame_face_model
 from mien.face.listing import available_face_models
+from mien.face.models.flame import flame_face_model
+from mien.formats.shared.glb_file import read_glb
 from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.spec import AnalysisOptions
 from mien.lab.analysis.study.files import read_all_answers, read_key
 from mien.lab.analysis.study.tally import tally_content, tally_text
+from mien.media.source import FrameSelection, open_source, read_image
+from mien.media.video import count_frames, probe_video, read_video_frames
+from mien.pipeline.import_dataset import front_camera
 from mien.render import rasterize
 from mien.runtime import write_portable
 from mien.runtime.avatar import Avatar
@@ -60,7 +61,6 @@ from mien.training import read_sequence, train
 from mien.training.checkpoint import resume
 from mien.training.run import read_face_track, run_camera, write_imported_run
 from mien.training.trainer import start
-from mien.workspace import Workspace, open_workspace
 from toy_scene import toy_camera, toy_face_model, toy_sequence
 
 SEEN = 3

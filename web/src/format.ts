@@ -69,7 +69,7 @@ interface PackedTensor {
 }
 
 /**
- * The avatar, and the motion if there is one, in the packed form (src/mien/export/packed.py): gzip around the length of
+ * The avatar, and the motion if there is one, in the packed form (src/mien/formats/shared/packed.py): gzip around the length of
  * a json text (uint32), that text, and the arrays as integers of 8 or 16 bits.
  */
 export async function readPacked(packed: Uint8Array): Promise<{ avatar: Avatar; motion: Motion | null }> {

@@ -1,4 +1,4 @@
-// Csv of ARKit's blend shapes: of Live Link Face, also as spreadsheets save it, and of other programs. It follows src/mien/driving/live_link_face.py and sides.py.
+// Csv of ARKit's blend shapes: of Live Link Face, also as spreadsheets save it, and of other programs. It follows src/mien/driving/sources/live_link_face.py and sides.py.
 
 import { AvatarError } from "./format";
 import { axisAngle, multiplied, rotationMatrix } from "./rigid";

@@ -1,4 +1,4 @@
-// Blend shapes as json, in the layouts of several programs. It follows src/mien/driving/json_layouts.py and blendshape_json.py.
+// Blend shapes as json, in the layouts of several programs. It follows src/mien/driving/sources/json_layouts.py and blendshape_json.py.
 
 import { AvatarError } from "./format";
 import { axisAngle } from "./rigid";

@@ -1,4 +1,4 @@
-// A voice moves the mouth as it sounds: what src/mien/driving/speech.py does with a file, without knowing what comes next.
+// A voice moves the mouth as it sounds: what src/mien/driving/sources/speech.py does with a file, without knowing what comes next.
 
 /** Coefficients by ARKit's names. */
 export type Mouth = Record<string, number>;

@@ -12,11 +12,11 @@ from mien.batch.plan import Batch, Row, State
 from mien.batch.progress import running_words
 from mien.batch.row import PROGRAM, attempt
 from mien.batch.store import Returned, attempt_in_store
+from mien.disk.files import write_atomically
+from mien.disk.locks import BeingWrittenError, hold, holder_of
 from mien.errors import UserError
-from mien.files import write_atomically
-from mien.locks import BeingWrittenError, hold, holder_of
-from mien.progress import Advance, progress_bar, say
-from mien.terminal import counted
+from mien.machine.progress import Advance, progress_bar, say
+from mien.machine.terminal import counted
 
 
 def shard_of(rows: Sequence[Row], text: str) -> list[Row]:
@@ -43,7 +43,7 @@ class Driver:
     store: str = ""
     """URL of the store of workspaces. Empty if all nodes share the batch's folder."""
     program: tuple[str, ...] = ()
-    """The command of a row's process. Empty means this Python with `-m mien.batch_row`."""
+    """The command of a row's process. Empty means this Python with `-m mien.batch.row_name`."""
     work: Work | None = None
     """A function that runs a row in place of `attempt`, for trials of the engines."""
     look_seconds: float = 5.0
@@ -119,7 +119,7 @@ class Driver:
         threads = self.options.threads or None
         if self.engine == "local" and threads is None:
             from mien.batch.engines.local import jobs_here
-            from mien.threads import thread_count
+            from mien.machine.threads import thread_count
 
             threads = max(1, thread_count() // jobs_here(rows, self.options))
         if self.store:

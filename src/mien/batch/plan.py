@@ -13,11 +13,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from mien.bounded import parse_json, read_bytes
+from mien.disk.files import expect_whole, read_json, remove_leftovers, write_atomically, write_json
+from mien.disk.locks import BeingWrittenError, hold
+from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.files import expect_whole, read_json, remove_leftovers, write_atomically, write_json
 from mien.inside import check_unlinked, inside, is_one_line, is_plain_name
-from mien.locks import BeingWrittenError, hold
 
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
 WORKSPACE = "{workspace}"
@@ -26,7 +26,7 @@ _STATUSES = ("running", "done", "failed")
 _MAX_PLAN_BYTES, _MAX_STATE_BYTES = 256 << 20, 1 << 20
 _MAX_NUMBER = 1e15
 _COMPARED = 50
-"""Number of characters by which leftovers are told, before `mien.files` looks at them exactly."""
+"""Number of characters by which leftovers are told, before `mien.disk.files` looks at them exactly."""
 _AGAIN = "run `mien batch TABLE --out DIR` again"
 
 

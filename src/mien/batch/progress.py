@@ -11,8 +11,8 @@ from typing import Any
 from mien.batch.plan import Batch, Row, State
 from mien.batch.row import repeat_command, tail
 from mien.batch.store import is_url
-from mien.locks import holder_of
-from mien.terminal import counted, printable
+from mien.disk.locks import holder_of
+from mien.machine.terminal import counted, printable
 
 _STAGE = re.compile(r"stage (\d+) of (\d+) \(([\w -]+)\)")
 _PART = re.compile(r": (\d+)/(\d+) in ")

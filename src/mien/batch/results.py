@@ -10,8 +10,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from mien.batch.plan import Batch
+from mien.disk.files import write_atomically
 from mien.errors import UserError
-from mien.files import write_atomically
 from mien.metric_names import COLUMNS
 
 HIGHER = {name: higher for name, _, _, higher in COLUMNS}

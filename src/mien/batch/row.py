@@ -22,16 +22,16 @@ from typing import IO, Any
 
 import mien
 from mien.batch.plan import WORKSPACE, Batch, Row, State, row_from
+from mien.disk.locks import BeingWrittenError, hold
 from mien.errors import CannotWriteError, UserError
 from mien.inside import open_to_append, open_to_read
-from mien.locks import BeingWrittenError, hold
-from mien.stops import orderly_stops
-from mien.system import end_this_process, peak_memory_mb
-from mien.terminal import printable, tell
+from mien.machine.stops import orderly_stops
+from mien.machine.system import end_this_process, peak_memory_mb
+from mien.machine.terminal import printable, tell
 
 Do = Callable[[Batch, Row], tuple[tuple[dict[str, Any], ...], dict[str, float]]]
 """Runs the steps of a row, and returns the figures of its runs and the seconds of its stages."""
-PROGRAM = (sys.executable, "-m", "mien.batch_row")
+PROGRAM = (sys.executable, "-m", "mien.batch.row_name")
 """The command of a row's process."""
 EXIT_BUSY = 75
 """Exit code of a row's process if another process holds the row."""

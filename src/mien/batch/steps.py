@@ -11,9 +11,9 @@ from typing import Any
 from mien.batch.plan import WORKSPACE, Batch, Row
 from mien.batch.row import Do, RowFailedError, last_error
 from mien.batch.store import fetched
-from mien.files import write_atomically
-from mien.progress import current_stage
-from mien.workspace import Workspace
+from mien.disk.files import write_atomically
+from mien.disk.workspace import Workspace
+from mien.machine.progress import current_stage
 
 Main = Callable[[list[str]], int]
 """Runs a command of mien and returns its exit code."""
@@ -84,7 +84,7 @@ def write_strip(film: Path, path: Path) -> None:
     """Write pictures of a film side by side."""
     from PIL import Image
 
-    from mien.capture.video_file import open_video
+    from mien.media.video_file import open_video
 
     with open_video(film) as (container, stream):
         frames = [frame.to_image() for frame in container.decode(stream)]

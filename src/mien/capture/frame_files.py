@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from mien.errors import UserError
 from mien.inside import open_new, open_to_change
-from mien.picture_files import decode_png, encode_picture, write_at
+from mien.media.picture_files import decode_png, encode_picture, write_at
 
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
 STAGE = "`mien capture`"

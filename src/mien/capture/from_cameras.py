@@ -10,13 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from mien.camera import Camera
-from mien.capture.backend import detector_entry
-from mien.capture.calibration import CalibratedCamera, match_sources, read_calibration
-from mien.capture.calibration_check import advise_on, landmarks_at, some_timesteps, warn_of_misfit
+from mien.capture.cameras.calibration import CalibratedCamera, match_sources, read_calibration
+from mien.capture.cameras.calibration_check import advise_on, landmarks_at, some_timesteps, warn_of_misfit
+from mien.capture.cameras.head_path import HeadPath, choose_crops, disagreeing, find_head_path
 from mien.capture.capture import Capture
 from mien.capture.constants import CAPTURE
-from mien.capture.crop import Crop
-from mien.capture.faces import LANDMARKS
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.capture.from_video import (
     RECIPE,
@@ -28,22 +26,24 @@ from mien.capture.from_video import (
     prepare,
     read_finished,
 )
-from mien.capture.given import read_given, with_own_alpha
-from mien.capture.head_path import HeadPath, choose_crops, disagreeing, find_head_path
-from mien.capture.pace import frame_rate, tell_pauses
 from mien.capture.parts import Part, check_one_size
-from mien.capture.people import Person, choose_person
+from mien.capture.person.backend import detector_entry
+from mien.capture.person.crop import Crop
+from mien.capture.person.faces import LANDMARKS
+from mien.capture.person.given import read_given, with_own_alpha
+from mien.capture.person.people import Person, choose_person
+from mien.capture.person.survey import Survey, survey_source
+from mien.capture.person.video_kind import kind_report, tell_fields, tell_kind
 from mien.capture.process import Chunk, Reel, process_part
 from mien.capture.quality import MEASURES, FrameQuality, quality_report, relative_quality
 from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
-from mien.capture.survey import Survey, survey_source
-from mien.capture.video_kind import kind_report, tell_fields, tell_kind
+from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.inside import remove_tree
-from mien.locks import hold
-from mien.progress import say
+from mien.machine.progress import say
+from mien.media.pace import frame_rate, tell_pauses
 from mien.storage import file_digest
 
 _MAX_RATE_ERROR = 0.01
@@ -80,7 +80,7 @@ def capture_cameras(
 
     Args:
         sources: a video or a folder of pictures for each camera, named by the camera's id; or one folder with them.
-        calibration: json file of the cameras (`mien.capture.calibration.read_calibration`).
+        calibration: json file of the cameras (`mien.capture.cameras.calibration.read_calibration`).
         out: the capture's folder. A capture of the same sources in it is replaced; anything else is refused.
         name: name of the sequence.
         settings: settings of the capture. Mattes, landmarks and clean plates are folders with a file or folder for each

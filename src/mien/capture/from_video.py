@@ -14,26 +14,26 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mien.capture.backend import Detector, choose_detector, detector_entry
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FRAMES, FrameLayout
-from mien.capture.given import GivenInputs, read_given, with_own_alpha
 from mien.capture.outcome import CAMERA_ID, Origin, finish_part
 from mien.capture.parts import Part, check_one_size, find_parts, number_parts, whole_part
+from mien.capture.person.backend import Detector, choose_detector, detector_entry
+from mien.capture.person.given import GivenInputs, read_given, with_own_alpha
+from mien.capture.person.same_person import check_neighbors, face_shapes, group_people, tell_who
+from mien.capture.person.survey import Survey, check_upright, survey_source
+from mien.capture.person.video_kind import tell_fields, tell_kind
 from mien.capture.process import Chunk, Reel, process_part
 from mien.capture.room import check_room
-from mien.capture.same_person import check_neighbors, face_shapes, group_people, tell_who
 from mien.capture.settings import CaptureSettings
-from mien.capture.source import FrameSelection, FrameSource, open_source
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
-from mien.capture.survey import Survey, check_upright, survey_source
-from mien.capture.video_kind import tell_fields, tell_kind
+from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.inside import check_tree, has_other_names, remove_tree
-from mien.locks import hold
-from mien.progress import say
+from mien.machine.progress import say
+from mien.machine.terminal import plain_name
+from mien.media.source import FrameSelection, FrameSource, open_source
 from mien.storage import cannot_write, file_digest, read_json, write_json
-from mien.terminal import plain_name
 
 RECIPE = 7
 """Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""

@@ -5,19 +5,19 @@ from pathlib import Path
 
 import numpy as np
 
-from mien.capture.backend import Detector, detector_entry
-from mien.capture.faces import second_difference_jitter
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
-from mien.capture.pace import frame_rate, pace_report
 from mien.capture.parts import Part
+from mien.capture.person.backend import Detector, detector_entry
+from mien.capture.person.faces import second_difference_jitter
+from mien.capture.person.survey import no_face
+from mien.capture.person.video_kind import kind_report
 from mien.capture.process import Chunk
 from mien.capture.quality import quality_report, relative_quality
-from mien.capture.source import FrameSource
 from mien.capture.store import CaptureData, finish_capture
-from mien.capture.survey import no_face
-from mien.capture.video_kind import kind_report
 from mien.inside import remove_tree
-from mien.progress import say
+from mien.machine.progress import say
+from mien.media.pace import frame_rate, pace_report
+from mien.media.source import FrameSource
 
 CAMERA_ID = "0"
 

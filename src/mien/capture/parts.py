@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mien.capture.constants import CAPTURE
-from mien.capture.crop import Crop, choose_crop, whole_picture
-from mien.capture.people import Person, choose_person
+from mien.capture.person.crop import Crop, choose_crop, whole_picture
+from mien.capture.person.people import Person, choose_person
+from mien.capture.person.survey import Survey, no_face, slice_survey
 from mien.capture.settings import CaptureSettings
-from mien.capture.survey import Survey, no_face, slice_survey
 from mien.errors import UserError
-from mien.progress import say
-from mien.terminal import counted
+from mien.machine.progress import say
+from mien.machine.terminal import counted
 
 _MANY_LEFT_OUT = 0.1
 """Share of the frames in parts that are left out from which on that is a warning."""

@@ -11,23 +11,23 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt64
 
-from mien.capture.backend import DetectorChoice
 from mien.capture.constants import CAPTURE
-from mien.capture.crop import Crop
-from mien.capture.display import brought_to
-from mien.capture.faces import LANDMARKS, LandmarkDetector
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
-from mien.capture.given import GivenInputs
-from mien.capture.matte import MakeMatte, choose_matting
-from mien.capture.matte_owner import held, without_others
 from mien.capture.parts import Part
-from mien.capture.people import Person
+from mien.capture.person.backend import DetectorChoice
+from mien.capture.person.crop import Crop
+from mien.capture.person.faces import LANDMARKS, LandmarkDetector
+from mien.capture.person.given import GivenInputs
+from mien.capture.person.matte import MakeMatte, choose_matting
+from mien.capture.person.matte_owner import held, without_others
+from mien.capture.person.people import Person
+from mien.capture.person.screen import screen_of, without_screen
+from mien.capture.person.survey import Survey
 from mien.capture.quality import MEASURES, measure_face
-from mien.capture.screen import screen_of, without_screen
-from mien.capture.source import FrameSource, SourceFrame
-from mien.capture.survey import Survey
 from mien.errors import UserError
-from mien.progress import Advance, progress_bar, say
+from mien.machine.progress import Advance, progress_bar, say
+from mien.media.display import brought_to
+from mien.media.source import FrameSource, SourceFrame
 from mien.storage import expect_whole, read_arrays, write_arrays
 
 CHUNK = 256

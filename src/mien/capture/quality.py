@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mien.capture.constants import CAPTURE
-from mien.progress import say
+from mien.machine.progress import say
 
 _DIRECTIONS = 4
 """Directions in which detail is measured: across, down and both diagonals. Motion removes it only along itself."""

@@ -6,8 +6,8 @@ from pathlib import Path
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.errors import UserError
 from mien.inside import remove_tree
-from mien.progress import say
-from mien.terminal import counted
+from mien.machine.progress import say
+from mien.machine.terminal import counted
 
 _PNG_SHARE = 0.5
 """Size of lossless PNGs relative to their pixels. Footage takes 0.2 to 0.5 of them, mattes almost nothing."""

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mien.bounded import MAX_SIDE
-from mien.capture.backend import DetectorChoice
 from mien.capture.deinterlacing import Deinterlace
+from mien.capture.person.backend import DetectorChoice
+from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 
 _MIN_SIZE = 32

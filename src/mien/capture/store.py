@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float
 from mien.camera import Camera
 from mien.capture.cache import map_frames, stamp_cache
 from mien.capture.capture import Capture
-from mien.capture.faces import LANDMARKS
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, FrameLayout, FrameWriter
+from mien.capture.person.faces import LANDMARKS
 from mien.capture.quality import FrameQuality
+from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
 from mien.inside import check_tree, is_one_line, is_plain_name, remove_tree
 from mien.limits import MAX_NUMBER, camera_fault, checked_side
-from mien.locks import read_beside_writers
-from mien.progress import progress_bar
+from mien.machine.progress import progress_bar
 from mien.storage import (
     cannot_write,
     expect_whole,

@@ -6,11 +6,11 @@ from typing import Annotated
 
 import tyro
 
-from mien.devices import DeviceName, check_device
+from mien.disk.workspace import open_workspace
 from mien.errors import UserError
+from mien.machine.devices import DeviceName, check_device
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.settings import Split, TrainSettings, check_held_out
-from mien.workspace import open_workspace
 
 _SPLITS = ("blocks", "tail", "none")
 
@@ -52,8 +52,8 @@ class Command:
 
     def run(self) -> None:
         """Align, and write overlays and reports."""
-        from mien.commands.stages.aligning import run_alignment_stage
-        from mien.commands.stages.tracking import show_trackings
+        from mien.pipeline.align import run_alignment_stage
+        from mien.pipeline.track import show_trackings
 
         workspace = open_workspace(self.workspace)
         names = workspace.pick_tracked(self.sequences, self.hold_out)

@@ -7,11 +7,11 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.help_text import Described
+from mien.commands.parsing.help_text import Described
+from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.lab.analysis.registry import ANALYSES
 from mien.lab.analysis.spec import Analysis, AnalysisOptions, chosen_parts
-from mien.workspace import Workspace, open_workspace
 
 
 def _about_target() -> str:
@@ -44,7 +44,7 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
         from mien.inside import check_subtrees
 
         AnalysisOptions(self.steps, self.seconds).check()
@@ -57,10 +57,10 @@ class Command:
         """Measure the parts and write the page."""
         import json
 
-        from mien.commands.stages.evaluating import run_sequences
         from mien.lab.analysis.running import run_analysis
-        from mien.progress import say
-        from mien.terminal import show
+        from mien.machine.progress import say
+        from mien.machine.terminal import show
+        from mien.pipeline.evaluate import run_sequences
 
         workspace = self._workspace()
         run = workspace.pick_run(self.run_name)

@@ -13,10 +13,10 @@ import tyro
 from mien.batch.drive import shard_of
 from mien.batch.engines import EngineOptions, engine_named, engine_names
 from mien.batch.plan import Batch
-from mien.commands.help_text import Described
+from mien.commands.parsing.help_text import Described
 from mien.errors import UserError
 from mien.extras import EXTRA_OF
-from mien.terminal import show
+from mien.machine.terminal import show
 
 _WATCH_SECONDS = 5.0
 _TASKS = {
@@ -64,7 +64,7 @@ class Command:
     store: str = ""
     """URL of a folder for the workspaces, such as s3://bucket/people, if nodes share no folder. Copied in and out."""
     program: str = ""
-    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.batch_row". The folder of the
+    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.batch.row_name". The folder of the
     batch follows it."""
     watch: bool = False
     """For status: show it again every five seconds, until all rows have ended."""
@@ -79,7 +79,7 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
 
         task = self._task()
         if task is not None:
@@ -149,9 +149,9 @@ class Command:
         from mien.batch.progress import batch_progress, progress_text
         from mien.batch.results import write_results
         from mien.batch.wall import write_wall
-        from mien.commands.stages.batch_table import read_table
-        from mien.progress import say
-        from mien.terminal import counted
+        from mien.commands.batch_table import read_table
+        from mien.machine.progress import say
+        from mien.machine.terminal import counted
 
         assert self.out is not None
         batch, rows = Batch(self.out), read_table(Path(self.what[0]), self.for_all)
@@ -179,8 +179,8 @@ class Command:
 
     def _tell_dropped(self, batch: Batch, names: set[str]) -> None:
         """Say which rows of an earlier table are no longer in the plan."""
-        from mien.progress import say
-        from mien.terminal import counted
+        from mien.machine.progress import say
+        from mien.machine.terminal import counted
 
         try:
             dropped = [row.name for row in batch.read_plan() if row.name not in names]
@@ -202,7 +202,7 @@ class Command:
 
     def _table(self, batch: Batch) -> None:
         from mien.batch.results import latex_table, markdown_table, means_by, result_rows
-        from mien.files import write_atomically
+        from mien.disk.files import write_atomically
 
         columns = [column.strip() for column in self.columns.split(",") if column.strip()]
         table = means_by(result_rows(batch), self.rows, columns)

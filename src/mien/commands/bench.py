@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
-from mien.commands.options import PresetName, check_method, listed_methods
-from mien.devices import DeviceName, check_device, choose_device, like_on
+from mien.commands.parsing.options import PresetName, check_method, listed_methods
+from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking.registry import STEP_BENCHMARKS
 from mien.lazy import named
-from mien.terminal import show
-from mien.workspace import open_workspace
+from mien.machine.devices import DeviceName, check_device, choose_device, like_on
+from mien.machine.terminal import show
 
 if TYPE_CHECKING:
     import torch
@@ -163,7 +163,7 @@ class Quality:
 
     def run(self) -> None:
         """Run every capture through all stages, then print the table."""
-        from mien.commands.stages.quality import run_quality_stage
+        from mien.pipeline.quality import run_quality_stage
 
         run_quality_stage(self.out, self.captures, self.method, self.steps, aligned=self.align, as_json=self.as_json)
 
@@ -199,7 +199,7 @@ class Compare:
 
     def check(self) -> None:
         """Check without heavy libraries that there is something to compare, and that it can be written."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
         from mien.training.settings import PRESETS
 
         if not self.workspaces and not self.captures:
@@ -226,7 +226,7 @@ class Compare:
 
     def run(self) -> None:
         """Train and score every method on every capture, then print the table."""
-        from mien.commands.stages.comparing import Budget, CompareSettings, run_compare_stage
+        from mien.pipeline.comparing import Budget, CompareSettings, run_compare_stage
 
         methods = tuple(dict.fromkeys(self.methods))
         settings = CompareSettings(methods, self.preset, Budget(self.minutes, self.steps), self.split)

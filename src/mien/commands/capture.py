@@ -7,8 +7,8 @@ from typing import Annotated
 import tyro
 
 from mien.capture.settings import CaptureSettings
+from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.workspace import Workspace, check_new_workspace
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without the libraries that capture."""
-        from mien.commands.stages.names import check_videos, rig_name, sequence_names
+        from mien.pipeline.names import check_videos, rig_name, sequence_names
 
         names = () if self.name is None else (self.name,)
         if self.calibration is not None:
@@ -59,7 +59,7 @@ class Command:
 
     def run(self) -> None:
         """Capture the videos and report what was found."""
-        from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
+        from mien.pipeline.capture import run_calibrated_capture_stage, run_capture_stage
 
         workspace = Workspace(self.out)
         if self.calibration is None:

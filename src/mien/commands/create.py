@@ -9,16 +9,16 @@ import tyro
 
 from mien.avatar.settings import MethodConfig
 from mien.capture.settings import CaptureSettings
-from mien.commands.options import TrainOptions, check_viewer
+from mien.commands.parsing.options import TrainOptions, check_viewer
+from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
 from mien.overall import Overall
 from mien.tracking.settings import ScoringSettings, TrackingSettings
 from mien.training.alignment_settings import AlignmentSettings
-from mien.training.footage.benchmark_split import BENCHMARK_SPLIT
-from mien.training.footage.named_split import NAMED_SPLIT
-from mien.training.footage.own_split import OWN_SPLIT
 from mien.training.settings import PRESETS, TrainSettings
-from mien.workspace import Workspace, check_new_workspace
+from mien.training.splits.benchmark import BENCHMARK_SPLIT
+from mien.training.splits.named import NAMED_SPLIT
+from mien.training.splits.own import OWN_SPLIT
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Command:
 
     def check(self) -> None:
         """Check options, names and paths without heavy libraries."""
-        from mien.commands.stages.names import check_videos, rig_name, run_name, sequence_names
+        from mien.pipeline.names import check_videos, rig_name, run_name, sequence_names
 
         self.options.check()
         if self.view:
@@ -85,12 +85,12 @@ class Command:
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
-        from mien.commands.stages.capturing import check_camera_ids
-        from mien.commands.stages.face_models import face_model_of
-        from mien.commands.stages.names import doubled_videos, run_name, sequence_names
-        from mien.commands.stages.showing import name_next_commands, show_film
-        from mien.commands.stages.tracking import check_masks
-        from mien.progress import say, whole_command
+        from mien.machine.progress import say, whole_command
+        from mien.pipeline.capture import check_camera_ids
+        from mien.pipeline.create import name_next_commands, show_film
+        from mien.pipeline.face_models import face_model_of
+        from mien.pipeline.names import doubled_videos, run_name, sequence_names
+        from mien.pipeline.track import check_masks
         from mien.training.run import check_run, check_untouched
         from mien.training.run import check_videos as check_trained_videos
 
@@ -118,7 +118,7 @@ class Command:
     def _overall(self, settings: TrainSettings) -> Overall:
         """What is to be done, with expected times."""
         from mien.commands.stages.expected import count_captured, count_scored, expected_pieces
-        from mien.commands.stages.names import sequence_names
+        from mien.pipeline.names import sequence_names
 
         frames, names = [count_captured(video, self.capture) for video in self.videos], []
         if self.calibration is None:
@@ -141,15 +141,15 @@ class Command:
         return steps < self.alignment.template_steps
 
     def _run_stages(self, workspace: Workspace, run: str, method: MethodConfig, settings: TrainSettings) -> None:
-        from mien.commands.stages.aligning import is_trained_on, one_camera, run_alignment_stage
-        from mien.commands.stages.capturing import run_calibrated_capture_stage, run_capture_stage
-        from mien.commands.stages.evaluating import run_evaluation_stage
-        from mien.commands.stages.names import sequence_names
-        from mien.commands.stages.showing import show_page
-        from mien.commands.stages.tracking import run_tracking_stage, show_trackings
-        from mien.commands.stages.training import run_training_stage
         from mien.evaluation.protocols import EvaluationSettings
-        from mien.progress import say
+        from mien.machine.progress import say
+        from mien.pipeline.align import is_trained_on, one_camera, run_alignment_stage
+        from mien.pipeline.capture import run_calibrated_capture_stage, run_capture_stage
+        from mien.pipeline.create import show_page
+        from mien.pipeline.evaluate import run_evaluation_stage
+        from mien.pipeline.names import sequence_names
+        from mien.pipeline.track import run_tracking_stage, show_trackings
+        from mien.pipeline.train import run_training_stage
         from mien.training.settings import check_held_out
 
         if self.calibration is None:

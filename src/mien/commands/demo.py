@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mien.commands.create import Command as Create
-from mien.commands.options import PresetName, TrainOptions
+from mien.commands.parsing.options import PresetName, TrainOptions
 from mien.errors import UserError
 
 _MAX_SECONDS = 600.0
@@ -28,7 +28,7 @@ class Command:
 
     def check(self) -> None:
         """Check the options without heavy libraries."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
 
         TrainOptions(preset=self.preset, steps=self.steps).settings()
         if self.seconds and not 0 < self.seconds <= _MAX_SECONDS:
@@ -39,9 +39,9 @@ class Command:
         """Write the video unless it exists, then run `mien create` on it."""
         from dataclasses import replace
 
+        from mien.disk.locks import hold
         from mien.lab.synthetic.captures import write_synthetic_video
         from mien.lab.synthetic.recipe import RECIPES
-        from mien.locks import hold
 
         recipe = RECIPES["demo"]
         if self.seconds:

@@ -6,11 +6,18 @@ from typing import Annotated
 
 import tyro
 
-from mien.capture.camera_names import CameraFormat, camera_named, is_camera
-from mien.commands.options import check_avatar, check_driver, check_neutral, check_port, check_viewer, has_viewer
-from mien.commands.picture import PictureOptions
+from mien.commands.parsing.options import (
+    check_avatar,
+    check_driver,
+    check_neutral,
+    check_port,
+    check_viewer,
+    has_viewer,
+)
+from mien.disk.workspace import open_workspace
 from mien.errors import UserError
-from mien.workspace import open_workspace
+from mien.media.camera_names import CameraFormat, camera_named, is_camera
+from mien.pipeline.picture_options import PictureOptions
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ class Command:
         if is_camera(self.by):
             self._follow()
             return
-        from mien.commands.stages.driving import DriveOptions, run_driving_stage
+        from mien.pipeline.drive import DriveOptions, run_driving_stage
 
         if self.out is None:
             self._show()
@@ -108,15 +115,15 @@ class Command:
         run_driving_stage(run_dir, Path(self.by), self.out, options, self.picture)
 
     def _show(self) -> None:
-        from mien.commands.stages.viewing import Motions, Place, run_viewing_stage
+        from mien.pipeline.view import Motions, Place, run_viewing_stage
 
         motions = Motions(self.by, self.neutral, at_once=True)
         run_viewing_stage(self.workspace, self.run_name, motions, Place("127.0.0.1", self.port))
 
     def _follow(self) -> None:
-        from mien.commands.stages.following import CameraOptions, run_following_stage
-        from mien.commands.stages.viewing import Place
         from mien.driving.live.follower import FollowOptions
+        from mien.pipeline.follow import CameraOptions, run_following_stage
+        from mien.pipeline.view import Place
 
         place = Place("127.0.0.1", self.port) if has_viewer() else None
         follow = FollowOptions(self.head_pose, self.unlimited)

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from mien.disk.workspace import open_workspace
 from mien.errors import UserError
-from mien.terminal import show
-from mien.workspace import open_workspace
+from mien.machine.terminal import show
 
 Protocol = Literal["insta", "imavatar", "nersemble", "nersemble-benchmark", "vhap", "nerface", "nerf-blendshape"]
 """Names of `mien.evaluation.dataset_protocols`, without its imports."""
@@ -111,8 +111,8 @@ class Command:
             self._evaluate()
 
     def _evaluate(self) -> None:
-        from mien.commands.stages.evaluating import run_evaluation_stage
         from mien.evaluation.protocols import EvaluationSettings
+        from mien.pipeline.evaluate import run_evaluation_stage
 
         whole = self.protocol is not None and self.lpips_weights is not None
         settings = EvaluationSettings(
@@ -134,8 +134,8 @@ class Command:
         return default if self.perceptual_frames is None else self.perceptual_frames
 
     def _compare(self) -> None:
-        from mien.commands.stages.evaluating import run_comparison
-        from mien.evaluation.text import comparison_text
+        from mien.evaluation.report.text import comparison_text
+        from mien.pipeline.evaluate import run_comparison
 
         comparison = run_comparison([open_workspace(folder) for folder in self.workspaces], self.run_name, self.out)
         if self.as_json:
@@ -154,8 +154,8 @@ class Command:
 
     def _score_images(self, images: Path, truth: Path) -> None:
         from mien.evaluation.image_folders import ImageFolders, score_folders, write_scores
+        from mien.evaluation.report.text import scores_lines
         from mien.evaluation.scoring import ScoreSettings
-        from mien.evaluation.text import scores_lines
 
         folders = ImageFolders(images, truth, self.mattes, self.crops, self.background)
         scores = score_folders(

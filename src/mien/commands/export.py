@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
-from mien.commands.help_text import Described
-from mien.commands.options import check_driver, check_neutral
+from mien.commands.parsing.help_text import Described
+from mien.commands.parsing.options import check_driver, check_neutral
 from mien.datasets.layouts.layout import Layout, MatteKind
 from mien.datasets.layouts.registry import LAYOUTS, find_layout
+from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, Holds
 from mien.formats.registry import endings, find_format, format_of, formats, numbered
-from mien.workspace import open_workspace
 
 if TYPE_CHECKING:
     from mien.formats.format import Options
@@ -143,7 +143,7 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
 
         if self.format == SUBMISSION:
             self._check_submission()
@@ -206,7 +206,7 @@ class Command:
 
             convert(self.workspace, self.out, kind, self._options())
             return
-        from mien.commands.stages.exporting import RunContent, Series, export
+        from mien.pipeline.export import RunContent, Series, export
 
         workspace = open_workspace(self.workspace)
         series = None if self.series is None else Series(self.series, self.neutral, self.every)
@@ -238,7 +238,7 @@ class Command:
 
     def _check_submission(self) -> None:
         """Check the options and paths of a submission to the benchmark."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
 
         given = {"--sequence": self.sequence, "--split": self.split, "--mattes": self.mattes}
         other = self._option_of_avatars() or next((option for option, value in given.items() if value), None)
@@ -284,7 +284,7 @@ class Command:
         return next((option for option, value in given.items() if value), None)
 
     def _export_capture(self, layout: Layout) -> None:
-        from mien.commands.stages.exporting_capture import export_capture, settings_of
+        from mien.pipeline.export_dataset import export_capture, settings_of
 
         workspace = open_workspace(self.workspace)
         sequence = workspace.pick_sequence(self.sequence)
@@ -333,7 +333,7 @@ class Command:
         return UserError(f"{self.out}: cannot write {ending}; use {use}{folder}")
 
     def _check_options(self, kind: Format) -> None:
-        from mien.export.webcam import find_webcam_files
+        from mien.formats.shared.webcam import find_webcam_files
 
         given = {"webgpu": self.webgpu, "sh": self.sh is not None, "webcam": self.webcam, "microphone": self.microphone}
         given |= {"spz_version": self.spz_version is not None}
@@ -355,8 +355,8 @@ class Command:
         kind.check(self.out)
 
     def _options(self) -> "Options":
-        from mien.export.webcam import find_webcam_files
         from mien.formats.format import Options
+        from mien.formats.shared.webcam import find_webcam_files
 
         webcam = find_webcam_files(self.webcam_model) if self.webcam else None
         version = self.spz_version or 4
@@ -364,7 +364,7 @@ class Command:
         return Options(self.sh, self.webgpu, webcam, version, self.title, self.address, **named)
 
     def _check_file(self, kind: Format) -> None:
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
 
         if not self.workspace.is_file():
             raise UserError(f"{self.workspace}: no such file; give a workspace, or a file that `mien export` wrote")

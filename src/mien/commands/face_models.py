@@ -7,12 +7,12 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.stages.names import no_model_file
 from mien.errors import UserError
-from mien.terminal import show
+from mien.machine.terminal import show
+from mien.pipeline.names import no_model_file
 
 _ICT_MEAN = "generic_neutral_mesh.obj"
-"""A file by which ICT-FaceKit's folder is recognised (`mien.face.ict.NEUTRAL`, without its imports)."""
+"""A file by which ICT-FaceKit's folder is recognised (`mien.face.models.ict.NEUTRAL`, without its imports)."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Command:
         from mien.face.obtainable import OBTAINABLE
 
         if self.add is not None:
-            from mien.commands.stages.face_models import add_face_model_file
             from mien.face.cache import cache_is_kept
+            from mien.pipeline.face_models import add_face_model_file
 
             if not cache_is_kept():
                 raise UserError(

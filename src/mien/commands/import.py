@@ -6,12 +6,12 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.help_text import Described
-from mien.commands.stages.names import check_new_run, check_new_sequence, run_name
+from mien.commands.parsing.help_text import Described
 from mien.datasets.dataset import Dataset, Findings
 from mien.datasets.registry import find_dataset, known_datasets, recognised
+from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.workspace import Workspace, check_new_workspace
+from mien.pipeline.names import check_new_run, check_new_sequence, run_name
 
 
 def _about_path() -> str:
@@ -76,7 +76,7 @@ class Command:
 
     def _read(self, dataset: Dataset, told: str | None) -> None:
         from mien.commands.stages.findings import findings_lines
-        from mien.progress import say
+        from mien.machine.progress import say
 
         if told is not None and (self.dry_run or dataset.holds == "sequences"):
             say(f"{self.path}: {told}")  # before they are read, which takes long
@@ -89,7 +89,7 @@ class Command:
                 say(f"{self.out}: all sequences are there already")
                 return
         if not self.dry_run:
-            from mien.commands.stages.importing import run_import_stage
+            from mien.pipeline.import_dataset import run_import_stage
 
             workspace, run = Workspace(self.out), self._run(dataset)
             run_import_stage(

@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 
-from mien.terminal import show
+from mien.machine.terminal import show
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from mien.terminal import show
+from mien.machine.terminal import show
 
 if TYPE_CHECKING:
     from mien.plugins import Added

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from mien.commands.options import check_avatar
-from mien.commands.picture import PictureOptions
-from mien.devices import DeviceName, check_device, choose_device, like_on
+from mien.commands.parsing.options import check_avatar
+from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
-from mien.workspace import Workspace, open_workspace
+from mien.machine.devices import DeviceName, check_device, choose_device, like_on
+from mien.pipeline.picture_options import PictureOptions
 
 if TYPE_CHECKING:
     import numpy
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     import mien.avatar
     import mien.camera
-    import mien.export.output
     import mien.face
+    import mien.media.output
     import mien.runtime
 
 
@@ -107,11 +107,11 @@ class Command:
             return
         from mien.avatar.avatar import move_avatar
         from mien.avatar.files import load_avatar
-        from mien.commands.expression import tell_of_unfilmed, with_expression
-        from mien.commands.stages.pictures import draw, posed_softly, warn_of_white, whole
-        from mien.export.pictures import write_pictures
         from mien.face.checks import check_face_params
-        from mien.progress import say, track_progress
+        from mien.machine.progress import say, track_progress
+        from mien.media.writing import write_pictures
+        from mien.pipeline.draw import draw, posed_softly, warn_of_white, whole
+        from mien.pipeline.expression import tell_of_unfilmed, with_expression
         from mien.training.footage.filmed import filmed_words, read_coverage
         from mien.training.run import filmed_range
 
@@ -213,7 +213,7 @@ class Command:
 
     def _draw_file(self) -> None:
         """Draw the avatar of a file, without torch."""
-        from mien.commands.stages.file_pictures import View, render_file
+        from mien.pipeline.draw_file import View, render_file
 
         frames = self._frames(None)
         view = View(self.yaw, self.pitch, self.zoom, lambda camera, center: self._file_path(camera, center, frames))
@@ -237,8 +237,8 @@ class Command:
 
     def _camera(self, run_dir: Path, subject: "mien.face.FaceParams") -> "mien.camera.Camera":
         """The run's first camera, moved by --yaw, --pitch and --zoom."""
-        from mien.commands.stages.pictures import view
-        from mien.commands.stages.sheets import SMALL_TILE
+        from mien.pipeline.draw import view
+        from mien.pipeline.sheets import SMALL_TILE
         from mien.render.camera_paths import turned_camera
         from mien.training.run import run_camera
 
@@ -253,19 +253,13 @@ class Command:
         run_dir: Path,
         avatar: "mien.avatar.Avatar",
         face: "mien.face.FaceParams",
-        output: "mien.export.output.Output",
+        output: "mien.media.output.Output",
     ) -> None:
         from mien.avatar.avatar import move_avatar
-        from mien.commands.stages.pictures import draw, posed_softly
-        from mien.commands.stages.sheets import (
-            draw_sheet,
-            expression_tiles,
-            filmed_tiles,
-            nearer_tiles,
-            turntable_tiles,
-        )
-        from mien.export.pictures import write_pictures
-        from mien.progress import say
+        from mien.machine.progress import say
+        from mien.media.writing import write_pictures
+        from mien.pipeline.draw import draw, posed_softly
+        from mien.pipeline.sheets import draw_sheet, expression_tiles, filmed_tiles, nearer_tiles, turntable_tiles
         from mien.training.run import filmed_range
 
         camera, model = self._camera(run_dir, avatar.subject), avatar.face_model
@@ -339,7 +333,7 @@ class Command:
 
     def _given_cameras(self, workspace: Workspace, timesteps: int | None) -> "list[mien.camera.Camera] | None":
         """Cameras that do not depend on the avatar, one per frame, or None for a path around its head."""
-        from mien.commands.stages.pictures import view
+        from mien.pipeline.draw import view
         from mien.render.camera_paths import read_cameras
         from mien.tracking.files import read_tracking
 

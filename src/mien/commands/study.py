@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
-from mien.terminal import show
-from mien.workspace import Workspace, open_workspace
+from mien.machine.terminal import show
 
 if TYPE_CHECKING:
     from mien.lab.analysis.study.clips import StudyRuns
@@ -45,7 +45,7 @@ class Make:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
         from mien.inside import check_subtrees
 
         self._settings().check()
@@ -63,7 +63,7 @@ class Make:
     def run(self) -> None:
         """Write the page and the key."""
         from mien.lab.analysis.study.making import write_study
-        from mien.progress import say
+        from mien.machine.progress import say
 
         opened = [open_workspace(folder) for folder in self.workspaces]
         labels = self._labels(opened)
@@ -110,7 +110,7 @@ class Tally:
 
     def check(self) -> None:
         """Read the key and all answers, and check that the result can be written, without heavy libraries."""
-        from mien.files import check_writable
+        from mien.disk.files import check_writable
         from mien.lab.analysis.study.files import read_all_answers, read_key
 
         if not self.answers:
@@ -121,7 +121,7 @@ class Tally:
 
     def run(self) -> None:
         """Print the percentages."""
-        from mien.files import write_json
+        from mien.disk.files import write_json
         from mien.lab.analysis.study.files import read_all_answers, read_key
         from mien.lab.analysis.study.tally import FORMAT, VERSION, tally_content, tally_text
 
@@ -155,8 +155,8 @@ class Command:
 
 
 def _study_runs(workspace: Workspace, labels: list[str]) -> "StudyRuns":
-    from mien.commands.stages.evaluating import run_sequences
     from mien.lab.analysis.study.clips import StudyRuns
+    from mien.pipeline.evaluate import run_sequences
 
     folders = {label: workspace.run_dir(label) for label in labels}
     runs = {label: (folder, tuple(run_sequences(workspace, folder))) for label, folder in folders.items()}

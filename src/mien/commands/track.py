@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from mien.disk.workspace import open_workspace
 from mien.tracking.settings import ScoringSettings, TrackingSettings
-from mien.workspace import open_workspace
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Command:
 
     def run(self) -> None:
         """Track, and write overlays and reports."""
-        from mien.commands.stages.tracking import run_tracking_stage
+        from mien.pipeline.track import run_tracking_stage
 
         run_tracking_stage(
             open_workspace(self.workspace),

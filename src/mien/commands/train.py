@@ -6,12 +6,12 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.options import TrainOptions, check_viewer
-from mien.training.footage.benchmark_split import BENCHMARK_SPLIT
-from mien.training.footage.named_split import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
-from mien.training.footage.own_split import OWN_SPLIT
+from mien.commands.parsing.options import TrainOptions, check_viewer
+from mien.disk.workspace import open_workspace
 from mien.training.settings import check_held_out
-from mien.workspace import open_workspace
+from mien.training.splits.benchmark import BENCHMARK_SPLIT
+from mien.training.splits.named import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
+from mien.training.splits.own import OWN_SPLIT
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.commands.stages.names import run_name
+        from mien.pipeline.names import run_name
 
         self.options.check()
         if self.view:
@@ -45,8 +45,8 @@ class Command:
 
     def run(self) -> None:
         """Train the run to its end."""
-        from mien.commands.stages.names import run_name
-        from mien.commands.stages.training import (
+        from mien.pipeline.names import run_name
+        from mien.pipeline.train import (
             fill_in_benchmark_split,
             fill_in_named_split,
             fill_in_own_split,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.options import check_avatar, check_driver, check_neutral, check_port, check_viewer
+from mien.commands.parsing.options import check_avatar, check_driver, check_neutral, check_port, check_viewer
 from mien.errors import UserError
 
 _LOOPBACK = "127.0.0.1"
@@ -48,7 +48,7 @@ class Command:
 
     def run(self) -> None:
         """Load the avatar, and show it until Ctrl-C."""
-        from mien.commands.stages.viewing import Motions, Place, run_viewing_stage
+        from mien.pipeline.view import Motions, Place, run_viewing_stage
 
         motions = Motions(self.play, self.neutral)
         run_viewing_stage(self.avatar, self.run_name, motions, Place(self.host, self.port, self.token), self.follow)

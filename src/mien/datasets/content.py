@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mien.bounded import open_ordinary, parse_json, read_bytes
+from mien.disk.reading import open_ordinary, parse_json, read_bytes
 from mien.errors import UserError
 from mien.inside import is_one_line
 from mien.limits import MAX_NUMBER

@@ -57,7 +57,7 @@ class Footage:
     clean_plates: Mapping[str, Path] | None = None
     """A picture of the empty scene for each camera, by the camera's id."""
     color_corrections: "Callable[[], Mapping[str, numpy.ndarray]] | None" = None
-    """Reads the coefficients [3, n] that correct each camera's colours (`mien.capture.color_correction`), by its id.
+    """Reads the coefficients [3, n] that correct each camera's colours (`mien.media.color_correction`), by its id.
     It raises UserError if they are damaged. None if there are none."""
     stride: int = 1
     """Take every n-th frame."""

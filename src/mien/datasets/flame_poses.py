@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from mien.camera import Camera
 from mien.errors import UserError
-from mien.export.flame_params import face_of_flame_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.formats.shared.flame_params import face_of_flame_params
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 AXES = np.diag([1.0, -1.0, -1.0])

@@ -29,7 +29,7 @@ from mien.datasets.content import (
 )
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
-from mien.terminal import counted
+from mien.machine.terminal import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -222,7 +222,7 @@ def _pictures(layout: _Layout, size: tuple[int, int]) -> "tuple[np.ndarray, np.n
 
 
 def _with_split(sequence: ReadSequence, layout: _Layout) -> ReadSequence:
-    from mien.training.footage.own_split import OwnSplit, ranges_of
+    from mien.training.splits.own import OwnSplit, ranges_of
 
     return replace(sequence, own_split=OwnSplit(ranges_of(list(layout.test)))) if layout.test else sequence
 
@@ -232,7 +232,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     from mien.datasets.metrical_tracker import VERSION, read_tracker_frames
     from mien.datasets.overlay import check_overlay
     from mien.datasets.sequences import tracked_sequence
-    from mien.progress import say
+    from mien.machine.progress import say
 
     layout = _layout(path)
     checkpoints = _checkpoints(layout)

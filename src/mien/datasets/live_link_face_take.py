@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mien.bounded import read_bytes
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, sniff
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
 from mien.datasets.nersemble import frames_in
+from mien.disk.reading import read_bytes
 from mien.errors import UserError
 from mien.inside import listed
 
@@ -67,7 +67,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
             files[DRIVER] = read_bytes(table, _MAX_CSV_BYTES)
         except (OSError, ValueError) as error:
             raise UserError(f"{table}: cannot be read ({' '.join(str(error).split())[:200]}); {REMEDY}") from None
-        from mien.driving.live_link_face import read_live_link_face
+        from mien.driving.sources.live_link_face import read_live_link_face
 
         read_live_link_face(table)  # a damaged one is refused before the video is processed
     yield Footage(path.resolve().name, (video,), files=files)

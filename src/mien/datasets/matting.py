@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.matte import Segmenter, refine_matte
-from mien.capture.plate import plate_matte
-from mien.progress import progress_bar
+from mien.capture.person.matte import Segmenter, refine_matte
+from mien.capture.person.plate import plate_matte
+from mien.machine.progress import progress_bar
 
 
 def fill_mattes(

@@ -78,7 +78,7 @@ def _read_landmarks(path: Path) -> "np.ndarray":
     """The 478 points of a .lms file in pixels; NaN if the file is missing."""
     import numpy as np
 
-    from mien.bounded import read_bytes
+    from mien.disk.reading import read_bytes
 
     try:
         text = read_bytes(path, _MAX_LANDMARK_BYTES).decode("ascii")
@@ -99,7 +99,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.datasets.matting import fill_mattes
     from mien.datasets.pictures import collect, read_picture
     from mien.datasets.sequences import filmed_sequence
-    from mien.training.footage.own_split import OwnSplit
+    from mien.training.splits.own import OwnSplit
 
     file = path / _FILE
     content, frames = _frames(path)

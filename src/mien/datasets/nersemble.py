@@ -107,7 +107,7 @@ def scaled_intrinsics(K: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
 
 def frames_in(videos: Iterable[Path]) -> int | None:
     """Return the number of frames of the first video, or None if it is damaged or there is none."""
-    from mien.capture.video import count_frames
+    from mien.media.video import count_frames
 
     for video in videos:
         try:
@@ -163,7 +163,7 @@ def _corrections(path: Path, serials: tuple[str, ...]) -> "dict[str, np.ndarray]
     Raises:
         UserError: one is missing, or is no matrix of a polynomial that mien knows.
     """
-    from mien.capture.color_correction import color_correction
+    from mien.media.color_correction import color_correction
 
     file = _color_calibration(path)
     content, found = read_object(file), {}

@@ -13,13 +13,13 @@ from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.datasets.nersemble import FRONTAL, frames_in, has_mattes, read_cameras
 from mien.errors import UserError
-from mien.training.footage.benchmark_split import HIDDEN_CAMERAS
+from mien.training.splits.benchmark import HIDDEN_CAMERAS
 
 if TYPE_CHECKING:
     import numpy as np
 
     from mien.face.model import FaceModel
-    from mien.training.footage.own_split import OwnSplit
+    from mien.training.splits.own import OwnSplit
 
 VERSION = "FLAME 2023 (flame2023.pkl)"
 TRACKING = "flame2023_tracking_v2.npz"
@@ -116,8 +116,8 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
 
     import numpy as np
 
-    from mien.capture.video import read_video_frames
     from mien.datasets.pictures import collect
+    from mien.media.video import read_video_frames
 
     videos = _videos(folder, root)
     if not videos:  # a link to itself is no file, and yet a name
@@ -151,7 +151,7 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
 
 def _own_split(folder: Path, timesteps: int) -> "OwnSplit | None":
     """The split of a folder that `mien export` wrote, whose held-out frames are a sequence of their own."""
-    from mien.training.footage.own_split import OwnSplit
+    from mien.training.splits.own import OwnSplit
 
     if folder.name.endswith(TEST_ENDING):
         return OwnSplit(((0, timesteps),))
@@ -159,7 +159,7 @@ def _own_split(folder: Path, timesteps: int) -> "OwnSplit | None":
 
 
 def _count(video: Path) -> int:
-    from mien.capture.video import count_frames
+    from mien.media.video import count_frames
 
     return count_frames(video)
 

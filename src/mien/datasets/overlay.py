@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.capture.faces import LandmarkDetector
+from mien.capture.person.faces import LandmarkDetector
 from mien.datasets.dataset import TrackedSequence
 from mien.datasets.steadiness import measure_steadiness
 from mien.errors import UserError

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.picture import decode_picture
 from mien.datasets.content import REMEDY
 from mien.errors import UserError
-from mien.progress import progress_bar
+from mien.machine.progress import progress_bar
+from mien.media.decoding import decode_picture
 
 Pixels = UInt8[np.ndarray, "h w 3"]
 Matte = UInt8[np.ndarray, "h w"]

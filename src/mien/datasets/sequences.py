@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, UInt8
 
 from mien.camera import Camera
-from mien.capture.backend import choose_detector, detector_entry
 from mien.capture.capture import Capture
-from mien.capture.faces import LANDMARKS, LandmarkDetector
+from mien.capture.person.backend import choose_detector, detector_entry
+from mien.capture.person.faces import LANDMARKS, LandmarkDetector
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import FilmedSequence, TrackedSequence
 from mien.errors import UserError

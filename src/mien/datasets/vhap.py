@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from mien.datasets.dataset import TrackedSequence
     from mien.face.model import FaceModel
-    from mien.training.footage.own_split import OwnSplit
+    from mien.training.splits.own import OwnSplit
 
 _VERSION = "FLAME 2023 (flame2023.pkl) with GaussianAvatars' teeth"
 _WHOLE, _TRAIN = "transforms.json", "transforms_train.json"
@@ -107,7 +107,7 @@ def _group(path: Path, name: str, frames: dict[tuple[int, str], _Frame]) -> _Gro
 
 def _own_split(group: _Group) -> "OwnSplit | None":
     """Whole timesteps and cameras that transforms_train.json does not list."""
-    from mien.training.footage.own_split import OwnSplit, ranges_of
+    from mien.training.splits.own import OwnSplit, ranges_of
 
     trained = {key for key, frame in group.frames.items() if frame.trained}
     by_time = {timestep for timestep, _ in trained}
@@ -261,7 +261,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
 def _better(built: Any, group: _Group) -> "TrackedSequence":
     """The sequence with cy counted from above or from below, whichever fits the pictures better."""
     from mien.datasets.overlay import measure_overlay
-    from mien.progress import say
+    from mien.machine.progress import say
 
     above = built(False)
     frames = [group.frames[group.timesteps[0], camera] for camera in group.cameras]

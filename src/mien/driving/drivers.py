@@ -11,18 +11,18 @@ from torch import Tensor
 
 from mien.avatar.avatar import neutral_of
 from mien.capture.sound_endings import SOUND_ENDINGS
-from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.expression_map import fit_expression_map
-from mien.driving.live_link_face import read_live_link_face
 from mien.driving.rest import facing
-from mien.driving.speech import read_speech
-from mien.driving.timing import at_moments, even_moments, rate_of
+from mien.driving.sources.blendshape_json import read_blendshape_json
+from mien.driving.sources.live_link_face import read_live_link_face
+from mien.driving.sources.speech import read_speech
+from mien.driving.sources.timing import at_moments, even_moments, rate_of
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate, most_frontal_camera
-from mien.progress import say
+from mien.machine.progress import say
 from mien.training.footage.sequence import Sequence, read_sequence
 
 _TRACKED_REST = "the calmest tenth of its frames"
@@ -82,7 +82,7 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
 def read_tracked_driver(folders: Items[Path], face_model: FaceModel | None = None) -> Driver:
     """Read a driver from the folders of tracked sequences of one person, one sequence after the other.
 
-    Frames of a variable rate are resampled by their times (`mien.driving.timing`).
+    Frames of a variable rate are resampled by their times (`mien.driving.sources.timing`).
 
     Args:
         folders: Folders of the sequences.

@@ -9,7 +9,7 @@ from typing import IO
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mien.bounded import NotOrdinaryError, open_ordinary
+from mien.disk.reading import NotOrdinaryError, open_ordinary
 from mien.errors import UserError
 from mien.runtime.named import gaze_of as pitch_and_yaw
 

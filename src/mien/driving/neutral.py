@@ -9,7 +9,7 @@ from mien.driving.rest import rest_of
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.progress import say
+from mien.machine.progress import say
 from mien.rotation import axis_angle_from_matrix
 
 _MOST_NAMED = 4

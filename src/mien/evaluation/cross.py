@@ -15,7 +15,6 @@ from mien.avatar.files import load_avatar
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.capture.store import read_capture, read_capture_hash
-from mien.capture.video import write_video
 from mien.driving.rest import rest_before
 from mien.driving.transfer import drive
 from mien.errors import UserError
@@ -23,8 +22,9 @@ from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion,
 from mien.evaluation.videos import labeled_row, match_sizes
 from mien.face.checks import check_face_params
 from mien.face.params import FaceParams, most_frontal_camera
-from mien.pictures import to_uint8
-from mien.progress import track_progress
+from mien.machine.progress import track_progress
+from mien.media.pictures import to_uint8
+from mien.media.video import write_video
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.files import check_tracking_of, read_tracking

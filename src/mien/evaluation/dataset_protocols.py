@@ -8,11 +8,11 @@ from mien.errors import UserError
 from mien.evaluation.metrics import Border
 from mien.evaluation.scoring import ScoreSettings, lpips_metric
 from mien.tracking.scoring import Scoring
-from mien.training.footage.benchmark_split import BENCHMARK_SPLIT, TEST_CAMERAS
 from mien.training.footage.frames import Frame
-from mien.training.footage.named_split import NAMED_SPLIT
-from mien.training.footage.own_split import OWN_SPLIT, imported_from
 from mien.training.footage.sequence import Sequence
+from mien.training.splits.benchmark import BENCHMARK_SPLIT, TEST_CAMERAS
+from mien.training.splits.named import NAMED_SPLIT
+from mien.training.splits.own import OWN_SPLIT, imported_from
 
 _ALEX, _VGG = "lpips-alex", "lpips-vgg"
 

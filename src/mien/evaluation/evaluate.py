@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
 from mien.evaluation.dataset_protocols import check_lpips, dataset_protocol
@@ -14,15 +15,14 @@ from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, living, write_film
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
-from mien.evaluation.page import ReportVideo
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.report import RunRecord, write_report
-from mien.evaluation.report_sections import cross_section
+from mien.evaluation.report.page import ReportVideo
+from mien.evaluation.report.report_sections import cross_section
+from mien.evaluation.report.writing import RunRecord, write_report
 from mien.evaluation.scoring import worker_threads
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
-from mien.locks import hold
 from mien.perceptual.lpips import load_lpips
 from mien.ranges import check_ranges
 from mien.storage import file_digest, write_json

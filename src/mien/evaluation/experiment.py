@@ -14,7 +14,7 @@ from mien.camera import Camera
 from mien.face.params import FaceParams
 from mien.face.parts import part_boxes
 from mien.gaussians import Gaussians
-from mien.pictures import Box
+from mien.media.pictures import Box
 from mien.render import rasterize
 from mien.render.closing import close_holes
 from mien.render.rendering import Rendering

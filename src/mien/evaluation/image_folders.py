@@ -23,9 +23,9 @@ from mien.evaluation.scoring import (
     score_pictures,
     worker_threads,
 )
-from mien.parallel import stream_in_threads
-from mien.pictures import Box
-from mien.progress import progress_bar, say
+from mien.machine.parallel import stream_in_threads
+from mien.machine.progress import progress_bar, say
+from mien.media.pictures import Box
 from mien.storage import read_json, write_json
 from mien.tracking.scoring import head_crop
 from mien.training.footage.frames import evenly_spread

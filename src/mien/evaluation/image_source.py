@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.picture import decode_picture
-from mien.capture.video import read_video_frames
 from mien.errors import UserError
 from mien.inside import listed
-from mien.progress import say
+from mien.machine.progress import say
+from mien.media.decoding import decode_picture
+from mien.media.video import read_video_frames
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 

@@ -11,9 +11,9 @@ from mien import runtime
 from mien.avatar.avatar import Avatar
 from mien.avatar.baking import make_portable
 from mien.camera import Camera
-from mien.capture.video import write_video
 from mien.errors import UserError
-from mien.progress import track_progress
+from mien.machine.progress import track_progress
+from mien.media.video import write_video
 from mien.runtime.camera_paths import fitted, zoom_for_all
 from mien.runtime.filmed import head_angles
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle

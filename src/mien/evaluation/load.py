@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from mien.avatar.files import load_avatar
 from mien.capture.store import read_capture_hash
-from mien.config import decode
+from mien.disk.config import decode
 from mien.errors import UserError
 from mien.evaluation.dataset_protocols import counted_frames, dataset_protocol, scores_whole_mattes
 from mien.evaluation.experiment import Edges, Experiment, FaceSource

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from mien.pictures import Box
+from mien.media.pictures import Box
 from mien.training.photometric import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
 
 Border = Literal["zeros", "inside"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mien.bounded import parse_json, read_bytes
+from mien.disk.reading import parse_json, read_bytes
 from mien.evaluation.scoring import Scores
 from mien.inside import open_to_append
 from mien.limits import checked_whole

@@ -42,9 +42,9 @@ from mien.evaluation.scoring import (
     worker_threads,
 )
 from mien.evaluation.trained_frames import look_at_trained
-from mien.parallel import stream_in_threads
+from mien.machine.parallel import stream_in_threads
+from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips
-from mien.progress import progress_bar
 from mien.ranges import Range
 from mien.training.footage.frames import Frame, spread_frames
 

@@ -11,7 +11,7 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.faces import MeshReader
+from mien.capture.person.faces import MeshReader
 from mien.rotation import align_centered
 from mien.tracking.landmarks.groups import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 

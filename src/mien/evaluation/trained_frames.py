@@ -10,7 +10,7 @@ from torch import Tensor
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit
-from mien.parallel import stream_in_threads
+from mien.machine.parallel import stream_in_threads
 from mien.training.footage.frames import Frame, spread_frames
 
 

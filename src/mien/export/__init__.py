@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.export.flame_params import face_of_flame_params, flame_params_of
     from mien.export.gaussian_avatars_folder import (
         GaussianAvatarsFolder,
         read_gaussian_avatars_folder,
@@ -13,18 +12,19 @@ if TYPE_CHECKING:
     )
     from mien.export.glb import MeshModel, WrittenGlb, write_glb
     from mien.export.glb_avatar import read_glb_avatar
-    from mien.export.glb_file import Glb, read_glb
-    from mien.export.packed import Motion, pack, unpacked
     from mien.export.page_head import Described
-    from mien.export.pixels import png_bytes, to_rgb
     from mien.export.ply import read_ply, write_ply
     from mien.export.sog import read_sog, write_sog
     from mien.export.spz import read_spz, write_spz
     from mien.export.usd import read_usd, write_usd
     from mien.export.vrm import write_vrm
     from mien.export.web_page import WrittenPage, write_packed, write_page
-    from mien.export.webcam import WebcamFiles, find_webcam_files
-    from mien.export.world_space import in_world
+    from mien.formats.shared.flame_params import face_of_flame_params, flame_params_of
+    from mien.formats.shared.glb_file import Glb, read_glb
+    from mien.formats.shared.packed import Motion, pack, unpacked
+    from mien.formats.shared.webcam import WebcamFiles, find_webcam_files
+    from mien.formats.shared.world_space import in_world
+    from mien.media.pixels import png_bytes, to_rgb
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 

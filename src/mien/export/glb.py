@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Float, Float32, Int
 
 from mien import runtime
+from mien.disk.files import check_writable
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
 from mien.export.glb_avatar import EXTENSION, avatar_extension
-from mien.export.glb_file import INDICES, VERTICES, GlbWriter
-from mien.export.splats import unit_quats
-from mien.export.texture import FRONT_VIEWS, Shot, Surface, bake_texture
-from mien.files import check_writable
-from mien.picture_files import encode_picture
+from mien.formats.shared.glb_file import INDICES, VERTICES, GlbWriter
+from mien.formats.shared.splats import unit_quats
+from mien.formats.shared.texture import FRONT_VIEWS, Shot, Surface, bake_texture
+from mien.media.picture_files import encode_picture
 from mien.runtime.baked import MeshBound, PortableAvatar, Rig
 from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
 from mien.runtime.posing import SH_C0, Face, Gaussians, rig_points

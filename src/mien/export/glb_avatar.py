@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mien.errors import UserError
-from mien.export.glb_file import Glb, GlbWriter, read_glb
+from mien.formats.shared.glb_file import Glb, GlbWriter, read_glb
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.file import from_arrays, to_arrays
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from mien import runtime
+from mien.disk.files import write_atomically
 from mien.errors import UserError
-from mien.export.pixels import png_bytes
-from mien.files import write_atomically
+from mien.media.pixels import png_bytes
 
 _ICON = 64
 """Side of the icon in pixels."""
@@ -78,7 +78,7 @@ def write_poster(path: Path, avatar: runtime.Avatar) -> None:
     """
     import cv2
 
-    from mien.picture_files import encode_picture
+    from mien.media.picture_files import encode_picture
 
     wide, high = POSTER
     x, y = np.meshgrid(np.linspace(-1, 1, wide) * wide / high, np.linspace(-0.84, 1.16, high))

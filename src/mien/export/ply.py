@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from mien.bounded import open_ordinary
+from mien.disk.reading import open_ordinary
 from mien.errors import UserError
 from mien.gaussians import Gaussians
 from mien.limits import rigid_fault

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
 
-from mien.bounded import open_archive, open_member, open_ordinary, parse_json
-from mien.capture.picture import announced_size
+from mien.disk.files import write_atomically
+from mien.disk.reading import open_archive, open_member, open_ordinary, parse_json
 from mien.errors import UserError
-from mien.export.splats import finite_arrays, unit_quats
-from mien.files import write_atomically
+from mien.formats.shared.splats import finite_arrays, unit_quats
 from mien.gaussians import Gaussians
 from mien.limits import checked_whole
+from mien.media.decoding import announced_size
 
 _VERSION = 2
 _CODES, _ROUNDS = 256, 20

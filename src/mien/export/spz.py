@@ -15,10 +15,10 @@ import numpy as np
 import torch
 import zstandard
 
-from mien.bounded import read_bytes
+from mien.disk.files import write_atomically
+from mien.disk.reading import read_bytes
 from mien.errors import UserError
-from mien.export.splats import finite_arrays, unit_quats
-from mien.files import write_atomically
+from mien.formats.shared.splats import finite_arrays, unit_quats
 from mien.gaussians import Gaussians
 
 VERSIONS = (3, 4)

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien.bounded import open_ordinary
+from mien.disk.files import write_atomically
+from mien.disk.reading import open_ordinary
 from mien.errors import UserError
-from mien.export.splats import finite_arrays, unit_quats
 from mien.export.usd_package import USD_ENDINGS, check_usd
-from mien.files import write_atomically
+from mien.formats.shared.splats import finite_arrays, unit_quats
 from mien.gaussians import Gaussians
 
 _ROOT, _SPLATS = "/avatar", "/avatar/gaussians"

@@ -13,7 +13,7 @@ import numpy as np
 
 from mien import runtime
 from mien.export.glb import TEXTURE_SIZE, Head, MeshModel, WrittenGlb, head_of
-from mien.picture_files import encode_picture
+from mien.media.picture_files import encode_picture
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.named import GAZE_NAMES, LOOK_ANGLE, presets, visemes, within_lids
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from mien import runtime
-from mien.export.packed import Motion, pack, unpacked
+from mien.disk.files import check_writable, write_atomically
 from mien.export.page_head import Described, head_part, write_poster
-from mien.export.thinning import fitted
-from mien.export.webcam import POLICY, WebcamFiles, webcam_part
-from mien.files import check_writable, write_atomically
+from mien.formats.shared.packed import Motion, pack, unpacked
+from mien.formats.shared.thinning import fitted
+from mien.formats.shared.webcam import POLICY, WebcamFiles, webcam_part
 from mien.runtime import camera_paths
 from mien.runtime.baked import PortableAvatar
 

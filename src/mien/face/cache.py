@@ -6,10 +6,10 @@ import tempfile
 from functools import lru_cache
 from pathlib import Path
 
+from mien.disk.files import check_writable
 from mien.errors import UserError
-from mien.files import check_writable
 from mien.inside import remove_tree
-from mien.progress import say
+from mien.machine.progress import say
 
 
 def cache_folder() -> Path:

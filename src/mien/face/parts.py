@@ -9,7 +9,7 @@ from mien.face.constants import FACE
 from mien.face.model import FaceModel
 
 Box = tuple[int, int, int, int]
-"""Left, top, width and height in pixels: `mien.pictures.Box`, without its import of OpenCV."""
+"""Left, top, width and height in pixels: `mien.media.pictures.Box`, without its import of OpenCV."""
 PARTS = ("eyes", "mouth")
 """Names of the parts. The eyes are one part."""
 _REGIONS = {"eyes": ("eyelids", "eyes", "irises"), "mouth": ("lips",)}

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
-from mien.bounded import read_bytes
+from mien.disk.reading import read_bytes
 from mien.errors import UserError
 from mien.storage import file_digest
 

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.bounded import parse_json, read_bytes
 from mien.camera import Camera
+from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
 from mien.limits import camera_fault
 from mien.rotation import invert_rigid, matrix_from_axis_angle, rigid_transform

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from mien import _native
+from mien.machine.threads import asked_threads
 from mien.runtime.baked import Camera, PortableAvatar
 from mien.runtime.file import read_portable
 from mien.runtime.named import Part, is_gaze, parts_of, presets_for, turned_eyes
 from mien.runtime.posing import Face, Gaussians, pose
 from mien.runtime.rotation import compose_rigid
-from mien.threads import asked_threads
 
 Vector = Sequence[float | int] | np.ndarray
 """Three numbers."""

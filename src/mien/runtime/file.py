@@ -15,10 +15,10 @@ import numpy as np
 import safetensors
 from jaxtyping import jaxtyped
 
-from mien.bounded import parse_json
-from mien.config import decode
+from mien.disk.config import decode
+from mien.disk.files import check_writable, expect_whole, read_safetensors, write_arrays
+from mien.disk.reading import parse_json
 from mien.errors import UserError
-from mien.files import check_writable, expect_whole, read_safetensors, write_arrays
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.checks import check
 

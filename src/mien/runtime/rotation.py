@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from mien import exact
+from mien.machine import exact
 
 _SMALL_ANGLE_SQUARED = 1e-8
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import torch
 
-from mien.capture.backend import detector_of
 from mien.capture.capture import Capture
+from mien.capture.person.backend import detector_of
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.inside import remove_tree
-from mien.progress import say
+from mien.machine.progress import say
 from mien.tracking.descent.schedule import fit_by_descent
 from mien.tracking.fitting.fit import Fit, Watch, ignore_progress
 from mien.tracking.fitting.parameters import layout_of

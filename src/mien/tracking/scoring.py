@@ -14,8 +14,8 @@ from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.picture_files import PictureStack
-from mien.progress import track_progress
+from mien.machine.progress import track_progress
+from mien.media.picture_files import PictureStack
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.constants import TRACKING
 from mien.tracking.neck_cut import NeckCut, NeckParts, above_neck_cut, fit_neck_cut

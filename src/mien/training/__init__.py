@@ -7,25 +7,8 @@ from mien.lazy import lazy_names
 if TYPE_CHECKING:
     from mien.training.alignment import align
     from mien.training.alignment_settings import AlignmentSettings
-    from mien.training.footage.benchmark_split import (
-        BENCHMARK_SPLIT,
-        HIDDEN_CAMERAS,
-        TEST_CAMERAS,
-        TEST_SEQUENCES,
-        TRAINING_CAMERA,
-        with_benchmark_split,
-    )
     from mien.training.footage.filmed import confidence_picture, filmed_words, read_coverage
     from mien.training.footage.frames import held_out
-    from mien.training.footage.named_split import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
-    from mien.training.footage.own_split import (
-        OWN_SPLIT,
-        OwnSplit,
-        ranges_of,
-        read_own_split,
-        with_own_split,
-        write_own_split,
-    )
     from mien.training.footage.sequence import Sequence, read_sequence
     from mien.training.frame_gains import GAINS, lit, read_gains
     from mien.training.run import (
@@ -50,6 +33,16 @@ if TYPE_CHECKING:
         check_held_out,
         doubly_held_out,
     )
+    from mien.training.splits.benchmark import (
+        BENCHMARK_SPLIT,
+        HIDDEN_CAMERAS,
+        TEST_CAMERAS,
+        TEST_SEQUENCES,
+        TRAINING_CAMERA,
+        with_benchmark_split,
+    )
+    from mien.training.splits.named import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
+    from mien.training.splits.own import OWN_SPLIT, OwnSplit, ranges_of, read_own_split, with_own_split, write_own_split
     from mien.training.trainer import train
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from mien.bounded import MAX_SIDE
+from mien.disk.reading import MAX_SIDE
 from mien.ranges import COUNT, POSITIVE, Range, check_ranges
 
 

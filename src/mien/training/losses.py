@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 from mien.arrays import is_native, native, recycled, unpacked
 from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.media.pictures import Box
 from mien.perceptual.features import TrainingFeatures, load_training_features
-from mien.pictures import Box
 from mien.render.rendering import Rendering
 from mien.training.footage.sequence import Target
 from mien.training.photometric import photometric_loss

@@ -11,7 +11,7 @@ from torch.nn.functional import conv2d
 
 from mien import _native
 from mien.arrays import is_native, recycled, unpacked
-from mien.pictures import Box
+from mien.media.pictures import Box
 
 WINDOW_RADIUS = 5
 """Radius of the SSIM window in pixels: it is 11x11."""

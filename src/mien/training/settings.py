@@ -6,17 +6,17 @@ from typing import Annotated, Any, Literal
 
 from mien.avatar.methods import method_named
 from mien.avatar.settings import Differences, MethodConfig
-from mien.bounded import MAX_SIDE
-from mien.config import overlay
-from mien.devices import DeviceName
+from mien.disk.config import overlay
+from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
+from mien.machine.devices import DeviceName
 from mien.ranges import FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars", "nersemble-benchmark", "dataset"]
 """Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
-camera instead (`mien.training.footage.named_split`), and so does nersemble-benchmark
-(`mien.training.footage.benchmark_split`). dataset holds out what the authors of an imported dataset held out
-(`mien.training.footage.own_split`)."""
+camera instead (`mien.training.splits.named`), and so does nersemble-benchmark
+(`mien.training.splits.benchmark`). dataset holds out what the authors of an imported dataset held out
+(`mien.training.splits.own`)."""
 
 
 @dataclass(frozen=True)

@@ -19,18 +19,18 @@ from mien.avatar.filmed import measure_filmed
 from mien.avatar.methods import method_named, method_of
 from mien.avatar.schedules import Progress
 from mien.avatar.settings import FaceTuning, MethodConfig
-from mien.devices import choose_device, like_on
+from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate
-from mien.locks import hold
+from mien.machine.devices import choose_device, like_on
+from mien.machine.progress import Advance, progress_bar
+from mien.machine.stops import stops_put_off
+from mien.machine.threads import one_torch_thread
 from mien.perceptual.features import load_training_features
-from mien.progress import Advance, progress_bar
 from mien.render.rendering import Rendering
 from mien.render.validation import CannotDrawError
-from mien.stops import stops_put_off
-from mien.threads import one_torch_thread
 from mien.training.adam import Adam
 from mien.training.ahead import targets_ahead
 from mien.training.batch import (

@@ -15,7 +15,7 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qsl, urlsplit
 
 from mien.errors import UserError
-from mien.terminal import printable
+from mien.machine.terminal import printable
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 HEADERS: Mapping[str, str] = {

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 
 from mien import runtime
-from mien.export.pixels import to_rgb
+from mien.media.pixels import to_rgb
 from mien.runtime.filmed import head_angles
 from mien.runtime.posing import rig_points
 

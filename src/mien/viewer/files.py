@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.export.output import Output
-from mien.export.pixels import png_bytes
+from mien.media.output import Output
+from mien.media.pixels import png_bytes
 from mien.runtime.rotation import matrix_from_axis_angle
 from mien.viewer.drawing import MAX_SIDE, View
 from mien.viewer.session import Session
@@ -52,7 +52,7 @@ def video(
     Raises:
         Stopped: `go_on` returned False.
     """
-    from mien.export.pictures import write_pictures
+    from mien.media.writing import write_pictures
 
     clip = session.clip
 

@@ -12,9 +12,9 @@ from mien.viewer.meters import Meters
 from mien.viewer.session import Seen, Session
 
 if TYPE_CHECKING:
-    import mien.capture.faces
-    import mien.capture.live_camera
+    import mien.capture.person.faces
     import mien.driving.live
+    import mien.media.live_camera
 
 STAGES = ("camera", "tracking", "drawing")
 _PATIENCE_SECONDS = 0.04
@@ -33,7 +33,7 @@ class CameraSwitch:
     def __init__(
         self,
         session: Session,
-        open_camera: Callable[[], "mien.capture.live_camera.LiveCamera"],
+        open_camera: Callable[[], "mien.media.live_camera.LiveCamera"],
         make: Callable[[], "mien.driving.live.Follower"],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -49,7 +49,7 @@ class CameraSwitch:
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._camera: mien.capture.live_camera.LiveCamera | None = None
+        self._camera: mien.media.live_camera.LiveCamera | None = None
         self._follower: mien.driving.live.Follower | None = None
         self.meters = Meters(STAGES)
         self.watch: Callable[[Seen], None] | None = None
@@ -115,8 +115,8 @@ class CameraSwitch:
             return ["The camera is away. mien waits for it."]
         return [_WORDS[follower.state], *self.meters.words(self._clock())]
 
-    def _run(self, camera: "mien.capture.live_camera.LiveCamera", follower: "mien.driving.live.Follower") -> None:
-        from mien.capture.faces import LandmarkDetector
+    def _run(self, camera: "mien.media.live_camera.LiveCamera", follower: "mien.driving.live.Follower") -> None:
+        from mien.capture.person.faces import LandmarkDetector
 
         try:
             with LandmarkDetector(several_faces=False) as detector:
@@ -129,9 +129,9 @@ class CameraSwitch:
 
     def _follow(
         self,
-        camera: "mien.capture.live_camera.LiveCamera",
+        camera: "mien.media.live_camera.LiveCamera",
         follower: "mien.driving.live.Follower",
-        detector: "mien.capture.faces.LandmarkDetector",
+        detector: "mien.capture.person.faces.LandmarkDetector",
     ) -> None:
         number, frames, last = -1, 0, None
         while not self._stopping.is_set():
@@ -154,7 +154,7 @@ class CameraSwitch:
         self,
         follower: "mien.driving.live.Follower",
         landmarks: Float[np.ndarray, "l 2"] | None,
-        frame: "mien.capture.live_camera.LiveFrame",
+        frame: "mien.media.live_camera.LiveFrame",
         seconds: float,
     ) -> None:
         height, width = frame.picture.shape[:2]

@@ -10,7 +10,7 @@ import viser
 
 from mien import runtime
 from mien.errors import UserError
-from mien.terminal import printable
+from mien.machine.terminal import printable
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
 from mien.viewer.faces import grouped, matches, readable
 from mien.viewer.files import Stopped, screenshot, video

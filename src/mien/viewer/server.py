@@ -24,7 +24,7 @@ from websockets.http11 import Request, Response
 
 from mien.errors import UserError
 from mien.extras import missing_package
-from mien.terminal import tell
+from mien.machine.terminal import tell
 from mien.viewer.access import HEADERS, Door
 from mien.viewer.drawing import View
 from mien.viewer.following import CameraSwitch

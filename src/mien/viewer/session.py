@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 
 from mien import runtime
 from mien.errors import UserError
-from mien.export.packed import Motion
+from mien.formats.shared.packed import Motion
 from mien.runtime.filmed import within_filmed_inputs
 from mien.runtime.posing import Face
 from mien.viewer.drawing import (

@@ -12,7 +12,7 @@ from mien.avatar.settings import (
     PerceptualLoss,
     Photometric,
 )
-from mien.config import overlay
+from mien.disk.config import overlay
 from mien.ranges import FRACTION, NOT_NEGATIVE, NotBelow, Range
 
 

@@ -14,9 +14,9 @@ from typing import Any
 
 from mien.batch.engines import EngineOptions, Work
 from mien.batch.plan import Batch, Row
+from mien.disk.files import write_atomically
 from mien.errors import UserError
-from mien.files import write_atomically
-from mien.progress import say
+from mien.machine.progress import say
 
 _MOST_TASKS = 1000
 """Largest number of tasks of an array. Slurm's default limit is 1001."""

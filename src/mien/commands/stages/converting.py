@@ -7,7 +7,7 @@ from mien import runtime
 from mien.errors import UserError
 from mien.formats.format import Format, Options
 from mien.formats.registry import format_of
-from mien.progress import say
+from mien.machine.progress import say
 from mien.runtime.baked import PortableAvatar
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class FileContent:
         """Return the Gaussians at rest. This needs torch."""
         import torch
 
-        from mien.export.world_space import in_world
+        from mien.formats.shared.world_space import in_world
         from mien.gaussians import Gaussians
 
         posed = self._posed()

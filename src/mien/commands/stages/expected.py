@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mien.capture.settings import CaptureSettings
-from mien.capture.video import probe_video
 from mien.errors import UserError
 from mien.inside import listed
+from mien.media.video import probe_video
 from mien.overall import Piece
 from mien.tracking.settings import TrackingSettings
 from mien.training.alignment_settings import AlignmentSettings

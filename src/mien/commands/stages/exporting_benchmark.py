@@ -12,7 +12,6 @@ from mien.avatar.avatar import Avatar
 from mien.avatar.files import load_avatar
 from mien.camera import Camera
 from mien.capture.store import read_capture
-from mien.capture.video import write_video
 from mien.datasets.submission import (
     MONO_PEOPLE,
     VIEW_PEOPLE,
@@ -22,19 +21,20 @@ from mien.datasets.submission import (
     shortcomings,
     view_task,
 )
+from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.params import FaceParams
 from mien.inside import remove_tree
-from mien.pictures import to_uint8
-from mien.progress import say, track_progress
+from mien.machine.progress import say, track_progress
+from mien.machine.terminal import counted
+from mien.media.pictures import to_uint8
+from mien.media.video import write_video
 from mien.render import rasterize
 from mien.render.closing import close_holes
 from mien.render.validation import drawable
 from mien.storage import replace_folder
-from mien.terminal import counted
 from mien.tracking.files import read_tracking
 from mien.training.run import check_data, read_face_track, read_run_config
-from mien.workspace import Workspace
 
 _CRF = 14
 """Quality of the videos, as the benchmark asks for."""

@@ -1,7 +1,7 @@
 """Lines that tell people what a dataset holds."""
 
 from mien.datasets.dataset import Clip, Findings
-from mien.terminal import counted
+from mien.machine.terminal import counted
 
 _MAX_CLIPS = 12
 """Most sequences that are listed one by one."""

@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from mien.camera import Camera
-from mien.capture.color_correction import NAME as COLOR_CORRECTION
 from mien.capture.from_cameras import capture_cameras
 from mien.capture.from_video import capture_video
 from mien.capture.settings import CaptureSettings
 from mien.datasets.dataset import Dataset, Footage
 from mien.errors import UserError
 from mien.inside import inside, remove_tree
+from mien.media.color_correction import NAME as COLOR_CORRECTION
 from mien.storage import write_atomically
-from mien.training.footage.own_split import write_own_split
+from mien.training.splits.own import write_own_split
 
 
 def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path) -> None:

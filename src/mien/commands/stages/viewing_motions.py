@@ -10,20 +10,21 @@ import torch
 from mien import runtime
 from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import load_avatar
-from mien.capture.camera_names import CameraName, camera_named
-from mien.capture.live_camera import LiveCamera
-from mien.commands.stages.driving import open_driver
-from mien.commands.stages.viewing import Viewed, mesh_of
+from mien.disk.workspace import open_workspace
 from mien.driving.keeping import keep_to_filmed
 from mien.driving.live.follower import Follower, FollowOptions
 from mien.driving.rest import facing, rest_of
 from mien.driving.transfer import drive
 from mien.errors import UserError
-from mien.export.packed import Motion
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.progress import say
+from mien.formats.shared.packed import Motion
+from mien.machine.progress import say
+from mien.media.camera_names import CameraName, camera_named
+from mien.media.live_camera import LiveCamera
+from mien.pipeline.drive import open_driver
+from mien.pipeline.view import Viewed, mesh_of
 from mien.runtime.baked import PortableAvatar
 from mien.training.footage.filmed import read_coverage
 from mien.training.run import filmed_range, run_camera
@@ -31,7 +32,6 @@ from mien.training.whole_head.soft_cut import with_soft_cut
 from mien.viewer.drawing import Mesh
 from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Clip, Session
-from mien.workspace import open_workspace
 
 
 def of_workspace(root: Path, run: str | None) -> Viewed:

@@ -10,9 +10,9 @@ from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, pad
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
 from mien.errors import UserError
-from mien.export.flame_params import flame_params_of
-from mien.picture_files import write_png
-from mien.progress import track_progress
+from mien.formats.shared.flame_params import flame_params_of
+from mien.machine.progress import track_progress
+from mien.media.picture_files import write_png
 
 _SHAPES, _EXPRESSIONS = 100, 50
 _SCALE = 4.0

@@ -19,10 +19,10 @@ from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, pad
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.tracker_frame import write_tracker_frame
 from mien.datasets.layouts.writing import write_plain_json
-from mien.export.flame_params import flame_params_of
 from mien.face.params import FaceParams
-from mien.picture_files import write_png
-from mien.progress import track_progress
+from mien.formats.shared.flame_params import flame_params_of
+from mien.machine.progress import track_progress
+from mien.media.picture_files import write_png
 from mien.render.mesh import rasterize_mesh
 
 _EXPRESSIONS, _SHAPES = 100, 300

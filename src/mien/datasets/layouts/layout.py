@@ -55,7 +55,7 @@ def check_new_folder(folder: Path) -> None:
     Raises:
         UserError: something is there, or it cannot be written.
     """
-    from mien.files import check_writable
+    from mien.disk.files import check_writable
 
     check_writable(folder, folder=True)
     if folder.exists() and any(folder.iterdir()):

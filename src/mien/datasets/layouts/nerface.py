@@ -9,8 +9,8 @@ import numpy as np
 from mien.datasets.layouts.filmed import Filmed, lost_words, padded
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
-from mien.picture_files import write_png
-from mien.progress import track_progress
+from mien.machine.progress import track_progress
+from mien.media.picture_files import write_png
 
 _MEAN_DISTANCE = 0.5
 """Mean distance of the camera from the head in its world; near and far planes are at 0.2 and 0.8."""

@@ -14,14 +14,14 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.video_file import create_video
 from mien.datasets.flame_poses import face_of_flame
 from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, padded
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
 from mien.datasets.nersemble_benchmark import TEST_ENDING, TRACKING
-from mien.export.flame_params import flame_params_of
-from mien.progress import say
+from mien.formats.shared.flame_params import flame_params_of
+from mien.machine.progress import say
+from mien.media.video_file import create_video
 
 _SHAPES, _EXPRESSIONS = 300, 100
 _POSES = ("neck_pose", "jaw_pose", "eyes_pose")

@@ -8,13 +8,13 @@ import numpy as np
 
 from mien.datasets.layouts.filmed import Filmed
 from mien.datasets.layouts.layout import Layout, Written, check_new_folder
+from mien.disk.files import cannot_write, replace_folder
 from mien.errors import UserError
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
-from mien.files import cannot_write, replace_folder
 from mien.inside import remove_tree
-from mien.picture_files import write_png
-from mien.pictures import Box
-from mien.terminal import counted
+from mien.machine.terminal import counted
+from mien.media.picture_files import write_png
+from mien.media.pictures import Box
 from mien.tracking.scoring import head_crop
 
 README = "README.txt"

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien.capture.backend import choose_detector
+from mien.capture.person.backend import choose_detector
 from mien.driving.constants import DRIVING
 from mien.driving.rest import kept_share
 from mien.face.model import FaceModel

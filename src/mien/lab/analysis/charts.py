@@ -1,8 +1,8 @@
-"""Charts as png files, in the colours of the pages (`mien.plots` draws the same charts as SVG)."""
+"""Charts as png files, in the colours of the pages (`mien.pages.plots` draws the same charts as SVG)."""
 
 from pathlib import Path
 
-from mien.files import write_atomically
+from mien.disk.files import write_atomically
 from mien.lab.analysis.result import Chart
 
 _COLORS = {"main": "#2563c9", "second": "#c2571a", "quiet": "#8c8b84"}

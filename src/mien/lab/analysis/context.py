@@ -17,15 +17,15 @@ from mien.avatar.avatar import Avatar
 from mien.avatar.files import load_avatar
 from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
-from mien.config import decode, encode
+from mien.disk.config import decode, encode
+from mien.disk.files import read_json, write_json
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import psnr
 from mien.face.model import FaceModel
-from mien.files import read_json, write_json
 from mien.lab.analysis.spec import AnalysisOptions
-from mien.progress import say
+from mien.machine.progress import say
 from mien.training.footage.sequence import Sequence as TrainedSequence
 from mien.training.footage.sequence import read_sequence
 from mien.training.run import check_data, read_curves, read_run_config, read_training_summary, run_camera

@@ -9,9 +9,9 @@ from mien import _native
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.face.params import FaceParams
+from mien.machine.system import peak_memory_mb
+from mien.machine.threads import one_torch_thread
 from mien.render import rasterize
-from mien.system import peak_memory_mb
-from mien.threads import one_torch_thread
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 

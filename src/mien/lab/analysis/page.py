@@ -7,14 +7,14 @@ from typing import Any
 
 from markupsafe import Markup
 
-from mien.bounded import read_bytes
-from mien.evaluation.page import Card, Cell, DataTable, Picture, video_of
+from mien.disk.reading import read_bytes
+from mien.evaluation.report.page import Card, Cell, DataTable, Picture, video_of
 from mien.inside import inside
 from mien.lab.analysis.result import chart_from
 from mien.lab.analysis.spec import Analysis
-from mien.pages import render
-from mien.pictures import data_uri
-from mien.plots import line_chart
+from mien.media.pictures import data_uri
+from mien.pages.pages import render
+from mien.pages.plots import line_chart
 from mien.storage import write_atomically
 
 _MAX_PICTURE_BYTES = 64 << 20

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.plots import Axes, Series, thin
+from mien.pages.plots import Axes, Series, thin
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 import mien
 from mien import _native
+from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.inside import check_tree, inside
 from mien.lab.analysis.charts import write_chart
@@ -15,9 +16,8 @@ from mien.lab.analysis.context import Context, digest_of
 from mien.lab.analysis.page import section_html, write_page
 from mien.lab.analysis.result import PartResult, file_names
 from mien.lab.analysis.spec import Analysis, AnalysisOptions, Part
-from mien.locks import hold
-from mien.picture_files import write_png
-from mien.progress import say
+from mien.machine.progress import say
+from mien.media.picture_files import write_png
 from mien.storage import expect_whole, file_digest, read_json, write_json
 from mien.training.run import read_run_config, read_training_summary
 

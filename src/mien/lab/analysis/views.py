@@ -12,7 +12,7 @@ from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.pictures import WHITE, Box, to_uint8
+from mien.media.pictures import WHITE, Box, to_uint8
 from mien.render import rasterize
 from mien.render.mesh import Headlight, render_mesh
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from mien.disk.files import check_writable
 from mien.errors import UserError
-from mien.files import check_writable
 
 KINDS = (".png", ".svg", ".pdf")
 

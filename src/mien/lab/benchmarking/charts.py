@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from mien.files import write_atomically
+from mien.disk.files import write_atomically
 from mien.lab.benchmarking.timing import BenchmarkRow, Machine, format_machine
 
 

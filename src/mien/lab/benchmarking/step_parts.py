@@ -25,7 +25,7 @@ from mien.lab.benchmarking.train_step import (
     paint_targets,
     training_case,
 )
-from mien.terminal import counted
+from mien.machine.terminal import counted
 from mien.training import trainer
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from mien import _native
-from mien.system import load_average
-from mien.threads import one_torch_thread
+from mien.machine.system import load_average
+from mien.machine.threads import one_torch_thread
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,15 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
+from mien.disk.files import write_atomically
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.scoring import Scores, ScoreSettings, as_8_bit, mean_scores, perceptual_metric, score_pictures
-from mien.files import write_atomically
 from mien.lab.synthetic.recipe import SIDES
 from mien.lab.synthetic.truth import Truth
-from mien.parallel import stream_in_threads
-from mien.pictures import Box
-from mien.progress import track_progress
+from mien.machine.parallel import stream_in_threads
+from mien.machine.progress import track_progress
+from mien.media.pictures import Box
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
 from mien.tracking.neck_cut import NeckParts

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from mien import exact
 from mien.face.model import FaceModel
 from mien.lab.synthetic.posing import landmark_positions, rest_vertices
+from mien.machine import exact
 
 # MediaPipe's landmark indices. "right" is the subject's right.
 LIPS_OUTER = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)

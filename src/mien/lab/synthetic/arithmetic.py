@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from mien.exact import dot
+from mien.machine.exact import dot
 
 _PERIOD = 32  # lattice cells after which the noise repeats; a power of two
 

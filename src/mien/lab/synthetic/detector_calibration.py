@@ -19,14 +19,14 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.capture.backend import Detector
-from mien.capture.faces import LandmarkDetector
+from mien.capture.person.backend import Detector
+from mien.capture.person.faces import LandmarkDetector
 from mien.errors import UserError
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
-from mien.progress import say, track_progress
+from mien.machine.progress import say, track_progress
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.landmarks.detector_response import DetectorResponse, read_response, response_path, write_response
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mien import exact
 from mien.lab.synthetic import anatomy as places
 from mien.lab.synthetic.anatomy import Anatomy, face_view, resample
 from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep, unit
 from mien.lab.synthetic.hair import Strands
+from mien.machine import exact
 
 _BEARD_COUNT, _BEARD_STEPS = 5200, 7
 """Strands, and points per strand, of a beard."""

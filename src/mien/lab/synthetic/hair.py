@@ -6,10 +6,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from mien import exact
-from mien.exact import dot, length, mixed
 from mien.lab.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy
 from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep, unit
+from mien.machine import exact
+from mien.machine.exact import dot, length, mixed
 
 _LONG_STEPS = 22
 _LONG_COUNT = 7500

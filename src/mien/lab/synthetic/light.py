@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien import exact
 from mien.camera import Camera, look_at
 from mien.lab.synthetic.posing import project
+from mien.machine import exact
 from mien.render.mesh import rasterize_mesh, sh_basis
 
 # Clamped cosine in spherical harmonics of degrees 0, 1, 2 (Ramamoorthi and Hanrahan 2001, "An efficient representation

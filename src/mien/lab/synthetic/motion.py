@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien import exact
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.synthetic.arithmetic import smoothstep
 from mien.lab.synthetic.posing import rest_joints
 from mien.lab.synthetic.recipe import Segment, SegmentKind, SyntheticRecipe
+from mien.machine import exact
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 _MAX_GAZE = 0.42

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien import exact
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep
 from mien.lab.synthetic.posing import rest_vertices
+from mien.machine import exact
 
 _EXTRA = (("jawOpen", "mouthSmileLeft"), ("mouthPucker", "mouthFunnel"), ("browInnerUp", "browDownLeft"))
 """Pairs of expressions whose product drives an additional field: muscles that work together do not just add up."""

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 
-from mien import exact
 from mien.camera import Camera
 from mien.lab.synthetic import shading
 from mien.lab.synthetic.anatomy import LIPS_OUTER, SIDES, UPPER_LIDS
@@ -26,6 +25,7 @@ from mien.lab.synthetic.subject import (
     Subject,
     opaque_vertices,
 )  # fmt: skip
+from mien.machine import exact
 from mien.render.mesh import MeshFragments, interpolate, rasterize_mesh
 
 _BLOCK = 32768  # samples

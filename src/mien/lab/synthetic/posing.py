@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien import exact
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.machine import exact
 from mien.runtime.rotation import matrix_from_axis_angle
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from mien import exact
 from mien.camera import Camera, look_at
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
@@ -22,7 +21,8 @@ from mien.lab.synthetic.painter import develop, draw, paint_wall, to_uint8
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
 from mien.lab.synthetic.recipe import SIDES, SyntheticRecipe
 from mien.lab.synthetic.subject import Subject, build_subject, pose_subject
-from mien.parallel import stream_in_threads
+from mien.machine import exact
+from mien.machine.parallel import stream_in_threads
 from mien.tracking.neck_line import fit_neck_lines
 from mien.tracking.tracking import Tracking
 

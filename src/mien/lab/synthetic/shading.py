@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mien import exact
-from mien.exact import dot
 from mien.lab.synthetic.arithmetic import along, smoothstep, unit
 from mien.lab.synthetic.hair import Strands
 from mien.lab.synthetic.light import Lighting, irradiance_polynomial
+from mien.machine import exact
+from mien.machine.exact import dot
 from mien.render.mesh import sample_texture
 
 _MIN_HIGHLIGHT = 0.2

@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from mien import exact
 from mien.camera import Camera
 from mien.lab.synthetic import anatomy as places
 from mien.lab.synthetic.anatomy import SIDES, Anatomy, FrontView, face_view
 from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep
 from mien.lab.synthetic.facial_hair import beard_zone
 from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.machine import exact
 from mien.render.mesh import interpolate, rasterize_mesh
 
 _TONES = np.array(

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien import exact
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.synthetic.accessories import Glasses, RigidMesh, build_glasses, build_shirt, stack_meshes
@@ -18,6 +17,7 @@ from mien.lab.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.skin import SkinTextures, paint_skin
+from mien.machine import exact
 
 SKIN, EYE, TEETH, MOUTH, HAIR, SHIRT, FRAME = range(7)
 """Materials."""

@@ -6,12 +6,12 @@ varied" means that the first value worked and no other was measured.
 
 from dataclasses import dataclass
 
-from mien.tracking.constants.descent import DescentConstants
-from mien.tracking.constants.eyelids import EyelidConstants
-from mien.tracking.constants.fitting import CameraConstants, PriorConstants
-from mien.tracking.constants.landmarks import EmbeddingConstants, LandmarkConstants
-from mien.tracking.constants.neck import NeckConstants
-from mien.tracking.constants.pixels import CoveredConstants, PixelConstants
+from mien.tracking.descent.constants import DescentConstants
+from mien.tracking.eyelids.constants import EyelidConstants
+from mien.tracking.fitting.constants import CameraConstants, PriorConstants
+from mien.tracking.landmarks.constants import EmbeddingConstants, LandmarkConstants
+from mien.tracking.neck_constants import NeckConstants
+from mien.tracking.pixels.constants import CoveredConstants, PixelConstants
 
 
 @dataclass(frozen=True)

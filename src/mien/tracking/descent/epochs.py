@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.adam import Moments
-from mien.parallel import map_in_threads
-from mien.progress import Advance
+from mien.machine.parallel import map_in_threads
+from mien.machine.progress import Advance
 from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import RowStepper, apply_adam
 from mien.tracking.descent.scene import PaperScene, PaperState

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mien.adam import Moments
 from mien.face.params import most_frontal_camera
-from mien.progress import Advance
+from mien.machine.progress import Advance
 from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent

@@ -6,7 +6,7 @@ from functools import partial
 
 import torch
 
-from mien.progress import progress_bar
+from mien.machine.progress import progress_bar
 from mien.tracking.descent.epochs import Descent
 from mien.tracking.descent.frames import fit_appearance, fit_sequence, measure_visibility, recenter
 from mien.tracking.descent.scene import PaperScene, PaperState, first_state, paper_scene

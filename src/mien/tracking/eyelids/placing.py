@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.parallel import map_in_threads
+from mien.machine.parallel import map_in_threads
 from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids.colors import EyeColors, learn_colors
 from mien.tracking.eyelids.crops import EyeCrop, eye_crop

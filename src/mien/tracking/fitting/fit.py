@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.progress import Advance
+from mien.machine.progress import Advance
 from mien.tracking.fitting.parameters import ParameterLayout
 from mien.tracking.fitting.solver import Smoothness
 from mien.tracking.fitting.views import CameraBatch

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mien.errors import UserError
 from mien.inside import remove_tree
-from mien.progress import say
+from mien.machine.progress import say
 from mien.storage import read_tensors, write_tensors
 
 INTERVAL_SECONDS = 20.0

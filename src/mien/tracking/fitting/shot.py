@@ -12,8 +12,8 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.errors import UserError
+from mien.machine.terminal import counted
 from mien.rotation import invert_rigid
-from mien.terminal import counted
 from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.views import CameraBatch, Views, batch_of
 from mien.tracking.settings import TrackingSettings

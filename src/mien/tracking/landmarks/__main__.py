@@ -7,7 +7,7 @@ from pathlib import Path
 import tyro
 
 from mien.face.loading import load_face_model_without_landmarks, write_landmarks
-from mien.progress import say
+from mien.machine.progress import say
 from mien.tracking.landmarks.embedding import EmbeddingSettings, embed_landmarks
 
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.capture.backend import Detector
+from mien.capture.person.backend import Detector
 from mien.face.model import FaceModel
 from mien.tracking.constants import TRACKING
 

@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
-from mien.capture.faces import LANDMARKS
-from mien.capture.quiet_mediapipe import load_solution, quiet_mediapipe
+from mien.capture.person.faces import LANDMARKS
+from mien.capture.person.quiet_mediapipe import load_solution, quiet_mediapipe
 from mien.errors import UserError
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams
-from mien.progress import track_progress
+from mien.machine.progress import track_progress
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform
 from mien.tracking.constants import TRACKING

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.capture.faces import LANDMARKS
+from mien.capture.person.faces import LANDMARKS
 from mien.tracking.constants import TRACKING
 from mien.tracking.settings import LandmarkSet
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.progress import progress_bar
+from mien.machine.progress import progress_bar
 from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import (
     Course,

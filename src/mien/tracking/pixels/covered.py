@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
-from mien.parallel import map_in_threads
+from mien.machine.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.constants import TRACKING

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.face.model import FaceModel
-from mien.parallel import map_in_threads
-from mien.progress import say
+from mien.machine.parallel import map_in_threads
+from mien.machine.progress import say
 from mien.render.mesh import sh_basis
 from mien.tracking.fitting.shot import Shot
 from mien.tracking.pixels.comparison import model_pictures

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.parallel import map_in_threads
+from mien.machine.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.render.mesh_gradients import mesh_edges
 from mien.tracking.constants import TRACKING

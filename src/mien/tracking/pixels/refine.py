@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.parallel import map_in_threads
-from mien.progress import progress_bar, say
+from mien.machine.parallel import map_in_threads
+from mien.machine.progress import progress_bar, say
 from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids.placing import place_lids
 from mien.tracking.fitting.fit import Course, Fit, SequenceFit, Subject, Watch, smoothness_of

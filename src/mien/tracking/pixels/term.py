@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien import _native
-from mien.parallel import map_in_threads
+from mien.machine.parallel import map_in_threads
 from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import Subject
 from mien.tracking.fitting.parameters import ParameterLayout

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
-from mien.picture_files import write_png
+from mien.media.picture_files import write_png
 from mien.tracking.report.heat import draw_legend, write_text
 from mien.tracking.report.overlay import OverlayPainter, frontal_camera
 from mien.tracking.tracking import Tracking

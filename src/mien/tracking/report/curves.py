@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
-from mien.plots import Axes, Series, line_chart
+from mien.pages.plots import Axes, Series, line_chart
 
 _WIDTH, _HEIGHT = 520, 200
 _TURNS = (("pitch", "main"), ("yaw", "second"), ("roll", "third"))

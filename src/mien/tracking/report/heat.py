@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.pictures import heat_colors
+from mien.media.pictures import heat_colors
 
 HOTTEST = 0.15
 """Length of the colour difference (each channel 0..1) that is drawn brightest."""

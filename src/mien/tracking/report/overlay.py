@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float, UInt8
 
 from mien.capture.capture import Capture
-from mien.capture.video import write_video
 from mien.face.model import FaceModel
 from mien.face.params import most_frontal_camera
-from mien.parallel import stream_in_threads
-from mien.progress import track_progress
+from mien.machine.parallel import stream_in_threads
+from mien.machine.progress import track_progress
+from mien.media.video import write_video
 from mien.render.mesh import Headlight, render_mesh
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.pixels.comparison import model_pictures, window_of

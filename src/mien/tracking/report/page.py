@@ -6,8 +6,8 @@ from typing import Any
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
-from mien.pages import render
-from mien.pictures import picture_uri, shrink
+from mien.media.pictures import picture_uri, shrink
+from mien.pages.pages import render
 from mien.storage import write_atomically
 from mien.tracking.report.contact_sheet import SheetRow, sheet_frames, sheet_rows
 from mien.tracking.report.curves import Curves, charts

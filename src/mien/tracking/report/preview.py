@@ -12,9 +12,9 @@ from jaxtyping import Float, Int, UInt8
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
-from mien.pages import render
-from mien.picture_files import encode_picture
-from mien.pictures import data_uri
+from mien.media.picture_files import encode_picture
+from mien.media.pictures import data_uri
+from mien.pages.pages import render
 from mien.storage import write_atomically
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.shot import Shot

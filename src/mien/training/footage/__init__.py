@@ -5,14 +5,6 @@ from typing import TYPE_CHECKING
 from mien.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mien.training.footage.benchmark_split import (
-        BENCHMARK_SPLIT,
-        HIDDEN_CAMERAS,
-        TEST_CAMERAS,
-        TEST_SEQUENCES,
-        TRAINING_CAMERA,
-        with_benchmark_split,
-    )
     from mien.training.footage.clothes import FOREIGN, clothes_digest, clothes_mask, packed_clothes, read_clothes
     from mien.training.footage.constants import FOOTAGE
     from mien.training.footage.coverage import (
@@ -50,7 +42,16 @@ if TYPE_CHECKING:
     )
     from mien.training.footage.hidden import hidden_triangles, inside_triangles
     from mien.training.footage.mesh_colors import sample_picture, vertex_colors
-    from mien.training.footage.named_split import (
+    from mien.training.footage.sequence import Sequence, Target, Targets, composite, read_sequence, sequence_of
+    from mien.training.splits.benchmark import (
+        BENCHMARK_SPLIT,
+        HIDDEN_CAMERAS,
+        TEST_CAMERAS,
+        TEST_SEQUENCES,
+        TRAINING_CAMERA,
+        with_benchmark_split,
+    )
+    from mien.training.splits.named import (
         DRIVING,
         NAMED_SPLIT,
         NamedSplit,
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
         split_by_name,
         with_named_split,
     )
-    from mien.training.footage.own_split import (
+    from mien.training.splits.own import (
         OWN_SPLIT,
         OwnSplit,
         imported_from,
@@ -67,7 +68,6 @@ if TYPE_CHECKING:
         with_own_split,
         write_own_split,
     )
-    from mien.training.footage.sequence import Sequence, Target, Targets, composite, read_sequence, sequence_of
 else:
     __getattr__, __dir__ = lazy_names(__name__, __file__)
 

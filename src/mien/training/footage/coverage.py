@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.parallel import stream_in_threads
+from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut

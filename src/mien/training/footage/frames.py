@@ -15,9 +15,9 @@ from torch import Tensor
 
 from mien.errors import UserError
 from mien.training.footage.constants import FOOTAGE
-from mien.training.footage.own_split import OWN_SPLIT, read_own_split
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
+from mien.training.splits.own import OWN_SPLIT, read_own_split
 
 Item = TypeVar("Item")
 _ORDER, _BACKGROUND, _DENSITY, _CROP, _COVER, _ASIDE = range(6)

@@ -10,7 +10,7 @@ from torch.nn.functional import grid_sample, normalize
 
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.parallel import stream_in_threads
+from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, spread_frames

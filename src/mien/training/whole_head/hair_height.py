@@ -12,7 +12,7 @@ from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.parallel import stream_in_threads
+from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.sequence import Sequence

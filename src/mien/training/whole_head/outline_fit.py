@@ -21,8 +21,8 @@ from mien.camera import Camera
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.parallel import stream_in_threads
-from mien.threads import one_torch_thread
+from mien.machine.parallel import stream_in_threads
+from mien.machine.threads import one_torch_thread
 from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings

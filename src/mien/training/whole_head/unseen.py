@@ -24,7 +24,7 @@ from mien.avatar.store import GaussianStore
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.parallel import stream_in_threads
+from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.render.rendering import Rendering
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep

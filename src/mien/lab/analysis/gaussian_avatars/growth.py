@@ -6,7 +6,7 @@ from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.errors import UserError
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.result import Chart, PartResult, Table
-from mien.plots import Axes, Series
+from mien.pages.plots import Axes, Series
 
 _PAPER_START, _PAPER_END = 10_144, 100_000
 """The supplement, section C: one Gaussian for each triangle at first, and about so many at the end, on average."""

@@ -9,7 +9,7 @@ from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.lab.analysis.context import Context, Variant, mean_psnr
 from mien.lab.analysis.drawing import measure_in_turn
 from mien.lab.analysis.result import Chart, PartResult, Table
-from mien.plots import Axes, Series
+from mien.pages.plots import Axes, Series
 from mien.storage import file_digest
 from mien.training.footage.frames import spread_frames
 

@@ -17,7 +17,7 @@ from mien.face.params import FaceParams
 from mien.lab.analysis.context import Context, Variant, mean_psnr
 from mien.lab.analysis.result import PartResult, Picture, Table
 from mien.lab.analysis.views import draw_avatar, mouth_box, mouth_camera
-from mien.pictures import Box, side_by_side, to_uint8
+from mien.media.pictures import Box, side_by_side, to_uint8
 from mien.render import rasterize
 
 _OPEN = 0.7

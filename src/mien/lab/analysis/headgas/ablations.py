@@ -17,8 +17,8 @@ from mien.lab.analysis.headgas.trained import busy_face
 from mien.lab.analysis.result import PartResult, Picture, Table
 from mien.lab.analysis.scoring import METRICS, held_out_scores, perceptual_metric
 from mien.lab.analysis.views import labeled
+from mien.media.pictures import side_by_side, to_uint8
 from mien.perceptual.distance import PerceptualDistance
-from mien.pictures import side_by_side, to_uint8
 from mien.storage import file_digest
 from mien.training.footage.frames import Frame
 

@@ -8,15 +8,15 @@ import numpy as np
 import torch
 
 from mien.avatar.headgas.avatar import HeadGas
-from mien.capture.video import write_video
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas.trained import trained_range, with_expression
 from mien.lab.analysis.result import Film, PartResult, Picture, Table
 from mien.lab.analysis.views import draw_avatar, draw_mesh, head_camera, labeled
-from mien.pictures import picture_grid, side_by_side
-from mien.progress import track_progress
+from mien.machine.progress import track_progress
+from mien.media.pictures import picture_grid, side_by_side
+from mien.media.video import write_video
 
 _SHOWN, _COLUMNS = 12, 3
 """Number of expressions that are shown, and of those in a row."""

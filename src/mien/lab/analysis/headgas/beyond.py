@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 
 from mien.camera import Camera
-from mien.capture.video import write_video
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas.trained import Trained, trained_range, with_expression
 from mien.lab.analysis.result import Chart, Film, PartResult, Picture
 from mien.lab.analysis.views import draw_avatar, draw_mesh, head_camera, labeled
-from mien.pictures import picture_grid, side_by_side
-from mien.plots import Axes, Series
+from mien.media.pictures import picture_grid, side_by_side
+from mien.media.video import write_video
+from mien.pages.plots import Axes, Series
 from mien.render.camera_paths import turned_camera
 
 _REACH = 1.4

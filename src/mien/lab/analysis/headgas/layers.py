@@ -8,12 +8,12 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture.video import write_video
 from mien.gaussians import Gaussians, world_means
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.result import Film, PartResult, Picture
 from mien.lab.analysis.views import draw_avatar, head_camera, labeled, mouth_camera
-from mien.pictures import side_by_side
+from mien.media.pictures import side_by_side
+from mien.media.video import write_video
 
 _SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 """Shares of the Gaussians in view that pictures lack."""

@@ -8,10 +8,10 @@ from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.headgas.trained import busy_face
 from mien.lab.analysis.result import Chart, PartResult, Table
 from mien.lab.benchmarking.timing import format_machine, measure_machine
-from mien.plots import Axes, Series
-from mien.progress import track_progress
+from mien.machine.progress import track_progress
+from mien.machine.terminal import counted
+from mien.pages.plots import Axes, Series
 from mien.storage import file_digest
-from mien.terminal import counted
 
 PAPER = {512: 4.0, 1024: 5.0, 2048: 8.6}
 """Side of a square picture in pixels -> mean milliseconds of a frame, for 21,000 to 37,000 Gaussians on a GPU."""

@@ -13,11 +13,11 @@ from mien.evaluation.metrics import crop_to, psnr
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.result import Chart, PartResult, Picture, Table
 from mien.lab.analysis.views import labeled
-from mien.pictures import side_by_side, to_uint8
-from mien.plots import Axes, Series
-from mien.progress import progress_bar
+from mien.machine.progress import progress_bar
+from mien.machine.threads import one_torch_thread
+from mien.media.pictures import side_by_side, to_uint8
+from mien.pages.plots import Axes, Series
 from mien.render import rasterize
-from mien.threads import one_torch_thread
 from mien.training.footage.frames import (
     Frame,
     FrameOrder,

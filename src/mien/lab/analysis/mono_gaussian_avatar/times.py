@@ -5,8 +5,8 @@ from mien.lab.analysis.context import Context
 from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.result import PartResult, Table
 from mien.lab.benchmarking.timing import format_machine, measure_machine
+from mien.machine.terminal import counted
 from mien.storage import file_digest
-from mien.terminal import counted
 
 PAPER = {
     "NeRFace": (48.0, 2000.0),

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from mien.capture.video import write_video
 from mien.errors import UserError
 from mien.evaluation.experiment import avatar_image, head_box, target_image
 from mien.evaluation.metrics import crop_to
 from mien.lab.analysis.study.clips import Clip, HeldOut
-from mien.pictures import WHITE, Box, to_uint8
+from mien.media.pictures import WHITE, Box, to_uint8
+from mien.media.video import write_video
 
 _CRFS = (16, 18, 20, 22, 24, 26, 28, 30, 33, 36)
 """x264's qualities, best first. The first one that fits is taken."""

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mien.bounded import parse_json, read_bytes
+from mien.disk.files import expect_whole, read_json, write_json
+from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.files import expect_whole, read_json, write_json
 from mien.inside import is_one_line, listed
 from mien.lab.analysis.study.shuffling import shuffled
 from mien.limits import checked_whole

@@ -9,13 +9,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from mien.files import file_digest, write_atomically
+from mien.disk.files import file_digest, write_atomically
+from mien.disk.locks import hold
 from mien.lab.analysis.study.clips import Clip, HeldOut, StudyRuns, choose_clips, read_held_out
 from mien.lab.analysis.study.drawing import VISIBLE_CRF, Encoded, drawn_clip, encode
 from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, key_path, write_key
 from mien.lab.analysis.study.settings import StudySettings
-from mien.locks import hold
-from mien.progress import progress_bar, say
+from mien.machine.progress import progress_bar, say
 
 _ROOM = 1_000
 """Bytes of the page's data for each clip beside its video."""

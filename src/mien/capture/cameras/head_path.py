@@ -1,0 +1,221 @@
+"""Where the head is in the world of several calibrated cameras, found from the boxes of its face in their pictures."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mien.camera import Camera
+from mien.capture.constants import CAPTURE
+from mien.capture.person.crop import Crop, whole_picture
+from mien.errors import UserError
+
+_FACE_WIDTHS = (0.08, 0.35)
+"""Plausible median width of a face in metres (eyebrows to chin, as the detector's boxes go)."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeadPath:
+    """The middle of the face at each timestep, and the cameras that agree on it."""
+
+    centers: Float[np.ndarray, "t 3"]
+    """Position in world space, in metres. NaN where fewer than two cameras agree."""
+    agrees: Bool[np.ndarray, "t c"]
+    """Whether the face that a camera found is where the others see it."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, " t"]:
+        """Timesteps at which the position is known."""
+        return np.isfinite(self.centers[:, 0])
+
+
+def find_head_path(
+    boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera], advise: Callable[[], str] = str
+) -> HeadPath:
+    """Find the head from its face boxes by consensus: the point that most cameras agree on, then least squares.
+
+    A box that is no face (the back of a head, a picture on the wall) therefore does not move the point.
+
+    Args:
+        boxes: left, top, right, bottom of the face in pixels of each camera's picture. NaN where there is no face.
+        cameras: the cameras, for those pictures.
+        advise: called if the cameras do not fit. It returns what to correct in all of them, or an empty text.
+
+    Raises:
+        UserError: no two cameras agree at any timestep, or the calibration is not in metres.
+    """
+    path = consensus(boxes, cameras)
+    if not path.known.any():
+        names = "check first that each video or folder has the name of its own camera's id, then the offsets"
+        remedy = advise() or names
+        raise UserError(f"--calibration: no two cameras ever see the face in the same place; {remedy}")
+    _check_unit(path, _sides(boxes), cameras, advise)
+    return path
+
+
+def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> HeadPath:
+    """Return the path on which most cameras agree, which is unknown throughout if they never do."""
+    centers, sides = (boxes[..., :2] + boxes[..., 2:]) / 2, _sides(boxes)
+    origins = np.stack([camera.position.numpy() for camera in cameras]).astype(np.float64)
+    directions = rays_of(centers, cameras)
+    best, best_cost = np.full((len(boxes), 3), np.nan), np.full(len(boxes), np.inf)
+    for first, second in itertools.combinations(range(len(cameras)), 2):
+        points = _nearest_point(origins[[first, second]], directions[:, [first, second]])
+        cost = np.minimum(_misses(points, centers, sides, cameras), 1).sum(axis=1)
+        better = np.isfinite(points[:, 0]) & (cost < best_cost)
+        best[better], best_cost[better] = points[better], cost[better]
+    agrees = _misses(best, centers, sides, cameras) < CAPTURE.head_most_miss
+    agrees[agrees.sum(axis=1) < 2] = False
+    refined = np.full_like(best, np.nan)
+    for timestep in np.flatnonzero(agrees.any(axis=1)):
+        chosen = agrees[timestep]
+        refined[timestep] = _intersection(origins[chosen], directions[timestep, chosen])
+    return HeadPath(refined, agrees)
+
+
+def _sides(boxes: Float[np.ndarray, "t c 4"]) -> Float[np.ndarray, "t c"]:
+    return np.sqrt(np.prod(boxes[..., 2:] - boxes[..., :2], axis=-1))
+
+
+def choose_crops(
+    path: HeadPath, cameras: Sequence[Camera], size: int, whole: bool
+) -> tuple[list[Crop], tuple[int, int]]:
+    """Choose a fixed crop for every camera, all with the same size in pixels and the head at the same scale in them.
+
+    Args:
+        path: the head's path.
+        cameras: the cameras for the source pictures.
+        size: largest side of the results in pixels. The smallest crop limits it, since none is enlarged.
+        whole: whether to take whole pictures. That is also done if all of them are head crops already.
+
+    Returns:
+        The crops, and the width and height that all of them have.
+
+    Raises:
+        UserError: whole pictures have different shapes.
+    """
+    spans = [_span(path, camera) for camera in cameras]
+    sides = [max(span[2] - span[0], span[3] - span[1]) for span in spans]
+    is_head = all(
+        max(camera.width, camera.height) <= CAPTURE.crop_most_aspect * min(camera.width, camera.height)
+        and side >= CAPTURE.crop_least_head_share * min(camera.width, camera.height)
+        for camera, side in zip(cameras, sides, strict=True)
+    )
+    shapes = {(camera.width, camera.height) for camera in cameras}
+    if whole or (is_head and len(shapes) == 1):
+        if len(shapes) > 1:
+            raise UserError(
+                f"--capture.crop none: the cameras' pictures have {len(shapes)} different sizes, and a capture has "
+                "one; leave the option out, so that each is cropped to the head"
+            )
+        width, height = shapes.pop()
+        crop = whole_picture(width, height, size)
+        return [crop] * len(cameras), (crop.width, crop.height)
+    cuts = [min(round(side), camera.width, camera.height) for side, camera in zip(sides, cameras, strict=True)]
+    output = min(size, *cuts)
+    crops = []
+    for span, cut, camera in zip(spans, cuts, cameras, strict=True):
+        left = int(np.clip(round((span[0] + span[2] - cut) / 2), 0, camera.width - cut))
+        top = int(np.clip(round((span[1] + span[3] - cut) / 2), 0, camera.height - cut))
+        crops.append(Crop(left, top, cut, cut, output, output))
+    return crops, (output, output)
+
+
+def disagreeing(path: HeadPath, boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> dict[int, float]:
+    """Return the cameras that mostly find the face where the others do not see it, with the median distance in pixels.
+
+    Cameras that find a face in less than half of the timesteps are left out: they look at the back of the head.
+    """
+    found = np.isfinite(boxes[..., 0]) & path.known[:, None]
+    centers = (boxes[..., :2] + boxes[..., 2:]) / 2
+    result = {}
+    for index, camera in enumerate(cameras):
+        seen = found[:, index]
+        if seen.sum() < 0.5 * path.known.sum() or path.agrees[seen, index].mean() >= 0.5:
+            continue
+        distances = np.linalg.norm(project(path.centers[seen], camera) - centers[seen, index], axis=-1)
+        result[index] = float(np.median(distances))  # NaN if the head is behind the camera
+    return result
+
+
+def rays_of(pixels: Float[np.ndarray, "t c 2"], cameras: Sequence[Camera]) -> Float[np.ndarray, "t c 3"]:
+    """Directions in world space, of unit length, through pixels of each camera."""
+    homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=-1)
+    rays = []
+    for index, camera in enumerate(cameras):
+        to_world = (np.linalg.inv(camera.K.numpy().astype(np.float64)).T) @ camera.viewmat[:3, :3].numpy()
+        rays.append(homogeneous[:, index] @ to_world)
+    stacked = np.stack(rays, axis=1)
+    return stacked / np.linalg.norm(stacked, axis=-1, keepdims=True)
+
+
+def _nearest_point(
+    origins: Float[np.ndarray, "2 3"], directions: Float[np.ndarray, "t 2 3"]
+) -> Float[np.ndarray, "t 3"]:
+    """The middle between two rays where they come closest; NaN if they are nearly parallel or meet behind a camera."""
+    first, second = directions[:, 0], directions[:, 1]
+    cosine, between = (first * second).sum(axis=-1), origins[1] - origins[0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sine2 = 1 - cosine**2
+        along_first = ((first @ between) - cosine * (second @ between)) / sine2
+        along_second = (cosine * (first @ between) - (second @ between)) / sine2
+        usable = (sine2 > CAPTURE.head_least_angle**2) & (along_first > 0) & (along_second > 0)
+    points = (origins[0] + along_first[:, None] * first + origins[1] + along_second[:, None] * second) / 2
+    return np.where(usable[:, None], points, np.nan)
+
+
+def _intersection(origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"]:
+    """The point with the least sum of squared distances to the rays."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, origins))
+
+
+def _misses(
+    points: Float[np.ndarray, "t 3"], centers: Float[np.ndarray, "t c 2"], sides: Float[np.ndarray, "t c"],
+    cameras: Sequence[Camera],
+) -> Float[np.ndarray, "t c"]:  # fmt: skip
+    """Distance of the projected point from each found face, in sides of its box; infinite where there is none."""
+    projected = np.stack([project(points, camera) for camera in cameras], axis=1)
+    with np.errstate(invalid="ignore"):
+        misses = np.linalg.norm(projected - centers, axis=-1) / sides
+    return np.where(np.isfinite(misses), misses, np.inf)
+
+
+def project(points: Float[np.ndarray, "*n 3"], camera: Camera) -> Float[np.ndarray, "*n 2"]:
+    """Pixels of points in world space; NaN behind the camera."""
+    inside = points @ camera.viewmat[:3, :3].numpy().T.astype(np.float64) + camera.viewmat[:3, 3].numpy()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pixels = (inside @ camera.K.numpy().T)[..., :2] / inside[..., 2:]
+        return np.where(inside[..., 2:] > 0, pixels, np.nan)
+
+
+def _span(path: HeadPath, camera: Camera) -> Float[np.ndarray, " 4"]:
+    """Left, top, right, bottom in pixels of the head's sphere over the whole path."""
+    centers = path.centers[path.known]
+    depth = (centers @ camera.viewmat[2, :3].numpy().astype(np.float64)) + float(camera.viewmat[2, 3])
+    radius = CAPTURE.head_radius * np.array([[float(camera.K[0, 0]), float(camera.K[1, 1])]]) / depth[:, None]
+    middle = project(centers, camera)
+    if not np.isfinite(middle).all():
+        raise UserError("--calibration: the head is behind a camera; check that matrices go from world to camera")
+    least = np.percentile(middle - radius, CAPTURE.crop_outliers, axis=0)
+    return np.concatenate([least, np.percentile(middle + radius, 100 - CAPTURE.crop_outliers, axis=0)])
+
+
+def _check_unit(
+    path: HeadPath, sides: Float[np.ndarray, "t c"], cameras: Sequence[Camera], advise: Callable[[], str]
+) -> None:
+    widths = []
+    for index, camera in enumerate(cameras):
+        chosen = path.agrees[:, index]
+        depth = path.centers[chosen] @ camera.viewmat[2, :3].numpy() + float(camera.viewmat[2, 3])
+        widths.append(sides[chosen, index] * depth / float(camera.K[0, 0]))
+    width = float(np.median(np.concatenate(widths)))
+    least, most = _FACE_WIDTHS
+    if not least <= width <= most:
+        meters = f"give positions in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
+        raise UserError(
+            f"--calibration: according to these cameras the face is {width:.3g} m wide, but it should be about 0.15; "
+            + (advise() or meters)
+        )

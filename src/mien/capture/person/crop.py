@@ -1,0 +1,69 @@
+"""Step 3: choose one crop for a whole part. It does not follow the head, so the frames come from one fixed camera."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mien.capture.constants import CAPTURE
+from mien.media.source import shrunk_size
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A part of the source picture and the size to which it is shrunk, all in pixels."""
+
+    left: int
+    top: int
+    crop_width: int
+    crop_height: int
+    width: int
+    height: int
+
+    @property
+    def scale(self) -> Float[np.ndarray, " 2"]:
+        """Output pixels per source pixel, along x and y."""
+        return np.array([self.width / self.crop_width, self.height / self.crop_height])
+
+    def to_output(self, source_pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
+        """Convert positions in the source picture to positions in the output."""
+        return (source_pixels - np.array([self.left, self.top])) * self.scale
+
+    def apply(self, image: UInt8[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h2 w2 *channels"]:
+        """Cut the part out and shrink it (area-averaged)."""
+        part = image[self.top : self.top + self.crop_height, self.left : self.left + self.crop_width]
+        if (self.crop_width, self.crop_height) == (self.width, self.height):
+            return np.ascontiguousarray(part)
+        shrunk = cv2.resize(part, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        return shrunk.astype(np.uint8, copy=False)
+
+
+def whole_picture(width: int, height: int, size: int) -> Crop:
+    """Return a crop of the whole picture, shrunk so that its longer side has at most `size` pixels."""
+    width_out, height_out = shrunk_size(width, height, size)
+    return Crop(0, 0, width, height, width_out, height_out)
+
+
+def choose_crop(boxes: Float[np.ndarray, "t 4"], width: int, height: int, size: int) -> Crop:
+    """Return a square inside the picture that holds the head over the whole clip, or the picture if it is a head crop.
+
+    Args:
+        boxes: left, top, right, bottom of the face as fractions of the picture. NaN where there is no face.
+        width: width of the source picture in pixels.
+        height: height of the source picture in pixels.
+        size: largest side of the result in pixels. Smaller crops are not enlarged.
+    """
+    pixels = boxes[np.isfinite(boxes).all(axis=1)] * np.array([width, height, width, height])
+    assert len(pixels) > 0
+    left, top = np.percentile(pixels[:, :2], CAPTURE.crop_outliers, axis=0)
+    right, bottom = np.percentile(pixels[:, 2:], 100 - CAPTURE.crop_outliers, axis=0)
+    face = float(np.median(np.maximum(pixels[:, 2] - pixels[:, 0], pixels[:, 3] - pixels[:, 1])))
+    wanted = max(right - left, bottom - top) + CAPTURE.crop_margin * face
+    shorter, longer = min(width, height), max(width, height)
+    if longer <= CAPTURE.crop_most_aspect * shorter and wanted >= CAPTURE.crop_least_head_share * shorter:
+        return whole_picture(width, height, size)
+    side = min(round(wanted), shorter)
+    crop_left = int(np.clip(round((left + right - side) / 2), 0, width - side))
+    crop_top = int(np.clip(round((top + bottom - side) / 2), 0, height - side))
+    return Crop(crop_left, crop_top, side, side, min(side, size), min(side, size))

@@ -1,0 +1,185 @@
+"""Find faces in pictures: boxes of all faces (step 2, to choose the crop) and landmarks (step 4).
+
+The classes here are seams: behind them, mediapipe or `mien.capture.person.litert` runs MediaPipe's networks, as
+`mien.capture.person.backend` chooses.
+"""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mien.capture.constants import CAPTURE
+from mien.capture.person.backend import DetectorChoice, choose_detector
+from mien.capture.person.quiet_mediapipe import load_solution, quiet_mediapipe
+
+LANDMARKS = 478
+"""Points of MediaPipe's face mesh with irises: 468 of the mesh and 5 of each iris."""
+MAX_FACES = 4
+"""Most faces of a frame that are kept, the largest first."""
+
+_Boxes = tuple[np.ndarray, np.ndarray]
+"""Boxes [n, 4] as fractions of the picture, and their scores [n]."""
+
+
+class FaceFinder:
+    """Finds the boxes of all faces in a picture.
+
+    It uses MediaPipe's detector for near faces and, if that finds none, the one for far faces.
+
+    Use as a context manager.
+    """
+
+    def __init__(self, detector: DetectorChoice = "auto") -> None:
+        self._detector: DetectorChoice = detector
+
+    def __enter__(self) -> "FaceFinder":
+        self._stack = ExitStack()
+        is_mediapipe = choose_detector(self._detector) == "mediapipe"
+        self._finds = _mediapipe_boxes(self._stack) if is_mediapipe else _litert_boxes()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def find(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
+        """Return left, top, right, bottom of each face (eyebrows to chin) as fractions of the picture's size."""
+        for find in self._finds:
+            boxes, _ = find(image)
+            if len(boxes):
+                return boxes
+        return np.zeros((0, 4))
+
+    def surest(self, image: UInt8[np.ndarray, "h w 3"]) -> float:
+        """Return the higher of the two detectors' confidences that there is a face, 0..1; 0 if neither finds one."""
+        return max((float(score) for find in self._finds for score in find(image)[1]), default=0.0)
+
+
+def _mediapipe_boxes(stack: ExitStack) -> list[Callable[[np.ndarray], _Boxes]]:
+    module = load_solution("face_detection")
+    with quiet_mediapipe():
+        detectors = [
+            module.FaceDetection(model_selection=model, min_detection_confidence=CAPTURE.face_confidence)
+            for model in (0, 1)
+        ]
+        blank = np.zeros((64, 64, 3), np.uint8)
+        for detector in detectors:
+            stack.callback(detector.close)
+            detector.process(blank)
+
+    def of(detector: object) -> Callable[[np.ndarray], _Boxes]:
+        def find(image: np.ndarray) -> _Boxes:
+            found = detector.process(image).detections or ()  # pyright: ignore[reportAttributeAccessIssue]
+            boxes = [detection.location_data.relative_bounding_box for detection in found]
+            corners = [(b.xmin, b.ymin, b.xmin + b.width, b.ymin + b.height) for b in boxes]
+            return np.array(corners).reshape(-1, 4), np.array([detection.score[0] for detection in found])
+
+        return find
+
+    return [of(detector) for detector in detectors]
+
+
+def _litert_boxes() -> list[Callable[[np.ndarray], _Boxes]]:
+    from mien.capture.person.litert.boxes import BoxNetwork
+
+    def of(network: BoxNetwork) -> Callable[[np.ndarray], _Boxes]:
+        def find(image: np.ndarray) -> _Boxes:
+            found = network.find(image)
+            return found.boxes / np.tile([image.shape[1], image.shape[0]], 2), found.scores
+
+        return find
+
+    return [of(BoxNetwork("near_faces", CAPTURE.face_confidence)), of(BoxNetwork("far_faces", CAPTURE.face_confidence))]
+
+
+class MeshReader:
+    """Finds face-mesh landmarks, of single pictures or of consecutive ones. Use as a context manager."""
+
+    def __init__(self, most_faces: int, is_video: bool, detector: DetectorChoice = "auto") -> None:
+        """Prepare.
+
+        Args:
+            most_faces: most faces that are found in a picture.
+            is_video: whether pictures are consecutive, so that faces are followed.
+            detector: what runs the networks.
+        """
+        self._most, self._is_video = most_faces, is_video
+        self._detector: DetectorChoice = detector
+
+    def __enter__(self) -> "MeshReader":
+        self._stack = ExitStack()
+        is_mediapipe = choose_detector(self._detector) == "mediapipe"
+        self.read = self._mediapipe() if is_mediapipe else self._litert()
+        """Returns the landmarks [n, 478, 3] of a picture's faces in pixels; z points away from the camera."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def _litert(self) -> Callable[[np.ndarray], np.ndarray]:
+        from mien.capture.person.litert.mesh import Mesh
+
+        return Mesh(self._most, self._is_video).find
+
+    def _mediapipe(self) -> Callable[[np.ndarray], np.ndarray]:
+        module = load_solution("face_mesh")
+        with quiet_mediapipe():
+            mesh = module.FaceMesh(
+                static_image_mode=not self._is_video, max_num_faces=self._most, refine_landmarks=True
+            )
+            self._stack.callback(mesh.close)
+            # The graph starts in its own threads and prints warnings. It has started when it has processed a picture.
+            mesh.process(np.zeros((64, 64, 3), np.uint8))
+        has_seen_face = False
+
+        def read(image: np.ndarray) -> np.ndarray:
+            nonlocal has_seen_face
+            if has_seen_face:
+                faces = mesh.process(image).multi_face_landmarks
+            else:
+                # MediaPipe prints its last warning at the first face.
+                with quiet_mediapipe():
+                    faces = mesh.process(image).multi_face_landmarks
+                has_seen_face = bool(faces)
+            height, width = image.shape[:2]
+            points = [[(point.x, point.y, point.z) for point in face.landmark] for face in faces or ()]
+            return np.array(points).reshape(-1, LANDMARKS, 3) * (width, height, width)
+
+        return read
+
+
+class LandmarkDetector:
+    """Finds face-mesh landmarks in consecutive pictures of one clip. Use as a context manager, one for each clip.
+
+    The region of interest is placed by the landmarks of the previous picture. That is steadier than a new detection,
+    but a result then depends on about four earlier pictures: pass those first.
+    """
+
+    def __init__(self, several_faces: bool, detector: DetectorChoice = "auto") -> None:
+        self._mesh = MeshReader(MAX_FACES if several_faces else 1, True, detector)
+
+    def __enter__(self) -> "LandmarkDetector":
+        self._mesh.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._mesh.__exit__(kind, error, traceback)
+
+    def detect(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n l 2"]:
+        """Return the landmarks of all faces in the next picture of the clip, in pixels."""
+        return self._mesh.read(image)[..., :2]
+
+
+def second_difference_jitter(landmarks: Float[np.ndarray, "t l 2"]) -> float:
+    """Return the median length in pixels of the landmarks' second difference; NaN for fewer than three frames."""
+    differences = landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]
+    lengths = np.linalg.norm(differences, axis=-1)
+    return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else float("nan")

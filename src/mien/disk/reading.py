@@ -1,0 +1,215 @@
+"""Bounds on what is read: ordinary files of limited size, json with numbers of limited size, pictures of limited size.
+
+Everything here is plain Python, because options and paths are checked before any heavy library is imported.
+"""
+
+import errno
+import io
+import json
+import math
+import os
+import stat
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, cast
+
+from mien.machine.system import BINARY, NO_LINK, NO_WAIT
+
+MAX_SIDE = 8192
+"""Largest width or height of a picture in pixels, of those that are read and of those that are rendered."""
+_WHOLE_NUMBERS = range(-(1 << 63), 1 << 64)
+_MAX_DIGITS = 20
+"""Most characters of a whole number, with its sign. Python takes long to parse very many digits, and float() and numpy
+refuse numbers that do not fit."""
+_MAX_DEPTH = 50
+"""Most levels of nested lists and objects. Python has a limit of its own, but reaches it only later, when the content
+is shown or compared."""
+_MAX_SHOWN = 40
+"""Most characters of a name or number that a message shows."""
+_COSTS = {"[": 64, "{": 232, ",": 40}
+"""Bytes that Python takes for a list, an object, and a further entry with its number or text, about."""
+_MAX_PARSED_BYTES = 1 << 30
+"""Most memory that the content of a json text may take, in bytes. Empty lists take twenty times their text."""
+_ARCHIVE_END, _ARCHIVE_END_SIZE = b"PK\x05\x06", 22
+_END_OF_LARGE_ARCHIVE = b"PK\x06\x07"
+"""Marker of archives with more than 65,534 members, or of 4 GB and more."""
+_MAX_COMMENT_BYTES = 65535
+_MAX_DIRECTORY_BYTES = 1 << 20
+"""Largest list of members at the end of an archive, in bytes. Each member takes about 50."""
+_PLAIN_MEMBERS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+class NotOrdinaryError(ValueError):
+    """A path is not an ordinary file, but a folder, a pipe, a device or a socket, or a link that is not followed."""
+
+
+def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False, constants: bool = False) -> Any:
+    """The content of a json text. By default, all numbers in it are finite and fit into 64 bits.
+
+    Args:
+        text: the text.
+        unique_names: whether an object that holds a name twice is refused, for texts that people write.
+        any_size: whether numbers of any size are allowed, because the caller checks them and can name their place.
+        constants: whether NaN and infinity are allowed, for the same reason.
+
+    Raises:
+        ValueError: the text is not json, or it holds a number or a name that is refused, or lists that are nested too
+            deep, or it would take too much memory.
+    """
+    if sum(cost * text.count(sign) for sign, cost in _COSTS.items()) > _MAX_PARSED_BYTES:
+        raise ValueError("it holds too many lists, objects or numbers")
+    hooks: dict[str, Any] = {} if any_size else {"parse_int": _whole_number, "parse_float": _finite_number}
+    if not constants:
+        hooks["parse_constant"] = _refuse_constant
+    if unique_names:
+        hooks["object_pairs_hook"] = _object_of_unique_names
+    try:
+        content = json.loads(text, **hooks)
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+    level = [content]
+    for _ in range(_MAX_DEPTH):
+        level = [child for node in level for child in _children(node)]
+        if not level:
+            return content
+    raise ValueError(_TOO_DEEP)
+
+
+def read_bytes(path: Path | str, most: int) -> bytes:
+    """The bytes of an ordinary file, which may be reached through a link.
+
+    Raises:
+        ValueError: the file has more than `most` bytes, or is not ordinary.
+        OSError: the file is missing or cannot be read.
+    """
+    handle = open_handle(path, os.O_RDONLY, follow_link=True)
+    try:
+        size = os.fstat(handle).st_size
+        if size > most:
+            raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
+        # Do not read to the end of the file, because the file may grow meanwhile.
+        found = os.read(handle, size)
+        while len(found) < size and (more := os.read(handle, size - len(found))):
+            found += more
+        return found
+    finally:
+        os.close(handle)
+
+
+def open_ordinary(path: Path | str) -> IO[bytes]:
+    """Open an ordinary file for reading. The path may be a link, since it is the user who names it.
+
+    Raises:
+        NotOrdinaryError: it is a folder, a pipe, a device or a socket.
+        OSError: it is missing or cannot be read.
+    """
+    return os.fdopen(open_handle(path, os.O_RDONLY, follow_link=True), "rb")
+
+
+def short_lines(file: io.TextIOWrapper, most: int) -> Iterator[str]:
+    """The lines of a text, for readers of csv, which hold a line in memory many times over.
+
+    Raises:
+        ValueError: a line has `most` characters or more.
+    """
+    while line := file.readline(most):
+        if len(line) == most:
+            raise ValueError(f"a line has more than {most:,} characters")
+        yield line
+
+
+def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
+    """Open a zip archive whose list of members is of moderate size. Its members are checked by `open_member`.
+
+    Raises:
+        ValueError: the list is missing or too long.
+        zipfile.BadZipFile: the archive is damaged.
+    """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - _MAX_COMMENT_BYTES - _ARCHIVE_END_SIZE))
+    tail = file.read()
+    place = tail.rfind(_ARCHIVE_END)
+    if place < 0 or len(tail) < place + _ARCHIVE_END_SIZE:
+        raise ValueError("its end is missing: copy it again")
+    directory = int.from_bytes(tail[place + 12 : place + 16], "little")
+    if directory > _MAX_DIRECTORY_BYTES or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE_ARCHIVE):
+        raise ValueError("it has far more members than such a file")
+    return zipfile.ZipFile(file)
+
+
+def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> zipfile.ZipExtFile:
+    """Open a member of an archive for reading.
+
+    Raises:
+        ValueError: it is encrypted, or compressed in a way that Python may lack.
+    """
+    if member.compress_type not in _PLAIN_MEMBERS:
+        raise ValueError("is compressed in an unusual way")
+    try:
+        return cast(zipfile.ZipExtFile, archive.open(member))
+    except (RuntimeError, NotImplementedError) as error:
+        raise ValueError(f"cannot be unpacked ({str(error)[:_MAX_SHOWN]})") from None
+
+
+def open_handle(path: Path | str, flags: int, *, follow_link: bool) -> int:
+    """The descriptor of an ordinary file. Opening never waits, not even for a process that writes into a pipe.
+
+    Args:
+        path: the file. With `O_CREAT` among the flags, it is created if it is missing.
+        flags: flags of open(2).
+        follow_link: whether the path itself may be a link.
+
+    Raises:
+        NotOrdinaryError: it is a folder, a pipe, a device or a socket, or a link that is not followed.
+        OSError: it is missing or cannot be opened.
+    """
+    try:
+        handle = os.open(path, flags | NO_WAIT | BINARY | (0 if follow_link else NO_LINK), 0o666)
+    except OSError as error:
+        if error.errno in _NOT_ORDINARY or (error.errno == errno.ELOOP and not follow_link):
+            raise NotOrdinaryError("it is not an ordinary file") from None
+        raise
+    linked = not follow_link and not NO_LINK and Path(path).is_symlink()
+    if linked or not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise NotOrdinaryError("it is not an ordinary file")
+    return handle
+
+
+_NOT_ORDINARY = frozenset({errno.EISDIR, errno.ENXIO})
+"""Errors of open(2) for folders that are opened to be written, and for sockets and pipes that nobody reads."""
+_TOO_DEEP = "its lists or objects are nested too deep"
+
+
+def _children(node: Any) -> Iterator[Any]:
+    """The lists and objects directly inside a node."""
+    inner = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    return (child for child in inner if isinstance(child, (dict, list)))
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"it holds the number {name}")
+
+
+def _object_of_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        seen: set[str] = set()
+        twice = next(name for name, _ in pairs if name in seen or seen.add(name))
+        raise ValueError(f"it holds {twice[:_MAX_SHOWN]!r} twice")
+    return content
+
+
+def _whole_number(digits: str) -> int:
+    number = int(digits) if len(digits) <= _MAX_DIGITS else None
+    if number is None or number not in _WHOLE_NUMBERS:
+        raise ValueError(f"it holds a number of {len(digits.lstrip('-'))} digits")
+    return number
+
+
+def _finite_number(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError(f"it holds the number {digits[:_MAX_SHOWN]}")
+    return number

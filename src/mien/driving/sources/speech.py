@@ -1,0 +1,152 @@
+"""Motion from a voice: the jaw and the mouth open with its open vowels, and the head lives meanwhile.
+
+It knows no words, so it makes mouths that fit the rhythm of speech, not its sounds. An open vowel, such as a, has much
+energy at the first of its formants, and above 1,400 Hz. Closed ones (i, u) and sounds through closed lips (m, b) are as
+loud, but below. So the level of these two bands opens the jaw. It counts in dB above the noise floor of the file,
+because the ear hears it so and because recordings differ. Where most energy is at high frequencies (s, sh, i), the
+mouth is wide and less open; where it is at low ones (o, u), the lips are rounded. Where the level drops for a moment
+(p, b, m), the lips shut.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mien.driving.constants import DRIVING
+from mien.driving.motion import ARKIT_NAMES, Motion
+from mien.media.sound import RATE, read_sound
+from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+
+FPS = 30.0
+"""Moments a second of the motion."""
+
+
+def read_speech(path: Path) -> Motion:
+    """The motion for a file with sound. The same file gives the same motion.
+
+    Raises:
+        UserError: the file is missing, has no sound, or is longer than an hour.
+    """
+    return motion_of_sound(read_sound(path))
+
+
+def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
+    """The motion for a sound with one channel and `mien.media.sound.RATE` samples a second, -1..1."""
+    count = max(1, math.ceil(len(samples) / RATE * FPS))
+    loudness, level, low, high = _measured(samples, count)
+    shut = _shut(level, high)
+    opening = _smooth(_opening(loudness, level)) * (1 - shut)
+    low, high = _smooth(low), _smooth(high)
+    seconds = np.arange(count) / FPS
+    blink = np.array([blink_at(moment) for moment in seconds])
+    given = {
+        "jawOpen": DRIVING.speech_jaw * opening * (1 - DRIVING.speech_less_jaw * high),
+        "mouthLowerDownLeft": DRIVING.speech_lower_lip * opening,
+        "mouthLowerDownRight": DRIVING.speech_lower_lip * opening,
+        "mouthUpperUpLeft": DRIVING.speech_upper_lip * opening,
+        "mouthUpperUpRight": DRIVING.speech_upper_lip * opening,
+        "mouthFunnel": DRIVING.speech_funnel * opening * low,
+        "mouthStretchLeft": DRIVING.speech_stretch * opening * high,
+        "mouthStretchRight": DRIVING.speech_stretch * opening * high,
+        "mouthPressLeft": DRIVING.speech_press * shut,
+        "mouthPressRight": DRIVING.speech_press * shut,
+        "eyeBlinkLeft": blink,
+        "eyeBlinkRight": blink,
+    }
+    coefficients = np.zeros((count, len(ARKIT_NAMES)), np.float32)
+    for name, values in given.items():
+        coefficients[:, ARKIT_NAMES.index(name)] = values
+    still = np.zeros((count, 3), np.float32)
+    return Motion(FPS, coefficients, np.zeros((count, 2, 3), np.float32), sway_at(seconds), still, 0)
+
+
+def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Loudness and level of open vowels in dB around each moment, and how much is low and how much is high, 0..1."""
+    size = round(DRIVING.speech_window * RATE)
+    padded = np.pad(samples, (size // 2, size + RATE))
+    starts = np.round(np.arange(count) / FPS * RATE).astype(int)
+    window = np.hanning(size)
+    frequencies = np.fft.rfftfreq(size, 1 / RATE)
+    bands = [(frequencies >= lowest) & (frequencies < highest) for lowest, highest in DRIVING.speech_bands]
+    power, level, low, high = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    for index, start in enumerate(starts):
+        piece = padded[start : start + size].astype(np.float64)
+        piece = (piece - piece.mean()) * window
+        spectrum = np.abs(np.fft.rfft(piece)) ** 2
+        total = max(float(spectrum.sum()), 1e-20)
+        power[index] = float((piece**2).sum()) / float((window**2).sum())
+        shares = [max(float(spectrum[band].sum()) / total, DRIVING.speech_least_share) for band in bands]
+        level[index] = 10 * np.dot(DRIVING.speech_band_weights, np.log10(shares))
+        low[index] = spectrum[frequencies < DRIVING.speech_split[0]].sum() / total
+        high[index] = spectrum[frequencies > DRIVING.speech_split[1]].sum() / total
+    # Most voices have most of their energy in low sounds, so only the rest of the way is rounding.
+    loudness = 10 * np.log10(np.maximum(power, 1e-12))
+    return loudness, loudness + level, np.clip(2 * low - 1, 0, 1), np.clip(high, 0, 1)
+
+
+def _opening(loudness: Float[np.ndarray, " t"], level: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """How open the mouth is, 0..1. What is no louder than the noise floor does not open it, whatever its bands."""
+    if float(np.percentile(loudness, DRIVING.speech_loud)) < DRIVING.speech_silence:
+        return np.zeros(len(level))
+    return _above_floor(level) ** DRIVING.speech_exponent * (_above_floor(loudness) > 0)
+
+
+def _above_floor(decibels: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """How far each moment is above the noise floor, 0..1, where 1 is a loud voice."""
+    loud = float(np.percentile(decibels, DRIVING.speech_loud))
+    bounds = loud - DRIVING.speech_range[1], loud - DRIVING.speech_range[0]
+    floor = float(np.clip(np.percentile(decibels, DRIVING.speech_floor), *bounds))
+    above = (decibels - floor) / (loud - floor)
+    return np.clip((above - DRIVING.speech_gate) / (1 - DRIVING.speech_gate), 0, 1)
+
+
+def _shut(level: Float[np.ndarray, " t"], high: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """How shut the lips are in the midst of speech, 0..1: at p, b and m, the level drops for a moment without a hiss.
+
+    So it does at t and k, behind open lips. The mouth shuts there, too, for a tenth of a second.
+    """
+    reach = round(DRIVING.speech_shut_within * FPS)
+    around = np.pad(level, reach, constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(around, reach + 1)
+    drop = np.minimum(windows[: len(level)].max(1), windows[reach:].max(1)) - level
+    least, most = DRIVING.speech_shut_drop
+    found = np.clip((drop - least) / (most - least), 0, 1) * (1 - np.clip(DRIVING.speech_shut_hiss * high, 0, 1))
+    spread = np.pad(found, 1, mode="edge")
+    return np.maximum(found, DRIVING.speech_shut_beside * np.maximum(spread[:-2], spread[2:]))
+
+
+def _smooth(values: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    reach = math.ceil(3 * DRIVING.speech_smoothing * FPS)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (DRIVING.speech_smoothing * FPS)) ** 2)
+    padded = np.pad(values, reach, mode="edge")
+    return np.convolve(padded, weights / weights.sum(), mode="valid")
+
+
+def blink_at(seconds: float) -> float:
+    """How closed the lids are at a time, 0..1. There is one blink in each stretch of time, as in the exported page."""
+    every, closing, opening = DRIVING.speech_blink_every, DRIVING.speech_blink_closing, DRIVING.speech_blink_opening
+    stretch = math.floor(seconds / every)
+    since = seconds - every * (stretch + 0.7 * _random(stretch))
+    if not 0 <= since <= closing + opening:
+        return 0.0
+    return since / closing if since < closing else 1 - (since - closing) / opening
+
+
+def _random(seed: int) -> float:
+    """A number from 0 to 1 that an integer decides."""
+    x = math.sin(12.9898 * seed + 78.233) * 43758.5453
+    return x - math.floor(x)
+
+
+def sway_at(seconds: Float[np.ndarray, " t"]) -> Float32[np.ndarray, "t 3"]:
+    """Turns of a head that is never quite still, as axis-angle vectors in radians: sums of slow waves from 0."""
+    waves = np.stack([size * _wave(seconds, k) for k, size in enumerate(DRIVING.speech_sway)], axis=1)
+    turns = matrix_from_axis_angle(waves)
+    return axis_angle_from_matrix(turns[0].T @ turns).astype(np.float32)
+
+
+def _wave(seconds: Float[np.ndarray, " t"], k: int) -> Float[np.ndarray, " t"]:
+    slow, fast = 0.61 * (1 + 0.37 * k), 1.13 * (1 + 0.21 * k)
+    return np.sin(slow * seconds + 2.1 * k) + 0.6 * np.sin(fast * seconds + 4.3 * k)

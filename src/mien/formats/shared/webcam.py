@@ -1,0 +1,174 @@
+"""A webcam in a page: MediaPipe's face landmarker, embedded with its model (docs/web.md).
+
+webcam.html beside this file is built from web/ and committed. The landmarker's model comes with mien, in the folder
+`landmarker` beside this file, compressed and in two parts. The second holds the network for blend shapes, which only
+pages need, so that source distributions leave it out. The landmarker's code is that of the npm package
+@mediapipe/tasks-vision, which `make setup` puts into the same folder.
+"""
+
+import base64
+import gzip
+import hashlib
+import html
+import lzma
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from mien.disk.reading import read_bytes
+from mien.errors import UserError
+
+TEMPLATE = Path(__file__).with_name("webcam.html")
+NOTICES = Path(__file__).with_name("webcam_notices.txt")
+"""Copyright notices and licences of what the page embeds. A new version of the package needs another look at them."""
+PACKAGE, VERSION = "@mediapipe/tasks-vision", "0.10.35"
+"""The npm package, and the version that pages are tested with. Later versions send statistics to their maker."""
+PACKAGE_VARIABLE, MODEL_VARIABLE = "MIEN_TASKS_VISION", "MIEN_FACE_LANDMARKER"
+"""Environment variables that name the package's folder and the model's file, in place of mien's own."""
+OWN = Path(__file__).with_name("landmarker")
+"""Folder of what comes with mien: the model, its licence, and the files of the package, which `make landmarker` puts
+there."""
+POLICY = " blob: 'wasm-unsafe-eval'; worker-src blob:; connect-src 'none'; form-action 'none'; base-uri 'none'"
+"""What the page's policy allows in addition: scripts and a worker that are in the page itself. Nothing else, and no
+connection at all."""
+_FILES = {
+    "vision": ("vision_bundle.cjs", "7fba4f9807297e229371318df577e96fc9f1b3d93e79075e3798ade2fc790c9e"),
+    "loader": ("vision_wasm_internal.js", "e7fd9858e8e8f221d9b96eddc11f8e077f263e0b7bbd79d3cbe882b134274f8c"),
+    "wasm": ("vision_wasm_internal.wasm", "6a5c64584c2ab61c763b6e204afbdbc7ce1caf7f5216187322bca8df94f646bc"),
+}
+"""Files of the package, with their SHA-256. Other files are refused, because later versions send statistics."""
+_MEMBERS = {"face_detector.tflite", "face_landmarks_detector.tflite", "face_blendshapes.tflite"}
+"""Networks in a model that finds blend shapes."""
+_MOST_BYTES = 64 << 20
+"""Largest file that goes into a page."""
+_MODEL_PARTS = ("face_landmarker.task.xz.1", "face_landmarker.task.xz.2")
+"""The model in mien's own folder: parts that are decompressed one by one and put together."""
+_SHRUNK = ".xz"
+"""Further ending of files that lie compressed in mien's own folder, so that mien is quickly downloaded."""
+
+
+@dataclass(frozen=True)
+class WebcamFiles:
+    """Where the landmarker's files are."""
+
+    package: Path
+    """Folder of the npm package."""
+    model: Path | None = None
+    """The file face_landmarker.task. None for that of mien."""
+
+
+def find_webcam_files(model: Path | None = None) -> WebcamFiles:
+    """Return the landmarker's files on this machine.
+
+    The package is in the folder that MIEN_TASKS_VISION names, or else in that of mien.
+
+    Args:
+        model: The model's file. None for the one that MIEN_FACE_LANDMARKER names, or else for that of mien.
+
+    Raises:
+        UserError: one of them is missing, is of another version, or is no such model.
+    """
+    return WebcamFiles(_package(), _model(model))
+
+
+def webcam_part(files: WebcamFiles) -> str:
+    """Return what a page holds for the webcam, as html.
+
+    Raises:
+        UserError: a file cannot be read.
+    """
+    contents = {name: _read(_place(files.package, path)) for name, (path, _) in _FILES.items()}
+    contents["model"] = own_model() if files.model is None else _read(files.model)
+    parts = "\n".join(
+        f'<script type="application/octet-stream" id="webcam-{name}">{_packed(content)}</script>'
+        for name, content in contents.items()
+    )
+    page = TEMPLATE.read_text(encoding="utf-8").replace("{{notices}}", html.escape(NOTICES.read_text(encoding="utf-8")))
+    return page.replace("{{parts}}", parts)
+
+
+def own_model() -> bytes:
+    """Return the bytes of the face_landmarker.task that comes with mien.
+
+    Raises:
+        UserError: a part is missing, as where mien was built from its source distribution, or is damaged.
+    """
+    return b"".join(_read(OWN / part) for part in _MODEL_PARTS)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return _content(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+
+
+def _packed(content: bytes) -> str:
+    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a file, which may lie compressed.
+
+    Raises:
+        ValueError: the file is too large or damaged.
+        OSError: the file is missing or cannot be read.
+    """
+    content = read_bytes(path, _MOST_BYTES)
+    if _SHRUNK not in path.suffixes:
+        return content
+    try:
+        return lzma.LZMADecompressor(memlimit=4 * _MOST_BYTES).decompress(content, _MOST_BYTES)
+    except lzma.LZMAError as error:
+        raise ValueError(str(error)) from None
+
+
+def _place(folder: Path, name: str) -> Path:
+    """A file of the package, in whose own folder some lie in `wasm`. In mien's folder, some lie compressed."""
+    places = (folder / name, folder / "wasm" / name, folder / f"{name}{_SHRUNK}")
+    return next((path for path in places if path.is_file()), folder / name)
+
+
+def _package() -> Path:
+    named = os.environ.get(PACKAGE_VARIABLE)
+    folder = Path(named) if named else OWN
+    remedy = (
+        f"run `make landmarker` in mien's checkout, or unpack the result of `npm pack {PACKAGE}@{VERSION}` and set "
+        f"{PACKAGE_VARIABLE} to its folder"
+    )
+    for name, expected in _FILES.values():
+        path = _place(folder, name)
+        try:
+            content = _content(path)
+        except (OSError, ValueError):
+            raise UserError(f"{folder}: --webcam needs {name} of the npm package {PACKAGE}; {remedy}") from None
+        if hashlib.sha256(content).hexdigest() != expected:
+            raise UserError(f"{path}: is not that of version {VERSION} of {PACKAGE}, which pages need; {remedy}")
+    return folder
+
+
+def _model(given: Path | None) -> Path | None:
+    named = os.environ.get(MODEL_VARIABLE)
+    path = given or (Path(named) if named else None)
+    own = all((OWN / part).is_file() for part in _MODEL_PARTS)
+    if path is None and own:
+        return None
+    if path is None:
+        raise UserError(
+            "--webcam needs MediaPipe's network for blend shapes, which mien's source distribution leaves out: install "
+            "mien from a wheel or a checkout, or give MediaPipe's face_landmarker.task with --webcam-model"
+        )
+    remedy = "give MediaPipe's face landmarker with blend shapes" + (", or leave it out: mien has one" if own else "")
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; {remedy}")
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError
+        with zipfile.ZipFile(path) as archive:
+            sound = set(archive.namelist()) >= _MEMBERS
+    except (OSError, ValueError, zipfile.BadZipFile):
+        sound = False
+    if not sound:
+        raise UserError(f"{path}: is no face_landmarker.task with blend shapes; {remedy}")
+    return path

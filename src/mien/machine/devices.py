@@ -1,0 +1,60 @@
+"""The device that holds the tensors of training and rendering: the CPU, or a CUDA GPU through gsplat."""
+
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Literal
+
+from mien.errors import UserError
+from mien.machine.progress import say
+
+if TYPE_CHECKING:
+    import torch
+
+DeviceName = Literal["cpu", "cuda", "auto"]
+"""`auto` chooses a CUDA GPU if torch finds one and gsplat is installed, and the CPU otherwise."""
+
+_OR_CPU = "or leave --device cuda out to use the processor"
+
+
+def check_device(name: DeviceName) -> None:
+    """Check a device name as far as that is possible without torch.
+
+    Raises:
+        UserError: CUDA is asked for but gsplat is not installed.
+    """
+    if name == "cuda" and find_spec("gsplat") is None:
+        raise UserError(
+            "--device cuda: needs a CUDA GPU and gsplat, which is not installed; if there is such a GPU, install "
+            "gsplat with `.venv/bin/uv pip install gsplat==1.5.3` (it compiles its kernels at first use, with the CUDA "
+            f"toolkit's nvcc), {_OR_CPU}"
+        )
+
+
+def choose_device(name: DeviceName) -> "torch.device":
+    """The device for a name. Prints a message if it is a GPU, or if `auto` finds none.
+
+    Raises:
+        UserError: CUDA is asked for, but torch finds no GPU or gsplat is not installed.
+    """
+    import torch
+
+    if name == "cpu":
+        return torch.device("cpu")
+    if name == "auto" and not (torch.cuda.is_available() and find_spec("gsplat") is not None):
+        say("--device auto: torch finds no CUDA GPU, or gsplat is not installed; using the processor")
+        return torch.device("cpu")
+    check_device(name)
+    if not torch.cuda.is_available():
+        built = "is built without CUDA" if torch.version.cuda is None else f"(CUDA {torch.version.cuda}) finds no GPU"
+        raise UserError(
+            f"--device cuda: torch {torch.__version__} {built}; check that `nvidia-smi` lists a GPU and that its "
+            f"driver is new enough, {_OR_CPU}"
+        )
+    say(f"{torch.cuda.get_device_name()}: gsplat compiles its kernels at first use, which takes some minutes, once")
+    return torch.device("cuda")
+
+
+def like_on(device: "torch.device | str") -> "torch.Tensor":
+    """A float32 scalar on a device, to pass to the method `to(like)` of the value objects."""
+    import torch
+
+    return torch.zeros((), device=device)

@@ -1,0 +1,259 @@
+"""A camera that is read while it films: a device, a stream, or a file that plays in real time.
+
+A thread of its own reads and keeps only the newest frame, so that slow work never makes the picture older.
+"""
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import av
+import av.error
+import numpy as np
+from av.container import InputContainer
+from av.video.stream import VideoStream
+from jaxtyping import UInt8
+
+from mien.capture.constants import CAPTURE
+from mien.errors import UserError
+from mien.media.camera_names import CameraName, remedy
+from mien.media.colors import UNSPECIFIED
+from mien.media.display import Display, brought_to, has_shape
+from mien.media.video import DEFAULT_FPS
+from mien.media.video_file import find_streams, open_video, read_container_tags
+
+_ASKED = {"framerate": "30", "video_size": "640x480"}
+"""What a device is asked for first. One that cannot do it gives its own default."""
+_STREAM = {"flags": "low_delay", "timeout": "5000000"}
+"""What a stream is asked for: no reordering, and an error after five seconds without an answer (in microseconds)."""
+_RETRY_SECONDS, _PATIENCE_SECONDS = 1.0, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """A frame of a camera."""
+
+    number: int
+    """Number of frames before it."""
+    seconds: float
+    """Time of the camera's clock at which the frame came."""
+    picture: UInt8[np.ndarray, "h w 3"]
+
+
+class LiveCamera:
+    """Reads a camera in a thread. Use as a context manager.
+
+    If the camera vanishes, the thread says so, waits, and takes it up again. A file ends, or starts again.
+    """
+
+    def __init__(
+        self,
+        name: CameraName,
+        again: bool,
+        say: Callable[[str], None] = lambda text: None,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[threading.Event, float], object] = threading.Event.wait,
+    ) -> None:
+        """Prepare to read a camera.
+
+        Args:
+            name: The camera.
+            again: Whether a file starts again at its end.
+            say: Is called with one line when the camera vanishes and when it is back.
+            clock: Returns the time in seconds.
+            wait: Waits for an event, at most so many seconds: between the frames of a file, and for a camera that has
+                vanished.
+        """
+        self.name = name
+        self._again, self._say, self._clock, self._wait = again, say, clock, wait
+        self._changed = threading.Condition()
+        self._newest: LiveFrame | None = None
+        self._stopping = threading.Event()
+        self.ended = False
+        """Whether a file has ended, or an error has ended the thread."""
+        self.is_lost = False
+        """Whether the camera has vanished and is waited for."""
+        self.error: BaseException | None = None
+        """What ended the thread, if it is a bug."""
+        self.frames = 0
+        """Number of frames so far."""
+        self._thread = threading.Thread(target=self._run, name="mien-camera", daemon=True)
+
+    def __enter__(self) -> "LiveCamera":
+        """Open the camera.
+
+        Raises:
+            UserError: it cannot be opened. The message names the cameras that exist.
+        """
+        self._opened = self._open()
+        return self
+
+    def start(self) -> None:
+        """Start to read."""
+        self._thread.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._stopping.set()
+        with self._changed:
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            # A device may block in its driver; the thread is a daemon, and ends with the process.
+            self._thread.join(_PATIENCE_SECONDS)
+
+    def newest(self, after: int, seconds: float) -> LiveFrame | None:
+        """The newest frame whose number is above `after`. Wait for it; None if none comes in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_new(after) or self.ended or self._stopping.is_set(), seconds)
+            return self._newest if self._is_new(after) else None
+
+    def _is_new(self, after: int) -> bool:
+        return self._newest is not None and self._newest.number > after
+
+    def _open(self) -> "contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]]":
+        source = _file(Path(self.name.device)) if self.name.is_file else _device(self.name)
+        frames = source.__enter__()
+        return _Opened(source, frames)
+
+    def _run(self) -> None:
+        try:
+            opened = self._opened
+            while not self._stopping.is_set():
+                if opened is None:
+                    opened = self._reopen()
+                    continue
+                with opened as frames:
+                    self._read(frames)
+                opened = None
+                if self.name.is_file and not self._again:
+                    break
+                if not self.name.is_file:
+                    self._lose()
+        except BaseException as error:  # noqa: BLE001
+            self.error = error
+        with self._changed:
+            self.ended = True
+            self._changed.notify_all()
+
+    def _reopen(self) -> "contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]] | None":
+        if not self.name.is_file:
+            self._wait(self._stopping, _RETRY_SECONDS)
+        try:
+            return None if self._stopping.is_set() else self._open()
+        except UserError:
+            return None
+
+    def _lose(self) -> None:
+        """Say once that the camera is away."""
+        if not self.is_lost and not self._stopping.is_set():
+            self.is_lost = True
+            self._say(f"{self.name}: gives no more pictures; mien waits until it is back")
+
+    def _read(self, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
+        """Keep each frame when it comes, until the end or an error of the device."""
+        container = UNSPECIFIED
+        if self.name.is_file:
+            path = Path(self.name.device)
+            container, _ = read_container_tags(path, find_streams(path)[0])
+        display = Display(str(self.name), 1.0, CAPTURE.live_side, container)
+        began: float | None = None
+        size: tuple[int, int] | None = None
+        with contextlib.suppress(av.error.FFmpegError, OSError):
+            for due, frame in frames:
+                now = self._clock()
+                if self.name.is_file:
+                    began = now - due if began is None else began
+                    self._wait(self._stopping, max(0.0, began + due - now))
+                    now = max(now, began + due)
+                if self._stopping.is_set():
+                    return
+                picture = display.show(frame)
+                size = size or (picture.shape[1], picture.shape[0])
+                if not has_shape(picture, size):
+                    raise UserError(
+                        f"{self.name}: the picture changes from {size[0]}x{size[1]} to {picture.shape[1]}x"
+                        f"{picture.shape[0]} at {due:.1f} s; start again with what comes after"
+                    )
+                self._keep(LiveFrame(self.frames, now, np.ascontiguousarray(brought_to(picture, size))))
+
+    def _keep(self, frame: LiveFrame) -> None:
+        if self.is_lost:
+            self.is_lost = False
+            self._say(f"{self.name}: is back")
+        with self._changed:
+            self._newest = frame
+            self.frames += 1
+            self._changed.notify_all()
+
+
+class _Opened(contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]]):
+    """An entered source, which is left at the end of the `with` statement."""
+
+    def __init__(
+        self, source: contextlib.AbstractContextManager[object], frames: Iterator[tuple[float, av.VideoFrame]]
+    ) -> None:
+        self._source, self._frames = source, frames
+
+    def __enter__(self) -> Iterator[tuple[float, av.VideoFrame]]:
+        return self._frames
+
+    def __exit__(self, *error: object) -> None:
+        with contextlib.suppress(av.error.FFmpegError, OSError):
+            self._source.__exit__(None, None, None)
+
+
+@contextlib.contextmanager
+def _file(path: Path) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
+    with open_video(path) as (container, stream):
+        fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
+        yield _timed(container, stream, fps)
+
+
+@contextlib.contextmanager
+def _device(name: CameraName) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
+    container = _open_device(name)
+    with container:
+        if not container.streams.video:
+            raise UserError(f"--by {name}: has no pictures; {_remedy(name)}")
+        yield _timed(container, container.streams.video[0], DEFAULT_FPS)
+
+
+def _open_device(name: CameraName) -> InputContainer:
+    attempts = [_STREAM] if name.is_stream else [_ASKED, {}]
+    reason = ""
+    for options in attempts:
+        try:
+            return av.open(name.device, "r", format=None if name.is_stream else name.format, options=options)
+        except ValueError:
+            raise UserError(
+                f"--camera-format {name.format}: this PyAV does not have it; on {sys.platform}, leave it out"
+            ) from None
+        except (av.error.FFmpegError, OSError) as error:
+            reason = error.strerror or str(error)
+            if isinstance(error, FileNotFoundError):
+                break
+    raise UserError(f"--by {name}: cannot be opened ({reason}); {_remedy(name)}")
+
+
+def _remedy(name: CameraName) -> str:
+    return "check the address, and that it can be reached from here" if name.is_stream else remedy()
+
+
+def _timed(container: InputContainer, stream: VideoStream, fps: float) -> Iterator[tuple[float, av.VideoFrame]]:
+    """Frames with their times in seconds from the first one."""
+    first: float | None = None
+    latest = -1 / fps
+    for frame in container.decode(stream):
+        seconds = latest + 1 / fps
+        if frame.pts is not None and frame.time_base is not None:
+            absolute = float(frame.pts * frame.time_base)
+            first = absolute if first is None else first
+            seconds = max(absolute - first, latest)
+        latest = seconds
+        yield seconds, frame

@@ -1,0 +1,193 @@
+"""Many pictures of one size: written one by one, and read as an array that does not fill the memory."""
+
+import contextlib
+import math
+import mmap
+import os
+import struct
+import tempfile
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from mien.disk.files import cannot_write, write_atomically
+from mien.errors import UserError
+from mien.inside import open_to_read
+from mien.machine import system
+
+MAX_KEPT_BYTES = 256 << 20
+"""Number of bytes that a map hands out before it gives its pages back, and largest stack that is held in memory."""
+_PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_MAX_PNG_HEADER_BYTES = 1 << 16
+"""Most bytes of a PNG file besides those of its pixels."""
+_DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)
+"""None if the system has no such call (Windows)."""
+
+
+class _Tally:
+    """Counts the bytes handed out by a map and all of its views."""
+
+    def __init__(self) -> None:
+        self.handed_out = 0
+
+
+class PictureMap(np.memmap):
+    """A read-only memory map that gives its pages back to the system now and then.
+
+    In a plain map, every page that was read once stays in the process's memory, up to the whole file. Pages that were
+    given back are read again when they are needed, mostly from the system's file cache.
+    """
+
+    _tally: _Tally | None = None
+
+    def __array_finalize__(self, obj: Any) -> None:
+        """Let views share the count of the array that they view."""
+        super().__array_finalize__(obj)
+        self._tally = getattr(obj, "_tally", None)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Index the map, and count the bytes that are handed out."""
+        found = super().__getitem__(index)
+        if isinstance(found, np.ndarray) and self._tally is not None:
+            self._tally.handed_out += found.nbytes
+            if self._tally.handed_out > MAX_KEPT_BYTES:
+                self._tally.handed_out = 0
+                self._give_back()
+        return found
+
+    def _give_back(self) -> None:
+        pages = getattr(self, "_mmap", None)
+        if pages is not None and _DONT_NEED is not None:
+            pages.madvise(_DONT_NEED)
+
+
+def map_pictures(file: Any, shape: tuple[int, ...]) -> PictureMap:
+    """Map the pictures [..., h, w] or [..., h, w, 3] in a raw file, given as a path or an open file."""
+    pictures = cast(PictureMap, PictureMap(file, np.uint8, "r", shape=shape))
+    pictures._tally = _Tally()
+    return pictures
+
+
+class PictureStack:
+    """Pictures that are written in any order and read as one array. A small array is in memory, a large one on disk.
+
+    The file on disk has no name, and is removed together with the array.
+    """
+
+    def __init__(self, shape: tuple[int, ...], folder: Path | None = None) -> None:
+        """Make room for an array of the given `shape`, [t, c, h, w].
+
+        A large array is in `folder`, by default in the system's folder for temporary files.
+
+        Raises:
+            CannotWriteError: the folder cannot be written to.
+        """
+        self._shape, self._folder = shape, folder or Path(tempfile.gettempdir())
+        self._file = None
+        if math.prod(shape) <= MAX_KEPT_BYTES:
+            self._array = np.zeros(shape, np.uint8)
+            return
+        try:
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (open as long as this object lives)
+            weakref.finalize(self, self._file.close)
+            os.truncate(self._file.fileno(), math.prod(shape))
+        except OSError as error:
+            raise cannot_write(self._folder, error) from None
+
+    def write(self, timestep: int, camera: int, picture: UInt8[np.ndarray, "h w"]) -> None:
+        """Write one picture to its place.
+
+        Raises:
+            CannotWriteError: the disk is full.
+        """
+        if self._file is None:
+            self._array[timestep, camera] = picture
+            return
+        try:
+            # A write through a memory map would crash on a full disk, not raise an error.
+            write_at(self._file.fileno(), picture, (timestep * self._shape[1] + camera) * picture.nbytes)
+        except OSError as error:
+            raise cannot_write(self._folder, error) from None
+
+    def array(self) -> UInt8[np.ndarray, "t c h w"]:
+        """All pictures. Pictures that were not written are zero."""
+        return self._array if self._file is None else map_pictures(self._file, self._shape)
+
+
+def png_fits(data: bytes) -> bool:
+    """Whether the chunks of a PNG lie within its bytes. A decoder takes memory for the length that each announces."""
+    position = len(_PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        length, kind = int.from_bytes(data[position : position + 4], "big"), data[position + 4 : position + 8]
+        position += 12 + length
+        if position > len(data):
+            return False
+        if kind == b"IEND":
+            return True
+    return False
+
+
+def encode_picture(picture: UInt8[np.ndarray, "h w *c"], ending: str = ".png", options: Sequence[int] = ()) -> bytes:
+    """The content of a picture file, for a grey, an RGB or an RGBA picture. `options` are those of `cv2.imencode`."""
+    if picture.ndim == 3:
+        picture = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR)
+    encoded, data = cv2.imencode(ending, picture, options)
+    assert encoded, f"cannot encode a picture of shape {picture.shape}"
+    return data.tobytes()
+
+
+def write_png(path: Path, picture: UInt8[np.ndarray, "h w *c"]) -> None:
+    """Write one grey, RGB or RGBA picture atomically."""
+    data = encode_picture(picture)
+    write_atomically(path, lambda aside: aside.write_bytes(data))
+
+
+def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndarray, "..."]:
+    """Read a picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB). Its header is checked first.
+
+    Args:
+        path: the file, which must not be a link.
+        shape: the shape that the picture must have.
+        remedy: advice for the message if the picture is missing or damaged.
+
+    Raises:
+        UserError: it is missing, damaged, or of another shape.
+    """
+    try:
+        with open_to_read(path) as file:
+            # A PNG of noise is a little larger than its pixels; a file that is much longer counts as damaged.
+            most = 2 * math.prod(shape) + _MAX_PNG_HEADER_BYTES
+            data = file.read(min(most, os.fstat(file.fileno()).st_size))
+    except FileNotFoundError:
+        raise UserError(f"{path}: missing; {remedy}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+    if not data.endswith(_PNG_END):
+        # Check the end here, because libpng would only print a complaint and return half a picture.
+        raise UserError(f"{path}: truncated; {remedy}")
+    picture = None
+    # Check the width and height in the header first, because the decoder would allocate them.
+    if data[:8] == _PNG_SIGNATURE and png_fits(data) and data[16:24] == struct.pack(">II", shape[1], shape[0]):
+        with contextlib.suppress(cv2.error):
+            flags = cv2.IMREAD_COLOR_RGB if len(shape) == 3 else cv2.IMREAD_GRAYSCALE
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if picture is None or picture.shape != shape:
+        raise UserError(f"{path}: damaged, or not of {shape[1]}x{shape[0]} pixels; {remedy}")
+    return picture.astype(np.uint8, copy=False)
+
+
+def write_at(file: int, picture: UInt8[np.ndarray, "..."], offset: int) -> None:
+    """Write a picture's bytes at an offset in an open file.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    data = np.ascontiguousarray(picture).data.cast("B")
+    while data:
+        written = system.write_at(file, data, offset)
+        data, offset = data[written:], offset + written

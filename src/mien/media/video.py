@@ -1,0 +1,307 @@
+"""Step 1: read video files one frame at a time, and write them, with PyAV (no system ffmpeg)."""
+
+import contextlib
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import av
+import av.error
+import numpy as np
+from av.container import InputContainer
+from av.video.codeccontext import VideoCodecContext
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
+from av.video.stream import VideoStream
+from jaxtyping import UInt8
+
+from mien.disk.files import write_atomically
+from mien.errors import UserError
+from mien.machine.progress import say
+from mien.media.colors import Colors, colors_of
+from mien.media.display import ACCURATE, Display, brought_to, has_shape
+from mien.media.fields import Deinterlace, FieldOrder, combs, deinterlace, no_combs
+from mien.media.sound import add_sound
+from mien.media.video_file import TOO_MANY_PIXELS, create_video, find_streams, open_video, read_container_tags
+
+_THREADS = 2
+DEFAULT_FPS = 25.0
+"""Frames a second of a stream that names no rate."""
+_WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+"""Decoders that read the alpha of a codec, if others do not."""
+_MAX_PROBED = 100
+"""Packets at the beginning in which a probe looks for a picture."""
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """Facts that a video file states about itself. Only decoding shows whether they are true."""
+
+    fps: float
+    """Average frames per second."""
+    frames: int
+    """Expected number of frames; 0 if the file does not state it."""
+    hdr: str
+    """HDR transfer function: PQ, HLG, or empty for ordinary video."""
+    has_field_pictures: bool
+    """Whether its pictures are single fields of interlaced video, of half the height (HEVC)."""
+    stream: int
+    """Index of the stream that is read."""
+    other_streams: tuple[int, ...]
+    """Indices of the file's other streams of pictures."""
+
+
+class LazyFrame(NamedTuple):
+    """A frame that was read. Its picture is made only on request."""
+
+    seconds: float
+    """Time since the first frame, in seconds."""
+    picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
+    """Makes the sRGB picture."""
+    size: Callable[[], tuple[int, int]]
+    """Returns the width and height in pixels of the picture as it is shown, before it is shrunk."""
+    is_deinterlaced: bool = False
+    """Whether the picture is made of an interlaced frame."""
+    alpha: Callable[[], UInt8[np.ndarray, "h w"] | None] = lambda: None
+    """Makes the alpha of the picture as it is shown, before it is shrunk; None if there is none or it is opaque."""
+    combs: Callable[[], float] = no_combs
+    """Measures the combs of the frame as stored, as a part of its pixels (`mien.media.fields.combs`)."""
+
+
+def probe_video(path: Path, wanted: int | None = None) -> VideoInfo:
+    """Return the frame rate, the expected number of frames, and the HDR transfer function.
+
+    Args:
+        path: path of the video.
+        wanted: index of the stream that is read; by default that of `find_streams`.
+
+    Raises:
+        UserError: the file is missing, is no video, or lacks the stream.
+    """
+    with open_video(path, wanted) as (container, stream):
+        fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
+        if stream.duration is not None and stream.time_base is not None:
+            seconds = float(stream.duration * stream.time_base)
+        else:
+            seconds = (container.duration or 0) / av.time_base
+        colors, order = _container_tags(path, stream)
+        first = _first_frame(container, stream)
+        hdr = colors_of(first, colors).hdr if first is not None else ""
+        has_field_pictures = first is not None and first.interlaced_frame and order.has_field_pictures
+        others = tuple(index for index in find_streams(path) if index != stream.index)
+        frames = stream.frames or round(seconds * fps)
+        return VideoInfo(fps, frames, hdr, has_field_pictures, stream.index, others)
+
+
+def _container_tags(path: Path, stream: VideoStream) -> tuple[Colors, FieldOrder]:
+    colors, order = read_container_tags(path, stream.index)
+    return colors, FieldOrder(stream.codec_context.name, order)
+
+
+def _first_frame(container: InputContainer, stream: VideoStream) -> av.VideoFrame | None:
+    """Return the first frame that can be decoded, or None if the beginning is damaged.
+
+    Only frames say for sure what the codec states.
+    """
+    with contextlib.suppress(av.error.FFmpegError, OSError):
+        for packet in itertools.islice(container.demux(stream), _MAX_PROBED):
+            with contextlib.suppress(av.error.FFmpegError):
+                for frame in packet.decode():
+                    return frame
+    return None
+
+
+def count_frames(path: Path, wanted: int | None = None) -> int:
+    """Count the frames in a video's stream (`probe_video`) by reading its packets without decoding them.
+
+    Raises:
+        UserError: the file is missing or is no video.
+    """
+    with open_video(path, wanted) as (container, stream):
+        try:
+            # An edit list discards frames that others need for decoding.
+            return sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
+        except av.error.FFmpegError as error:
+            raise UserError(f"{path}: is damaged ({error.strerror or error}); copy or record it again") from None
+
+
+def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
+    """Yield every frame in display order: its time in seconds from the first frame, and its sRGB picture.
+
+    Pictures of the first one's shape have its size. Others keep their own.
+
+    The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.media.tone`), and
+    interlaced frames are deinterlaced, one picture for each frame (`mien.media.fields`). Damaged parts are skipped
+    with a warning.
+
+    Args:
+        path: path of the video.
+        longest_side: side in pixels to which larger pictures are shrunk (area-averaged). 0 keeps the size.
+
+    Raises:
+        UserError: the file is missing, is no video, or no frame of it can be decoded.
+    """
+    first: tuple[int, int] | None = None
+    for frame in read_lazily(path, longest_side):
+        picture = frame.picture()
+        first = first or (picture.shape[1], picture.shape[0])
+        yield frame.seconds, brought_to(picture, first) if has_shape(picture, first) else picture
+
+
+def read_lazily(
+    path: Path, longest_side: int = 0, mode: Deinterlace = "auto", wanted: int | None = None
+) -> Iterator[LazyFrame]:
+    """Yield frames as `read_video_frames` does, but convert only pictures that are requested.
+
+    The conversion is most of the work.
+    """
+    with open_video(path, wanted) as (container, stream):
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = _THREADS
+        interval = 1.0 / float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
+        first: float | None = None
+        latest = -interval
+        aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
+        colors, order = _container_tags(path, stream)
+        display = Display(str(path), float(aspect) if aspect else 1.0, longest_side, colors)
+        for frame, shown, is_deinterlaced in deinterlace(_decode(path, container, stream), order, mode):
+            if frame.pts is None or frame.time_base is None:
+                seconds = latest + interval
+            else:
+                absolute = float(frame.pts * frame.time_base)
+                first = absolute if first is None else first
+                seconds = absolute - first
+            # Times must increase for everything that differentiates over time, but broken files repeat them.
+            latest = seconds if seconds > latest else latest + interval
+            yield LazyFrame(
+                latest,
+                partial(display.show, shown),
+                partial(display.size_of, shown),
+                is_deinterlaced,
+                partial(display.alpha, shown),
+                partial(combs, frame),
+            )
+
+
+def write_video(
+    path: Path,
+    frames: Iterable[UInt8[np.ndarray, "h w 3"]],
+    fps: int | float,
+    crf: int = 18,
+    preset: str = "medium",
+    sound: tuple[Path, float] | None = None,
+) -> None:
+    """Write sRGB frames as H.264 (yuv420p, BT.709), atomically. Odd sizes get a repeated last row or column.
+
+    Args:
+        path: path of the video. Its ending, usually .mp4, chooses the container.
+        frames: frames of one size. They are read once, so a generator will do.
+        fps: frames per second.
+        crf: x264's constant rate factor: 0 is lossless, 18 looks lossless, 51 is worst.
+        preset: x264's preset. `veryfast` takes a third of the time and compresses somewhat worse.
+        sound: a file with sound for the video, and the video's length in seconds.
+
+    Raises:
+        UserError: `frames` is empty, or the file cannot be written.
+    """
+    iterator = iter(frames)
+    first = next(iterator, None)
+    if first is None:
+        raise UserError(f"{path}: no frames to write; check the selection of frames")
+    # x264's macroblock tree reads memory that it has not written, so equal pictures could give different files.
+    options = {"crf": str(crf), "preset": preset, "mbtree": "0"}
+    write_atomically(
+        path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, options, sound)
+    )
+
+
+def _encode(
+    path: Path,
+    frames: Iterable[np.ndarray],
+    shape: tuple[int, ...],
+    fps: int | float,
+    options: dict[str, str],
+    sound: tuple[Path, float] | None = None,
+) -> None:
+    height, width = shape[:2]
+    with create_video(path) as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options=options)
+        stream.width, stream.height, stream.pix_fmt = width + width % 2, height + height % 2, "yuv420p"
+        context = stream.codec_context
+        context.thread_count = _THREADS
+        # Players assume BT.709 for matrix, primaries and transfer, and studio range. The file also says so.
+        context.colorspace = context.color_primaries = context.color_trc = 1
+        context.color_range = ColorRange.MPEG
+        packets = add_sound(container, *sound) if sound is not None else iter(())
+        heard = next(packets, None)
+        reformatter = VideoReformatter()
+        for number, image in enumerate(frames):
+            # Sound goes into the file just before the pictures of its time.
+            while heard is not None and float((heard.pts or 0) * (heard.time_base or 0)) <= number / fps:
+                container.mux(heard)
+                heard = next(packets, None)
+            assert image.shape == shape, f"frames of {shape}, then one of {image.shape}"
+            assert image.dtype == np.uint8, image.dtype
+            even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+            frame = reformatter.reformat(
+                av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24"),
+                format="yuv420p",
+                dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG,
+                interpolation=ACCURATE,
+            )
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+        container.mux([packet for packet in (heard, *packets) if packet is not None])
+
+
+def _decoder(stream: VideoStream) -> Callable[[av.Packet], list[av.VideoFrame]]:
+    """Return what decodes the packets of a stream. FFmpeg's own decoders of VP8 and VP9 leave out the alpha."""
+    name = _WITH_ALPHA.get(stream.codec_context.name)
+    if name is None or stream.metadata.get("alpha_mode") != "1":
+        return lambda packet: [frame for frame in packet.decode() if isinstance(frame, av.VideoFrame)]
+    context = av.CodecContext.create(name, "r")
+    assert isinstance(context, VideoCodecContext)
+    context.options = stream.codec_context.options
+
+    def decode(packet: av.Packet) -> list[av.VideoFrame]:
+        frames = context.decode(packet if packet.size else None)
+        for frame in frames:
+            frame.time_base = stream.time_base
+        return frames
+
+    return decode
+
+
+def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
+    """Yield all frames. Parts that cannot be decoded are skipped, counted, and reported at the end."""
+    damaged, decoded = 0, 0
+    packets, decode = container.demux(stream), _decoder(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+        except av.error.FFmpegError:
+            damaged += 1
+            break
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error.strerror}); copy it again") from None
+        if packet is None:
+            break
+        try:
+            frames = decode(packet)
+        except av.error.FFmpegError:
+            damaged += 1
+            continue
+        for frame in frames:
+            decoded += 1
+            yield frame
+    if decoded == 0:
+        raise UserError(
+            f"{path}: no frame of the video can be decoded (it is damaged, or has {TOO_MANY_PIXELS}); convert it to "
+            "H.264 or record it again"
+        )
+    if damaged:
+        say(f"warning: {path}: {damaged} damaged parts of the video were skipped")

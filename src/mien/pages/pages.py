@@ -1,0 +1,53 @@
+"""HTML from templates. Each room keeps its own in a folder `templates/`; `mien/templates` has what all pages share.
+
+A page is one file that can be sent around. It needs no network and no scripts, and works in light, in dark and on
+paper. The templates escape every text. Python code prepares what they show.
+"""
+
+import re
+from functools import cache
+from importlib.resources import files
+
+import jinja2
+from markupsafe import Markup, escape
+
+LIVING_PAGE = "me.html"
+"""Name of the living avatar's page in a workspace."""
+
+
+def render(template: str, **content: object) -> Markup:
+    """HTML from a template, which is named by its path in `mien`. Text in `content` is escaped, `Markup` is not."""
+    return Markup(_templates().get_template(template).render(content))
+
+
+def with_code(text: str) -> Markup:
+    """The text as HTML, with text between backticks as code. Templates know it as the filter `with_code`."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+
+
+@cache
+def _templates() -> jinja2.Environment:
+    folder = files("mien")
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda name: folder.joinpath(name).read_text(encoding="utf-8")),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["with_code"] = with_code
+    environment.globals |= {"heat_gradient": _heat_gradient, "error_limit": _error_limit}
+    return environment
+
+
+def _heat_gradient() -> str:
+    # Pictures need torch, and pages without them do not.
+    from mien.media.pictures import heat_gradient
+
+    return heat_gradient()
+
+
+def _error_limit() -> str:
+    from mien.media.pictures import ERROR_LIMIT
+
+    return f"{ERROR_LIMIT * 255:.0f}"

@@ -1,0 +1,187 @@
+"""From trackings to aligned trackings, as the command line runs it. What is aligned stays as it is."""
+
+import hashlib
+import json
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mien.capture.store import read_capture
+from mien.disk.locks import hold
+from mien.disk.workspace import Workspace
+from mien.errors import UserError
+from mien.face.params import FaceParams
+from mien.inside import remove_tree
+from mien.machine.progress import say
+from mien.pipeline.train import read_together
+from mien.rotation import axis_angle_from_matrix
+from mien.storage import expect_whole, read_tensors, write_tensors
+from mien.tracking.files import read_tracking, write_tracking
+from mien.tracking.tracking import Tracking
+from mien.training.alignment import align
+from mien.training.alignment_settings import AlignmentSettings
+from mien.training.footage.sequence import Sequence
+from mien.training.run import outdated_sequences
+from mien.training.settings import TrainSettings
+
+_RECIPE = 3
+"""Version of the alignment. It is raised whenever the same tracking would be aligned differently."""
+_KEY = "aligned"
+"""Entry of a tracking's settings that says how it was aligned."""
+_BEFORE = "before_alignment.safetensors"
+"""Face parameters as `mien track` left them, beside the tracking."""
+_HELD_OUT = ("split", "held_out_sequences", "held_out_cameras")
+"""Settings of a run that say what the template does not see."""
+
+
+def run_alignment_stage(
+    workspace: Workspace,
+    names: list[str],
+    settings: AlignmentSettings,
+    training: TrainSettings,
+    *,
+    keep: bool = False,
+) -> None:
+    """Align the tracked faces of some sequences to a quick avatar, and write the trackings again.
+
+    What `mien track` left stays beside them, and every alignment starts from it. Trackings that are aligned with these
+    settings stay as they are.
+
+    Args:
+        workspace: The workspace.
+        names: Names of the sequences, which were tracked together.
+        settings: Settings of the alignment. Its `when` is not read.
+        training: Settings of the run that follows, which say what is held out.
+        keep: Whether trackings that are aligned with other settings stay, too, so that older runs can still be scored.
+
+    Raises:
+        BeingWrittenError: another process is writing one of the sequences.
+        UserError: as `mien.training.align`, or a tracking was changed in this moment.
+    """
+    loaded, face_model = read_together(workspace, names)
+    fingerprint = _fingerprint(loaded, settings, training)
+    found = [_aligned(sequence.tracking) for sequence in loaded]
+    if all(one.get("fingerprint") == fingerprint for one in found):
+        say(f"{', '.join(names)}: the tracking is aligned, nothing to do")
+        return
+    if keep and all(found):
+        if any(_held_out(one) != _held_out(_choices(settings, training)) for one in found):
+            say(
+                f"warning: {', '.join(names)}: aligned to an avatar that held out other frames than this run; `mien "
+                f"align {workspace.root}` with this --split and --hold-out aligns again"
+            )
+        return
+    before = [replace(sequence, tracking=_before(sequence)) for sequence in loaded]
+    folder = workspace.root / "sequences" / f".alignment-{fingerprint}"
+    with hold(*(workspace.sequence_dir(name) for name in names)):
+        for sequence in loaded:
+            _check_unchanged(sequence)
+        for other in workspace.root.glob("sequences/.alignment-*"):
+            if other != folder and other.is_dir():
+                remove_tree(other)  # kept for another tracking or other settings
+        say(f"{', '.join(names)}: frames are aligned to a quick avatar, which is trained first")
+        faces = align(before, face_model, settings, training, folder)
+        aligned = {"fingerprint": fingerprint, **_choices(settings, training)}
+        for sequence, face in zip(before, faces, strict=True):
+            _write(sequence, face, aligned)
+        remove_tree(folder)
+    _tell_outdated(workspace, names)
+
+
+def one_camera(workspace: Workspace, names: list[str]) -> bool:
+    """Whether each of some sequences was filmed by one camera."""
+    return all(len(read_capture(workspace.sequence_dir(name) / "capture").camera_ids) == 1 for name in names)
+
+
+def is_trained_on(workspace: Workspace, run: str, names: list[str]) -> bool:
+    """Whether a run exists that was trained on the present trackings of some sequences."""
+    run_dir = workspace.run_dir(run)
+    if not (run_dir / "config.json").is_file():
+        return False
+    trackings = {name: read_tracking(workspace.sequence_dir(name) / "tracking") for name in names}
+    return not outdated_sequences(run_dir, trackings)
+
+
+def _folder(sequence: Sequence) -> Path:
+    assert sequence.folder is not None, "read from a workspace"
+    return sequence.folder / "tracking"
+
+
+def _before(sequence: Sequence) -> Tracking:
+    """The tracking before any alignment.
+
+    Raises:
+        UserError: the file that holds it is missing or damaged.
+    """
+    tracking = sequence.tracking
+    if not _aligned(tracking):
+        return tracking
+    path, remedy = _folder(sequence) / _BEFORE, "`mien track --again`"
+    tensors, now = read_tensors(path, remedy), tracking.face.tensors()
+    with expect_whole(path, f"run {remedy}"):
+        if {name: tensor.shape for name, tensor in tensors.items()} != {name: now[name].shape for name in now}:
+            raise ValueError("it does not belong to the tracking beside it")
+        face = FaceParams(**tensors)
+    return replace(tracking, face=face, settings={k: v for k, v in tracking.settings.items() if k != _KEY})
+
+
+def _write(before: Sequence, face: FaceParams, aligned: dict[str, Any]) -> None:
+    tracking, path = before.tracking, _folder(before)
+    write_tensors(path / _BEFORE, tracking.face.tensors())
+    write_tracking(path, replace(tracking, face=face, settings={**tracking.settings, _KEY: aligned}))
+    turn, shift = _moved(tracking.face, face)
+    say(f"{before.name}: aligned; heads turned by {turn:.2f} degrees and moved by {shift:.1f} mm (medians)")
+
+
+def _check_unchanged(sequence: Sequence) -> None:
+    now = read_tracking(_folder(sequence)).face.tensors()
+    if not all(now[name].equal(tensor) for name, tensor in sequence.tracking.face.tensors().items()):
+        raise UserError(f"{_folder(sequence)}: was tracked again in this moment; run the same command again")
+
+
+def _moved(before: FaceParams, after: FaceParams) -> tuple[float, float]:
+    """The medians by which heads were turned, in degrees, and moved, in millimetres."""
+    turned = axis_angle_from_matrix(before.T_world_head[:, :3, :3].mT @ after.T_world_head[:, :3, :3])
+    shift = after.head_translation - before.head_translation
+    return float(turned.norm(dim=-1).median()) * 180 / torch.pi, float(shift.norm(dim=-1).median()) * 1000
+
+
+def _choices(settings: AlignmentSettings, training: TrainSettings) -> dict[str, Any]:
+    """Return, as json, what the result depends on beside the tracking."""
+    own = {name: value for name, value in asdict(settings).items() if name != "when"}
+    return own | {"seed": training.seed} | {name: _plain(getattr(training, name)) for name in _HELD_OUT}
+
+
+def _held_out(choices: dict[str, Any]) -> list[Any]:
+    return [choices.get(name) for name in _HELD_OUT]
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _fingerprint(sequences: list[Sequence], settings: AlignmentSettings, training: TrainSettings) -> str:
+    tracked = [[sequence.name, sequence.tracking.settings.get("fingerprint")] for sequence in sequences]
+    content = [_RECIPE, tracked, _choices(settings, training)]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _aligned(tracking: Tracking) -> dict[str, Any]:
+    found = tracking.settings.get(_KEY)
+    return found if isinstance(found, dict) else {}
+
+
+def _tell_outdated(workspace: Workspace, names: list[str]) -> None:
+    outdated = []
+    for run in workspace.run_names():
+        with suppress(UserError):  # a damaged run is reported when it is used
+            if not is_trained_on(workspace, run, names):
+                outdated.append(run)
+    if outdated:
+        say(
+            f"Trained on the tracking before its alignment: {', '.join(outdated)}. Such a run can still be rendered, "
+            "but neither resumed nor scored; train again under another name (--run NAME), or delete its folder first"
+        )

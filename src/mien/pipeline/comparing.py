@@ -1,0 +1,208 @@
+"""From workspaces and methods to one table, as the command line runs it."""
+
+import json
+from collections.abc import Sequence as Items
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from mien.avatar.settings import MethodConfig
+from mien.disk.locks import WAIT, hold
+from mien.disk.workspace import COMPARED, Workspace
+from mien.errors import UserError
+from mien.evaluation.metrics_file import protocol_means
+from mien.evaluation.protocols import EvaluationSettings
+from mien.face.loading import load_face_model
+from mien.lab.benchmarking.comparing import MethodRow, comparison_table
+from mien.lab.benchmarking.timing import measure_machine
+from mien.lab.synthetic.references import ReferenceCapture, reference_named
+from mien.machine.progress import say
+from mien.machine.terminal import show
+from mien.pipeline.evaluate import run_evaluation_stage
+from mien.pipeline.quality import StageTimes, draw_and_track, reference_settings, score_unseen_views
+from mien.pipeline.train import run_training_stage
+from mien.storage import file_digest, read_json, write_atomically, write_json
+from mien.training.footage.frames import training_frames
+from mien.training.footage.sequence import Sequence, read_sequence
+from mien.training.run import read_training_summary
+from mien.training.settings import PRESETS, TrainSettings
+from mien.training.trainer import train
+
+_FORMAT, _VERSION = "mien.bench_compare", 1
+_SCORED = EvaluationSettings(video_frames=0)
+FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
+"""Least and largest number of steps of the first trial. Between them, it uses each training frame once."""
+_TRIAL_SHARE = 0.1
+"""Share of the budget that the second trial may take beside it. A shorter one grows fewer Gaussians than the run."""
+_LEAST_MARGIN = 0.3
+"""Smallest ratio of the seconds of a further step to the mean of all, because trials are noisy."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long each method trains on each capture. If both are 0, as long as its preset says."""
+
+    minutes: float = 0.0
+    """Minutes of training. The number of steps is chosen by a trial on this machine."""
+    steps: int = 0
+
+    @property
+    def name(self) -> str:
+        """A part of a run's name."""
+        return f"{self.minutes:g}min" if self.minutes else f"{self.steps}" if self.steps else "full"
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """What `mien bench compare` compares."""
+
+    methods: tuple[str, ...]
+    preset: str
+    budget: Budget
+    split: Literal["blocks", "tail"]
+    """Held-out frames of workspaces. Reference captures have their own."""
+
+    def run_name(self, method: str) -> str:
+        """The name of a method's run."""
+        parts = [COMPARED + method, self.budget.name]
+        parts += [] if self.preset == "standard" else [self.preset]
+        return "-".join(parts + ([] if self.split == "blocks" else [self.split]))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A capture on which all methods are trained."""
+
+    name: str
+    workspace: Workspace
+    sequences: list[str]
+    settings: TrainSettings
+    """What is held out."""
+    reference: ReferenceCapture | None = None
+    drawn: Path | None = None
+    """The folder of a reference capture's true pictures."""
+
+
+def run_compare_stage(
+    out: Path, workspaces: Items[Workspace], captures: Items[str], settings: CompareSettings, *, as_json: bool
+) -> None:
+    """Train and score every method on every capture, and print the table. Writes OUT/compare.json and compare.md.
+
+    Args:
+        out: Folder for the tables, for trials, and for reference captures with their workspaces.
+        workspaces: Tracked workspaces. Their runs are called `settings.run_name(method)`.
+        captures: Names of reference captures, which are drawn, captured and tracked first.
+        settings: Methods and budget.
+        as_json: Whether the result is printed as json.
+
+    Raises:
+        UserError: a capture cannot be read or trained on, or another process is comparing in the same folder.
+    """
+    references = [reference_named(name) for name in captures]
+    with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
+        subjects = [of_workspace(workspace, settings) for workspace in workspaces]
+        rows: list[MethodRow] = []
+        content: dict[str, Any] = {}
+        for subject in (*subjects, *(_of_reference(reference, out, settings) for reference in references)):
+            for method in settings.methods:
+                say(f"== {subject.name}: {method}")
+                rows.append(_row(subject, method, settings, out))
+                content = _write(out, rows, settings)
+    show(json.dumps(content) if as_json else comparison_table(rows))
+    say(f"The table is in {out / 'compare.md'}")
+
+
+def _write(out: Path, rows: Items[MethodRow], settings: CompareSettings) -> dict[str, Any]:
+    chosen = {**asdict(settings), "methods": list(settings.methods)}
+    content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": [row.as_json() for row in rows]}
+    content = json.loads(json.dumps(content))
+    write_json(out / "compare.json", _FORMAT, _VERSION, content)
+    write_atomically(out / "compare.md", lambda path: path.write_text(comparison_table(rows), encoding="utf-8"))
+    return {"format": _FORMAT, "version": _VERSION, **content}
+
+
+def of_workspace(workspace: Workspace, settings: CompareSettings) -> Subject:
+    """The tracked workspace as something to compare on."""
+    names = workspace.tracked_names()
+    if not names:
+        raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
+    held = replace(PRESETS[settings.preset].settings, split=settings.split)
+    return Subject(workspace.root.resolve().name, workspace, names, held)
+
+
+def _of_reference(reference: ReferenceCapture, out: Path, settings: CompareSettings) -> Subject:
+    drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
+    _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / "seconds.json"))
+    held = reference_settings(reference, PRESETS[settings.preset].settings)
+    return Subject(reference.name, workspace, list(trackings), held, reference, drawn)
+
+
+def _row(subject: Subject, method: str, settings: CompareSettings, out: Path) -> MethodRow:
+    """Train and score a method on a capture, unless that is done."""
+    workspace, run, preset = subject.workspace, settings.run_name(method), PRESETS[settings.preset]
+    run_dir, config = workspace.run_dir(run), preset.config(method)
+    own = replace(subject.settings, steps=preset.settings_of(method).steps)
+    own = replace(own, steps=steps_for(subject, config, own, settings.budget, out / "trials" / subject.name / run))
+    run_training_stage(workspace, subject.sequences, run, config, own)
+    metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
+    summary = read_training_summary(run_dir)
+    size = sum(path.stat().st_size for path in (run_dir / "avatar").rglob("*") if path.is_file())
+    return MethodRow(
+        subject.name, method, run, summary["steps"], summary["seconds"], summary["gaussians"], size,
+        protocol_means(metrics), _unseen(subject, run),
+    )  # fmt: skip
+
+
+def _unseen(subject: Subject, run: str) -> dict[str, Any]:
+    if subject.reference is None or subject.drawn is None or subject.reference.views is None:
+        return {}
+    known = subject.workspace.run_dir(run) / "unseen_view.json"
+    if known.is_file():
+        return read_json(known, "mien.unseen_view", 1, remedy="delete this file and run the same command again")[
+            "angles"
+        ]
+    return score_unseen_views(subject.reference, subject.drawn, subject.workspace, run)
+
+
+def steps_for(subject: Subject, config: MethodConfig, settings: TrainSettings, budget: Budget, folder: Path) -> int:
+    """The number of steps of a run. A budget of minutes is turned into steps by two trials, which are kept.
+
+    The run is expected to need as much time beside its steps as the trials, and for each step the time that a step of
+    the longer trial takes after the length of the shorter one. By then each frame was used once, which takes longest.
+    """
+    if not budget.minutes:
+        return budget.steps or settings.steps
+    finished = subject.workspace.run_dir(folder.name) / "training.json"
+    if finished.is_file():
+        return read_training_summary(finished.parent)["steps"]
+    folders = [subject.workspace.sequence_dir(name) for name in subject.sequences]
+    tracked = "".join(file_digest(one / "tracking/tracking.safetensors")[:8] for one in folders)[:32]
+    sequences = [read_sequence(one) for one in folders]
+    pictures = len(training_frames(sequences, settings))
+    count = max(FIRST_TRIAL_STEPS, min(pictures, _MOST_FIRST_STEPS))
+    took = trial_seconds(sequences, config, replace(settings, steps=count), folder / f"first-{count}-{tracked}")
+    rate, began = took / count, 0.0
+    longer = max(2 * count, round(_TRIAL_SHARE * 60 * budget.minutes / rate))
+    if longer * rate < 60 * budget.minutes:
+        both = trial_seconds(sequences, config, replace(settings, steps=longer), folder / f"second-{longer}-{tracked}")
+        rate = min(max((both - took) / (longer - count), _LEAST_MARGIN * both / longer), both / longer)
+        began = both - longer * rate
+    steps = max(1, round((60 * budget.minutes - began) / rate))
+    say(
+        f"{folder.name}: {1e3 * rate:.1f} ms a step and {began:.1f} s beside the steps in trials, "
+        f"so {steps:,} steps in {budget.minutes:g} minutes"
+    )
+    if steps < pictures:
+        say(
+            f"{folder.name}: {budget.minutes:g} minutes are too few steps to see each of {pictures} pictures once, so "
+            "the figures say little; give more --minutes"
+        )
+    return steps
+
+
+def trial_seconds(sequences: list[Sequence], config: MethodConfig, settings: TrainSettings, run_dir: Path) -> float:
+    """Seconds of a short run, whose schedules are as short. A trial that was done is only read."""
+    if not (run_dir / "training.json").is_file():
+        say(f"{run_dir.parent.name}: a trial of {settings.steps} steps")
+        train(sequences, load_face_model(sequences[0].tracking.face_model), config, settings, run_dir)
+    return max(read_training_summary(run_dir)["seconds"], 0.05)

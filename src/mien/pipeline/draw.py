@@ -1,0 +1,95 @@
+"""From posed Gaussians to pictures, with the options of the command line."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+
+from mien.avatar.avatar import Avatar
+from mien.camera import Camera
+from mien.face.params import FaceParams
+from mien.gaussians import Gaussians
+from mien.machine.progress import say
+from mien.media.pixels import to_rgb, to_rgba
+from mien.pipeline.picture_options import PictureOptions
+from mien.render import rasterize
+from mien.render.closing import close_holes
+from mien.render.validation import drawable
+from mien.runtime.camera_paths import zoom_for_all
+from mien.training.run import read_run_config
+from mien.training.whole_head.soft_cut import shares_left
+
+_GLANCE, _FAINT = 128, 0.1
+"""Largest side of the small pictures that tell where an avatar is, in pixels, and the opacity that counts."""
+
+
+def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
+    """The camera for pictures of the chosen size."""
+    return camera.fitted(*options.shape(), zoom)
+
+
+@torch.no_grad()
+def posed_softly(avatar: Avatar) -> Callable[[FaceParams], Gaussians]:
+    """How an avatar is posed for pictures that people look at: it fades towards the neck cut, as in pages and files.
+
+    The returned function takes a face of one timestep.
+    """
+    shares = shares_left(avatar)
+
+    @torch.no_grad()
+    def posed(face: FaceParams) -> Gaussians:
+        gaussians = avatar.pose(face).gaussians.timestep(0)
+        return replace(gaussians, opacities=gaussians.opacities * shares)
+
+    return posed
+
+
+@torch.no_grad()
+def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing: int = 0) -> UInt8[np.ndarray, "h w _"]:
+    """The picture as RGB over the background, or as RGBA with straight colours.
+
+    Args:
+        options: What pictures look like.
+        gaussians: What is drawn.
+        camera: The camera.
+        closing: Pixels by which holes are closed (`close_holes`). Transparent pictures keep them.
+    """
+    background = torch.tensor(options.color()).to(gaussians.means)
+    with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
+        rendering = rasterize(gaussians, camera, background)
+    if options.background == "transparent":
+        return to_rgba(*(tensor.float().cpu().numpy() for tensor in (rendering.image, rendering.alpha)))
+    return to_rgb(close_holes(rendering.image.float(), closing).cpu().numpy())
+
+
+@torch.no_grad()
+def whole(camera: Camera, gaussians: Gaussians) -> Camera:
+    """The camera, or one that shows more if its picture cuts the avatar off."""
+    side = _GLANCE / max(camera.width, camera.height)
+    size = max(8, round(side * camera.width)), max(8, round(side * camera.height))
+
+    def drawn(zoom: float) -> Bool[np.ndarray, "h w"]:
+        return rasterize(gaussians, camera.fitted(*size, zoom)).alpha.numpy() > _FAINT
+
+    zoom = zoom_for_all(drawn)
+    return camera if zoom == 1 else camera.fitted(camera.width, camera.height, zoom)
+
+
+def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> None:
+    """Warn if transparent pictures are asked for but the run was trained over white."""
+    if options.background == "transparent" and _trained_over_white(read_run_config(run_dir)["settings"], avatar):
+        say(
+            "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
+            "`mien train --background random` avoids that"
+        )
+
+
+def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:
+    """Whether a run had a white background. `auto` is random where avatar and settings can fill sides."""
+    background = settings.get("background")
+    may_fill = avatar.surface() is not None and settings.get("unseen") != "trained"
+    return background == "white" or (background == "auto" and not may_fill)

@@ -1,0 +1,168 @@
+"""From an avatar and a motion to pictures, as the command line runs it."""
+
+import itertools
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mien.avatar.files import load_avatar
+from mien.capture.settings import CaptureSettings
+from mien.capture.sound_endings import SOUND_ENDINGS
+from mien.commands.parsing.options import NEUTRALS, check_driver, check_neutral, holds_pictures, is_tracked_sequence
+from mien.disk.workspace import Workspace, open_workspace
+from mien.driving.drivers import Driver, read_recording, read_tracked_driver
+from mien.driving.keeping import keep_to_filmed
+from mien.driving.neutral import with_neutral
+from mien.driving.rest import facing, rest_of
+from mien.driving.transfer import drive
+from mien.face.cache import cache_folder, cache_is_kept
+from mien.face.model import FaceModel
+from mien.machine.progress import say, track_progress
+from mien.media.output import plan_output
+from mien.media.pictures import side_by_side
+from mien.media.source import FrameSelection, list_images, open_source
+from mien.media.writing import write_pictures
+from mien.pipeline.capture import run_capture_stage
+from mien.pipeline.draw import draw, posed_softly, view, warn_of_white
+from mien.pipeline.names import is_picture
+from mien.pipeline.picture_options import PictureOptions
+from mien.pipeline.track import run_tracking_stage
+from mien.storage import file_digest, write_atomically
+from mien.tracking.settings import TrackingSettings
+from mien.training.run import filmed_range, run_camera
+
+
+def open_driver(
+    by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None, neutral: str | None = None
+) -> Driver:
+    """Open a driver: a workspace, a recording (csv, json, voice), or a film.
+
+    A film is a video, a picture or a folder of pictures. It is captured, tracked and kept in the cache.
+
+    Args:
+        by: The workspace or file.
+        sequence: Name of a sequence of the workspace. For a video with cuts: one part instead of all parts in a row.
+        face_model: The avatar's face model.
+        fps: Frame rate of the timecode in a csv.
+        neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.with_neutral`).
+
+    Raises:
+        UserError: `by` or `neutral` is none of these, or a stage fails.
+    """
+    check_driver(by, sequence, fps)
+    check_neutral(neutral)
+    driver = _open(by, sequence, face_model, fps)
+    if neutral is None and by.is_file() and _is_film(by) and is_picture(by):
+        say(f"{by}: is one picture, so its motion is measured from the face model's neutral")
+        neutral = "model"
+    other = None if neutral is None or neutral in NEUTRALS else _open(Path(neutral), None, face_model)
+    return with_neutral(driver, face_model, neutral, str(by), other)
+
+
+def _is_film(by: Path) -> bool:
+    return by.suffix.lower() not in (".csv", ".json", *SOUND_ENDINGS)
+
+
+def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
+    if by.is_file() and not _is_film(by):
+        return read_recording(by, face_model, fps)
+    if by.is_file() or holds_pictures(by):
+        workspace, names = tracked_film(by, face_model.name)
+        names = names if sequence is None else [workspace.pick_sequence(sequence)]
+    elif is_tracked_sequence(by):
+        return read_tracked_driver([by], face_model)
+    else:
+        workspace = open_workspace(by)
+        names = [workspace.pick_sequence(sequence)]
+    return read_tracked_driver([workspace.sequence_dir(name) for name in names], face_model)
+
+
+_FEWEST = 3
+"""Least number of frames that are tracked. Fewer pictures are repeated."""
+
+
+def _write(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
+
+
+def tracked_film(film: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
+    """The workspace of a video, a picture or a folder of pictures in this user's cache, and its sequences.
+
+    They are captured and tracked if needed.
+    """
+    pictures = list_images(film) if film.is_dir() else [film] if is_picture(film) else []
+    digest = open_source(film, FrameSelection(), 1.0).content_hash if film.is_dir() else file_digest(film)
+    workspace = Workspace(cache_folder() / "drivers" / f"{film.resolve().stem}-{digest[:12]}")
+    source = film
+    if 0 < len(pictures) < _FEWEST:
+        source = workspace.root / film.resolve().stem
+        for index, picture in enumerate(each for each in pictures for _ in range(_FEWEST)):
+            content = picture.read_bytes()
+            write_atomically(source / f"{index}{picture.suffix}", partial(_write, content))
+    run_capture_stage(workspace, source, None, CaptureSettings())
+    # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
+    tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
+    names = sorted(tracked, key=lambda name: (len(name), name))
+    kept = "kept for the next time" if cache_is_kept() else "for this command only; set MIEN_CACHE to keep it"
+    say(f"{film}: tracked in {workspace.root}, {kept}")
+    return workspace, names
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """How the avatar follows the driver, and what is shown."""
+
+    sequence: str | None = None
+    """Name of the driver's sequence."""
+    head_pose: bool = True
+    alone: bool = False
+    fps: float | None = None
+    """Frame rate of the timecode in a csv."""
+    unlimited: bool = False
+    """Whether the avatar follows also beyond what was filmed."""
+    neutral: str | None = None
+    """The driver's face at rest, as `--neutral` names it."""
+
+
+def run_driving_stage(
+    run_dir: Path, by: Path, out: Path, options: DriveOptions | None = None, picture: PictureOptions | None = None
+) -> None:
+    """Render a run's avatar as it follows a driver. Pictures of the driver are beside it, unless `alone` is set."""
+    options, picture = options or DriveOptions(), picture or PictureOptions()
+    # The number of frames is known only after tracking, but a video or numbered pictures take any number.
+    output = picture.plan(out, 2)
+    avatar = load_avatar(run_dir)
+    warn_of_white(picture, run_dir, avatar)
+    driver = open_driver(by, options.sequence, avatar.face_model, options.fps, options.neutral)
+    bounds, filmed_by = avatar.face_model.expression_bounds, run_camera(run_dir)
+    person = rest_of(avatar.subject, avatar.face_model, facing(filmed_by.viewmat)).face
+    driven = drive(driver.face, driver.at_rest, person, bounds, options.head_pose, str(by))
+    if output.kind == "sequence":
+        plan_output(out, len(driven), output.transparent)
+    camera = view(picture, filmed_by)
+    if not options.unlimited:
+        filmed = filmed_range(run_dir, avatar)
+        driven, softened = keep_to_filmed(driven, filmed, avatar.subject, bounds, camera.position)
+        if softened:
+            say(f"{softened} of {len(driven)} frames go beyond what was filmed and are softened; --unlimited lets go")
+    beside = None if options.alone or output.transparent else driver.pictures
+    pose = posed_softly(avatar)
+
+    def frame(timestep: int) -> np.ndarray:
+        shown = draw(picture, pose(driven[timestep]), camera, avatar.extras.closing)
+        if beside is None:
+            return shown
+        theirs = beside(timestep)
+        width = max(1, round(theirs.shape[1] * camera.height / theirs.shape[0]))
+        return side_by_side([cv2.resize(theirs, (width, camera.height), interpolation=cv2.INTER_AREA), shown])
+
+    frames = (frame(timestep) for timestep in itertools.islice(itertools.count(), len(driven)))
+    sound = None if driver.sound is None else (driver.sound, len(driven) / driver.fps)
+    if sound is not None and output.kind != "mp4":
+        say(f"{out}: has no sound; only an .mp4 gets that of {driver.sound}")
+        sound = None
+    write_pictures(output, track_progress(frames, "Driving", len(driven)), driver.fps, sound)
+    say(f"{out}: {len(driven)} frames")

@@ -1,0 +1,54 @@
+"""Expressions, gaze, preset faces and joints on the command line: `--set jawOpen=0.6 smile=0.4 left_eye_y=0.2`."""
+
+from dataclasses import replace
+
+import torch
+
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.machine.progress import say
+from mien.pipeline.assignments import Settable, angle_names, assign
+from mien.runtime.baked import Filmed
+from mien.runtime.named import is_gaze, parts_of
+
+
+def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, ...]) -> FaceParams:
+    """`face` with expressions and joint angles set by name at every timestep (`mien.pipeline.assignments.assign`).
+
+    Raises:
+        UserError: an assignment is not NAME=NUMBER, the face model has no such expression or joint, or the number is
+            out of its range.
+    """
+    if not assignments:
+        return face
+    before = (face.expression.detach().cpu().numpy(), face.joints.detach().cpu().numpy())
+    expression, joints = assign(assignments, _settable(model), *before)
+    return replace(
+        face,
+        expression=torch.from_numpy(expression).to(face.expression),
+        joints=torch.from_numpy(joints).to(face.joints),
+    )
+
+
+def tell_of_unfilmed(assignments: tuple[str, ...], face: FaceParams, model: FaceModel, filmed: Filmed) -> None:
+    """Name the assignments that go beyond what was filmed. `face` is what `with_expression` made of them."""
+    names, beyond = (*model.expression_names, *angle_names(model.free_joint_names)), []
+    values = torch.cat([face.expression, face.joints.flatten(1)], 1)[0].tolist()
+    for name, _, text in (assignment.partition("=") for assignment in assignments):
+        for part in parts_of(name, float(text)):
+            if is_gaze(part.name, model.free_joint_names):
+                continue
+            index = names.index(part.name)
+            value, shown = (values[index], f"{values[index]:.2f}") if part.is_added else (part.value, text)
+            lowest, highest = min(0.0, float(filmed.lowest[index])), max(0.0, float(filmed.highest[index]))
+            # To the digits that are shown: nobody sees what lies between.
+            if not round(lowest, 2) <= round(value, 2) <= round(highest, 2):
+                beyond.append(f"{part.name}={shown} ({lowest:.2f} to {highest:.2f})")
+    if beyond:
+        say(f"beyond what was filmed, so it may look wrong: {', '.join(beyond)}")
+
+
+def _settable(model: FaceModel) -> Settable:
+    unit = "the full expression" if model.expression_sigmas is None else "strong, and 0 is the mean face"
+    bounds = model.expression_bounds.tolist()
+    return Settable(tuple(model.expression_names), bounds, tuple(model.free_joint_names), model.name, unit)

@@ -1,0 +1,137 @@
+"""From the files of other programs to runs and sequences of a workspace."""
+
+import math
+import shlex
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from mien.avatar.avatar import Avatar
+from mien.camera import Camera, camera_from_fov, look_at
+from mien.commands.stages.import_footage import write_footage
+from mien.datasets.dataset import Dataset, Footage, ReadSequence, TrackedSequence, TrainedAvatar
+from mien.datasets.writing import OVERLAY, write_sequence
+from mien.disk.locks import check_free, hold
+from mien.disk.workspace import Workspace
+from mien.inside import remove_tree
+from mien.machine.progress import say
+from mien.machine.terminal import counted
+from mien.pipeline.face_models import face_model_of
+from mien.pipeline.names import check_new_run, check_new_sequence
+from mien.pipeline.track import run_tracking_stage
+from mien.tracking.settings import TrackingSettings
+from mien.training.run import BUSY_REMEDY, write_imported_run
+
+_DISTANCE = 1.2
+"""Distance of the camera from the middle of the head, in metres."""
+_SIDE = 512
+_MARGIN = 1.15
+"""Size of the picture relative to the largest extent of the head's mesh."""
+
+
+def run_import_stage(
+    dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None, retrack: bool = False,
+    resume: bool = False, corrects_colors: bool = True,
+) -> None:  # fmt: skip
+    """Read a dataset, and write its avatar as a run, or its sequences.
+
+    Args:
+        dataset: The dataset.
+        path: Its files.
+        workspace: The workspace.
+        run: Name of the run that an avatar becomes.
+        face_model: Name or file of the face model that the files belong to, if the user gives one.
+        retrack: Whether to leave out the tracking of the authors, and to track the pictures with mien.
+        resume: Whether sequences that are there already stay as they are. If not, they are an error.
+        corrects_colors: Whether the colours of videos are corrected, if the dataset has such a correction.
+
+    Raises:
+        UserError: the files or the face model cannot be read, or the run or a sequence is there already or cannot be
+            written. Sequences before that one stay.
+        BeingWrittenError: another process is writing the run or the sequence.
+    """
+    run_dir = workspace.run_dir(run)
+    if dataset.holds == "avatar":
+        check_free(run_dir, BUSY_REMEDY)
+    if retrack:
+        assert dataset.read_pictures is not None  # the command checks it
+        content: Iterable[ReadSequence] | TrainedAvatar = dataset.read_pictures(path)
+    else:
+        content = dataset.read(path, None if face_model is None else face_model_of(face_model))
+    if isinstance(content, TrainedAvatar):
+        _write_run(content, run_dir, path)
+    else:
+        if not corrects_colors:
+            content = map(_as_filmed, content)
+        untracked = _write_sequences(content, workspace, dataset, path, resume)
+        if retrack:
+            run_tracking_stage(workspace, "anny", TrackingSettings())
+        elif untracked:
+            say(f"{', '.join(untracked)}: without a tracking; run `mien track {shlex.quote(str(workspace.root))}`")
+
+
+def _as_filmed(sequence: ReadSequence) -> ReadSequence:
+    return replace(sequence, color_corrections=None) if isinstance(sequence, Footage) else sequence
+
+
+def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
+    avatar, face = content.avatar, content.face
+    with hold(run_dir, remedy=BUSY_REMEDY):
+        check_new_run(run_dir)  # another process may have written it meanwhile
+        try:
+            write_imported_run(run_dir, avatar, face, front_camera(avatar), source)
+        except BaseException:
+            remove_tree(run_dir)
+            raise
+    count = counted(len(avatar.gaussian_store()), "Gaussian")
+    say(f"{run_dir}: {count} on {avatar.face_model.name}, {counted(len(face), 'timestep')}")
+
+
+def _write_sequences(
+    sequences: Iterable[ReadSequence], workspace: Workspace, dataset: Dataset, source: Path, resume: bool
+) -> list[str]:
+    """Write the sequences, and return the names of those without a tracking."""
+    untracked, overlays = [], []
+    for sequence in sequences:
+        if isinstance(sequence, Footage):
+            folder = workspace.sequence_dir(sequence.name)
+            with hold(folder):
+                if not (resume and folder.exists()):
+                    check_new_sequence(folder)
+                    write_footage(folder, sequence, dataset, source)
+            untracked.append(sequence.name)
+            continue
+        capture = sequence.capture
+        folder = workspace.sequence_dir(capture.name)
+        with hold(folder):
+            if resume and folder.exists():
+                continue
+            check_new_sequence(folder)
+            write_sequence(folder, sequence, dataset, source)
+        cameras = counted(len(capture.camera_ids), "camera")
+        tracked = f", tracked on {sequence.face_model.name}" if isinstance(sequence, TrackedSequence) else ""
+        say(f"{folder}: {counted(capture.timesteps, 'timestep')}, {cameras}{tracked}")
+        if tracked:
+            overlays.append(folder / OVERLAY)
+        else:
+            untracked.append(capture.name)
+    if overlays:
+        more = f", and {len(overlays) - 1} more" * (len(overlays) > 1)
+        say(f"the imported mesh over some pictures: {overlays[0]}{more}; look at it before you train")
+    return untracked
+
+
+@torch.no_grad()
+def front_camera(avatar: Avatar) -> Camera:
+    """A camera in front of the person at rest that shows the whole mesh."""
+    subject = avatar.subject
+    vertices = avatar.face_model.head_vertices(subject)[0]
+    middle, pose = (vertices.amin(0) + vertices.amax(0)) / 2, subject.T_world_head[0]
+    in_front = middle + torch.tensor([0.0, 0.0, _DISTANCE])
+    position, target = (pose[:3, :3] @ point + pose[:3, 3] for point in (in_front, middle))
+    extent = float((vertices.amax(0) - vertices.amin(0)).max())
+    return camera_from_fov(
+        2 * math.atan(0.5 * _MARGIN * extent / _DISTANCE), _SIDE, _SIDE, look_at(position, target, pose[:3, 1])
+    )

@@ -1,0 +1,155 @@
+"""Names of sequences and runs, which become names of folders."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+
+from mien.disk.files import file_digest
+from mien.disk.workspace import check_no_workspace
+from mien.errors import UserError
+from mien.inside import is_plain_name
+from mien.machine.terminal import plain_name
+
+
+def sequence_name(video: Path, name: str | None) -> str:
+    """`name`, or the video's name without its ending (with "_" for control characters), if a folder can have it.
+
+    Raises:
+        UserError: the name is empty, too long, or holds path separators or control characters.
+    """
+    name = plain_name(video.stem) if name is None else name
+    if not is_plain_name(name):
+        raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
+    return name
+
+
+def check_new_run(run_dir: Path) -> None:
+    """Check that there is no run of this name yet.
+
+    Raises:
+        UserError: there is one.
+    """
+    if run_dir.exists():
+        raise UserError(f"{run_dir}: is there already; give the imported run another name (--run NAME)")
+
+
+def check_new_sequence(folder: Path) -> None:
+    """Check that there is no sequence of this name yet.
+
+    Raises:
+        UserError: there is one.
+    """
+    if folder.exists():
+        raise UserError(f"{folder}: is there already; delete it to import it again, or import into another workspace")
+
+
+def run_name(name: str) -> str:
+    """`name`, if a folder can have it.
+
+    Raises:
+        UserError: the name is empty, too long, or holds path separators or control characters.
+    """
+    return sequence_name(Path(name), name)
+
+
+def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
+    """A name for each video: the given names, or else the names of the videos.
+
+    Raises:
+        UserError: there is no video, a video is missing, the number of names is wrong, two names are equal, or no
+            folder can have a name.
+    """
+    if not videos:
+        raise UserError("no video given; write mien create VIDEO [VIDEO ...] --out DIR")
+    for video in videos:
+        if not video.exists():
+            raise UserError(f"{video}: no such video or folder of pictures; check the path")
+    if names and len(names) != len(videos):
+        counts = f"{len(names)} names, but the number of videos is {len(videos)}"
+        raise UserError(f"--name {' '.join(names)}: {counts}; give one name for each")
+    found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
+    twice = [name for name, count in Counter(found).items() if count > 1]
+    if twice:
+        raise UserError(f"two videos would both be the sequence {twice[0]!r}; give each a name with --name")
+    return found
+
+
+def check_videos(videos: Sequence[Path]) -> None:
+    """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture.
+
+    Raises:
+        UserError: a file is no video, or one that cannot be opened, or a picture; or a folder is a workspace.
+    """
+    for video in videos:
+        check_no_workspace(video)
+        if video.is_file() and is_picture(video):
+            raise UserError(f"{video}: is a picture; give a video, or the folder of a video's pictures")
+
+
+def is_picture(file: Path) -> bool:
+    """Whether a file is a single picture.
+
+    Raises:
+        UserError: it is neither a picture nor a video, or cannot be opened.
+    """
+    from mien.media.video_file import open_video
+
+    with open_video(file) as (container, _):
+        return container.format.name.endswith("_pipe")  # FFmpeg's names of pictures: png_pipe, jpeg_pipe.
+
+
+def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
+    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder.
+
+    Raises:
+        UserError: a file is missing, more than one name is given, or there is neither a name nor a folder.
+    """
+    if calibration.is_dir():
+        raise UserError(f"--calibration {calibration}: is a folder; give the json file of its cameras (docs/using.md)")
+    if not calibration.is_file():
+        raise UserError(f"--calibration {calibration}: no such file; name a json file of cameras (docs/using.md)")
+    if not sources:
+        raise UserError("--calibration: name the videos of its cameras, or a folder that holds them")
+    for source in sources:
+        if not source.exists():
+            raise UserError(f"{source}: no such video or folder of pictures; check the path")
+    if len(names) > 1:
+        raise UserError(f"--name {' '.join(names)}: all cameras together become one sequence; give one name")
+    if not names and len(sources) > 1:
+        raise UserError("--calibration: several videos become one sequence; name it with --name")
+    return sequence_name(sources[0].resolve(), names[0] if names else None)
+
+
+def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Sequence[str]) -> Iterator[str]:
+    """Yield warnings about videos with the same content: they add nothing, or training uses held-out frames."""
+
+    def is_held_out(name: str) -> bool:
+        # A part of a video with cuts is called NAME-1.
+        return any(part == name or part.rpartition("-")[0] == name for part in held_out)
+
+    for (first, name), (second, other) in combinations(zip(videos, names, strict=True), 2):
+        if not _same_content(first, second):
+            continue
+        outside = [n for n in (name, other) if is_held_out(n)]
+        if len(outside) == 1:
+            trained = other if outside == [name] else name
+            yield f"{name} and {other} are the same video: {outside[0]} is held out, but {trained} trains on its frames"
+        else:
+            yield f"{name} and {other} are the same video, which then counts twice and adds nothing"
+
+
+def _same_content(first: Path, second: Path) -> bool:
+    if first.samefile(second):
+        return True
+    if not (first.is_file() and second.is_file()) or first.stat().st_size != second.stat().st_size:
+        return False
+    return file_digest(first) == file_digest(second)
+
+
+def no_model_file(path: Path) -> str:
+    """Return the message on a path that is neither a file nor ICT-FaceKit's folder."""
+    files = "FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz"
+    if path.is_dir():
+        return f"{path}: is a folder, and not ICT-FaceKit's FaceXModel; give a file in it: gnm_head.npz, {files}"
+    return f"{path}: no such file; give {files}"

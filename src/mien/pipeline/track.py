@@ -1,0 +1,318 @@
+"""From captures to trackings, as the command line runs it. Current trackings are read back."""
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Literal
+
+from mien.capture.capture import Capture
+from mien.capture.store import read_capture, read_capture_hash
+from mien.datasets.writing import OVERLAY
+from mien.disk.files import remove_leftovers
+from mien.disk.locks import hold
+from mien.disk.workspace import Workspace
+from mien.errors import UserError
+from mien.face.checks import check_face_params
+from mien.face.loading import load_face_model
+from mien.face.model import FaceModel
+from mien.inside import remove_tree
+from mien.machine.progress import say
+from mien.media.video import count_frames
+from mien.pipeline.face_models import face_model_of
+from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
+from mien.tracking.fitting.shot import has_enough_faces
+from mien.tracking.pipeline import track_subject
+from mien.tracking.report.overlay import overlay_stride, write_overlay
+from mien.tracking.report.residuals import write_residual_report
+from mien.tracking.scoring import make_scoring
+from mien.tracking.scoring_files import check_scoring_cut, scoring_exists, write_scoring
+from mien.tracking.settings import ScoringSettings, TrackingSettings
+from mien.tracking.tracking import Tracking
+from mien.training.run import outdated_sequences
+
+_TRACKING_RECIPE = 12
+"""Version of the tracking. It is raised whenever the same captures would be tracked differently, so that old trackings
+no longer count as current."""
+
+_DESCENT_RECIPE = "descent 3"
+"""The same for what only the schedule `paper` does."""
+
+DEFAULT_SCORING = ScoringSettings()
+
+Overlay = Literal["auto", "all", "none"]
+"""Frames that overlay.mp4 shows."""
+
+
+def run_tracking_stage(
+    workspace: Workspace,
+    face_model_choice: str,
+    settings: TrackingSettings,
+    again: bool = False,
+    overlay: Overlay = "auto",
+    preview: bool = False,
+    hold_out: Collection[str] = (),
+    scoring: ScoringSettings = DEFAULT_SCORING,
+    *,
+    show: bool = True,
+) -> dict[str, Tracking]:
+    """Track all sequences of a workspace together, with one identity; return the trackings by name.
+
+    Current trackings are read back. The face model is a name or a file (`face_model_of`). Writes overlays and, only
+    once, the scoring masks. Without `show`, reports and overlays are left to `show_trackings`. Sequences with too few
+    faces are left out, unless that would leave none. Held-out sequences have no part in what the sequences share
+    (`track_subject`). No other process may write a sequence meanwhile, unless everything is current and nothing is
+    written.
+
+    Raises:
+        BeingWrittenError: another process is writing one of the sequences.
+        UserError: Among others, a sequence has masks with another cut than that of `scoring`.
+    """
+    face_model = face_model_of(face_model_choice)
+    names = workspace.sequence_names()
+    if not names:
+        raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
+    check_apart(names, hold_out)
+    check_masks(workspace, names, scoring)
+    finished = (
+        None
+        if again
+        else _finished_trackings(workspace, names, face_model, settings, overlay if show else None, hold_out)
+    )
+    if finished is not None:
+        say(f"{', '.join(finished)}: the tracking is current, nothing to do")
+        return finished
+    with hold(*(workspace.sequence_dir(name) for name in names)):
+        fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
+        trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model)
+        if trackings is None:
+            trackings = _track(workspace, names, face_model, settings, fingerprint, preview, hold_out)
+        else:
+            say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
+        _write_masks(workspace, trackings, face_model, scoring)
+        if show:
+            for name, tracking in trackings.items():
+                show_tracking(workspace.sequence_dir(name), tracking, face_model, overlay)
+    return trackings
+
+
+def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overlay) -> None:
+    """Write reports and overlays of some tracked sequences, as far as they are missing or outdated.
+
+    Raises:
+        BeingWrittenError: something is to be written, and another process is writing that sequence.
+    """
+    folders = [workspace.sequence_dir(name) for name in names]
+    lacking = [folder for folder in folders if not all(_is_shown(folder, read_tracking(folder / "tracking"), overlay))]
+    with hold(*lacking):
+        for folder in lacking:
+            tracking = read_tracking(folder / "tracking")
+            show_tracking(folder, tracking, load_face_model(tracking.face_model), overlay)
+
+
+def check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
+    """Check that the sequences to track apart exist, and that others remain.
+
+    Raises:
+        UserError: one does not exist, or none remains.
+    """
+    unknown = [name for name in hold_out if name not in names]
+    if unknown:
+        raise UserError(f"--hold-out {unknown[0]}: no such sequence; there are: {', '.join(names)}")
+    if set(names) <= set(hold_out):
+        raise UserError(f"--hold-out {' '.join(hold_out)}: leaves no sequence that could show the person's shape")
+
+
+def check_masks(workspace: Workspace, names: Collection[str], scoring: ScoringSettings) -> None:
+    """Check that existing scoring masks have the cut of the settings (`check_scoring_cut`)."""
+    for name in names:
+        folder = workspace.sequence_dir(name)
+        try:
+            capture_hash = read_capture_hash(folder / "capture")
+        except UserError:  # reported when it is read as a whole
+            continue
+        check_scoring_cut(folder / "scoring", scoring, capture_hash)
+
+
+def _finished_trackings(
+    workspace: Workspace,
+    names: list[str],
+    face_model: FaceModel,
+    settings: TrackingSettings,
+    overlay: Overlay | None,
+    hold_out: Collection[str],
+) -> dict[str, Tracking] | None:
+    """The trackings, if all results of the stage exist and are current. Without `overlay`, reports do not count."""
+    try:
+        fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
+        trackings = _current_trackings(workspace, names, fingerprint, face_model, tell=False)
+        for name, tracking in (trackings or {}).items():
+            folder = workspace.sequence_dir(name)
+            if not scoring_exists(folder / "scoring", read_capture_hash(folder / "capture")):
+                return None
+            if overlay is not None and not all(_is_shown(folder, tracking, overlay)):
+                return None
+    except UserError:  # reported when the results are written again
+        return None
+    return trackings
+
+
+def _write_masks(
+    workspace: Workspace, trackings: Mapping[str, Tracking], face_model: FaceModel, scoring: ScoringSettings
+) -> None:
+    """Write scoring masks that are missing or outdated."""
+    for name, tracking in trackings.items():
+        folder = workspace.sequence_dir(name)
+        capture_hash = read_capture_hash(folder / "capture")
+        if not scoring_exists(folder / "scoring", capture_hash):
+            if scoring_exists(folder / "scoring"):
+                say(f"{name}: the pictures changed, so the scoring mask is made again")
+            capture = read_capture(folder / "capture")
+            check_tracking_of(capture, tracking, folder / "tracking")
+            made = make_scoring(capture, tracking, face_model, scratch=folder, settings=scoring)
+            write_scoring(folder / "scoring", made, capture_hash)
+
+
+def tracking_fingerprint(
+    workspace: Workspace,
+    names: list[str],
+    face_model: FaceModel,
+    settings: TrackingSettings,
+    hold_out: Collection[str] = (),
+) -> str:
+    """Return what trackings of these sequences depend on, as a short text that a tracking holds."""
+    captures = [(name, read_capture_hash(workspace.sequence_dir(name) / "capture")) for name in names]
+    content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]
+    content += [sorted(set(hold_out))] if hold_out else []
+    content += [_DESCENT_RECIPE] if settings.schedule == "paper" else []
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def _current_trackings(
+    workspace: Workspace, names: list[str], fingerprint: str, face_model: FaceModel, tell: bool = True
+) -> dict[str, Tracking] | None:
+    """The existing trackings, if they fit these captures and settings. If not, `tell` reports why."""
+    found, missing = {}, []
+    for name in names:
+        folder = workspace.sequence_dir(name) / "tracking"
+        if not (folder / "tracking.json").is_file():
+            missing.append(name)
+            continue
+        try:
+            found[name] = read_tracking(folder)
+            if found[name].face_model_hash == face_model.content_hash:
+                check_face_params(face_model, found[name].face, str(folder), "tracking again")
+        except UserError as error:
+            if tell:
+                say(f"{str(error).split('; ')[0]}; tracking again")
+            return None
+    together = {member for tracking in found.values() for member in tracking.settings.get("tracked_together", [])}
+    if not found:
+        return None
+    if all(tracking.settings.get("fingerprint") == fingerprint for tracking in found.values()):
+        # Sequences without a tracking had too few faces, or tracking was stopped before theirs were written.
+        return None if set(missing) & together else found
+    if not tell:
+        return None
+    imported = [name for name, tracking in found.items() if "imported" in tracking.settings]
+    if imported:
+        say(f"{', '.join(imported)}: came with a tracking of its dataset; mien's own takes its place")
+        return None
+    added = [name for name in missing if name not in together]
+    reason = f"{', '.join(added)} added" if added else "captures or settings changed"
+    say(f"{reason}: all {len(names)} sequences are tracked again, so that they share one identity" if len(names) > 1
+        else "Captures or settings changed since the sequence was tracked: tracking again")  # fmt: skip
+    return None
+
+
+def _track(
+    workspace: Workspace,
+    names: list[str],
+    face_model: FaceModel,
+    settings: TrackingSettings,
+    fingerprint: str,
+    preview: bool,
+    hold_out: Collection[str],
+) -> dict[str, Tracking]:
+    captures = {name: read_capture(workspace.sequence_dir(name) / "capture") for name in names}
+    usable = {name: capture for name, capture in captures.items() if has_enough_faces(capture)} or captures
+    for name in captures.keys() - usable.keys():
+        say(f"{name}: left out, because too few of its frames show a face")
+    apart = {name: capture for name, capture in usable.items() if name in hold_out}
+    shaping = {name: capture for name, capture in usable.items() if name not in hold_out}
+    check_apart(list(usable), list(apart))
+    keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
+    for other in workspace.root.glob("sequences/.tracking-*"):
+        if other != keep and other.is_dir():
+            remove_tree(other)  # kept for other captures or settings
+    page = workspace.root / "tracking_preview.html" if preview else None
+    if page is not None:
+        say(f"Open {page} in a browser to watch the fit")
+    if apart:
+        say(f"{', '.join(apart)}: tracked apart; the person's shape, texture and light come from {', '.join(shaping)}")
+    tracked = track_subject(list(shaping.values()), face_model, settings, keep, page, list(apart.values()))
+    by_name, trackings = dict(zip([*shaping, *apart], tracked, strict=True)), {}
+    for name, tracking in ((name, by_name[name]) for name in usable):
+        made_from: dict[str, object] = {"fingerprint": fingerprint, "tracked_together": list(usable)}
+        made_from |= {"held_out": list(apart)} if apart else {}
+        trackings[name] = replace(tracking, settings={**tracking.settings, **made_from})
+        folder = workspace.sequence_dir(name)
+        write_tracking(folder / "tracking", trackings[name])
+        (folder / OVERLAY).unlink(missing_ok=True)  # an import's, which shows another tracking
+        say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
+    _tell_outdated_runs(workspace, trackings)
+    return trackings
+
+
+def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
+    outdated = []
+    for run in workspace.run_names():
+        # A damaged run is reported when it is used.
+        with suppress(UserError):
+            if outdated_sequences(workspace.run_dir(run), trackings):
+                outdated.append(run)
+    if outdated:
+        say(
+            f"Trained on the previous tracking: {', '.join(outdated)}. Such a run can still be rendered, but neither "
+            "resumed nor scored; train again under another name (--run NAME), or delete its folder first"
+        )
+
+
+def show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, overlay: Overlay) -> None:
+    """Write the residual report and overlay.mp4, unless they are newer than the tracking."""
+    reported, shown = _is_shown(folder, tracking, overlay)
+    if reported and shown:
+        return
+    capture: Capture = read_capture(folder / "capture")
+    check_tracking_of(capture, tracking, folder / "tracking")
+    if not reported:
+        findings = write_residual_report(folder / "tracking", capture, tracking, face_model)
+        say(f"{capture.name}: {findings} See {folder / 'tracking' / 'report.html'}")
+    if not shown:
+        every = _stride(tracking, overlay)
+        if every > 1:
+            say(f"{capture.name}: the overlay shows one frame in {every} of {len(tracking.valid)}; `--overlay all` "
+                "shows them all")  # fmt: skip
+        video = folder / "tracking" / "overlay.mp4"
+        remove_leftovers(video)
+        write_overlay(video, capture, tracking, face_model, every)
+
+
+def _is_shown(folder: Path, tracking: Tracking, overlay: Overlay) -> tuple[bool, bool]:
+    """Whether the residual report and the chosen overlay exist and are newer than the tracking."""
+    video, report, written = (folder / "tracking" / name for name in ("overlay.mp4", "report.html", "tracking.json"))
+    if overlay == "none":
+        return _is_newer(report, written), True
+    frames = len(range(0, len(tracking.valid), _stride(tracking, overlay)))
+    return _is_newer(report, written), _is_newer(video, written) and count_frames(video) == frames
+
+
+def _stride(tracking: Tracking, overlay: Overlay) -> int:
+    """The n for which the overlay shows every n-th frame."""
+    return overlay_stride(len(tracking.valid)) if overlay == "auto" else 1
+
+
+def _is_newer(path: Path, than: Path) -> bool:
+    return path.is_file() and path.stat().st_mtime >= than.stat().st_mtime
