@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mien.driving.constants import DRIVING
 
 from mien import runtime
 from mien.capture.person.faces import LandmarkDetector
 from mien.cli import main
 from mien.commands.stages import viewing_motions
-from mien.driving.constants import DRIVING
 from mien.driving.live.follower import Follower, FollowOptions
 from mien.driving.live.landmark_fit import LandmarkFit
 from mien.driving.live.one_euro import OneEuro

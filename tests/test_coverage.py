@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mien.training.whole_head.constants import WHOLE_HEAD
 
 from known import known
 from mien.avatar import Avatar
@@ -33,8 +34,7 @@ from mien.training.footage.filmed import (
 )
 from mien.training.footage.frames import training_frames
 from mien.training.footage.sequence import Sequence
-from mien.training.whole_head.constants import WHOLE_HEAD
-from mien.training.whole_head.unseen import Unseen, drawn_at_height, spare_fills, unseen_of
+from mien.training.whole_head.unseen import UNSEEN_CONFIDENCE, Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
 from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_face, toy_sequence
@@ -165,7 +165,7 @@ def test_what_is_beside_shown_triangles_is_trained(toy: Toy, monkeypatch: pytest
     """Hair above a band beside what pictures show is on their outline, so pictures train it. Fills begin behind it."""
     model, avatar = toy[0], bare_avatar(toy)
     middles, found = model.head_vertices(avatar.subject)[0][model.faces].mean(1), covered(toy)
-    apart = torch.cdist(middles, middles[found.seen > WHOLE_HEAD.unseen_confidence]).amin(1)
+    apart = torch.cdist(middles, middles[found.seen > UNSEEN_CONFIDENCE]).amin(1)
     drawn = torch.zeros(len(model.faces), dtype=torch.bool)
     monkeypatch.setattr("mien.training.whole_head.unseen.drawn_at_height", lambda *given: drawn)
 

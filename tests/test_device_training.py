@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from mien.training.whole_head.constants import WHOLE_HEAD
 from torch import Tensor
 
 import mien.machine.devices
@@ -33,7 +34,6 @@ from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Sequence, Targets
 from mien.training.trainer import TrainingData, start, step
-from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.hair_surface import HairSurface
 from plain_settings import plain_config, plain_run
 from shared_things import toy_workspace

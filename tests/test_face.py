@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from mien.face.constants import FACE
 from torch import Tensor
 
 from mien.camera import camera_from_fov
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.face.constants import FACE
 from mien.face.models import anny_identity
 from mien.face.models.anny_identity import principal_components
 from mien.render.mesh import rasterize_mesh

@@ -10,9 +10,8 @@ from mien.avatar.schedules import Progress, Rate
 from mien.avatar.settings import FaceTuning
 from mien.face import FaceParams
 from mien.training.adam import Adam
-from mien.training.constants import TRAINING
 from mien.training.face_track import FaceTrack, spread_corrections, turns_from_mean, without_turns
-from mien.training.trainer import tuning_for
+from mien.training.trainer import ALIGNED_TUNING, tuning_for
 from toy_scene import toy_face, toy_sequence
 
 ROUNDING = 1e-8
@@ -170,7 +169,7 @@ def test_aligned_faces_are_corrected_more_slowly() -> None:
     tuning = FaceTuning(expression=Rate(1e-3, 1e-4), head_translation=Rate(3e-4, begin=0.5), keep_turns=True)
     assert tuning_for(tuning, [sequence, aligned]) == tuning
     assert not tuning_for(tuning, [sequence, both]).keep_turns
-    slower, share = tuning_for(tuning, [aligned]), TRAINING.aligned_tuning
+    slower, share = tuning_for(tuning, [aligned]), ALIGNED_TUNING
     assert slower.expression == Rate(share * 1e-3, share * 1e-4)
     assert slower.head_translation == Rate(share * 3e-4, begin=0.5)
 

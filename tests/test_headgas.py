@@ -12,8 +12,14 @@ from mien.adam import FactoredMoments, Moments
 from mien.avatar.avatar import neutral_of
 from mien.avatar.baking import make_portable
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.headgas.avatar import HeadGas, input_directions, neighbor_distances, sample_surface, spread_out
-from mien.avatar.headgas.constants import HEADGAS
+from mien.avatar.headgas.avatar import (
+    SHIFT_LENGTH,
+    HeadGas,
+    input_directions,
+    neighbor_distances,
+    sample_surface,
+    spread_out,
+)
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.headgas.variants import MOVED, averaging_weights
 from mien.avatar.methods import method_named
@@ -221,7 +227,7 @@ def test_delta_moves_and_turns_by_the_network_and_paints_nothing() -> None:
     posed, moved, store = avatar.pose(face), avatar.network(network_inputs(avatar)), avatar.store
     assert moved.shape == (40, MOVED)
     found = posed.gaussians.timestep(2)
-    torch.testing.assert_close(found.means, store["means"] + HEADGAS.shift_length * moved[:, :3])
+    torch.testing.assert_close(found.means, store["means"] + SHIFT_LENGTH * moved[:, :3])
     turn = matrix_from_quaternion(moved[:, 3:] + torch.tensor([1.0, 0, 0, 0]))
     torch.testing.assert_close(matrix_from_quaternion(found.quats), turn @ matrix_from_quaternion(store["quats"]))
     torch.testing.assert_close(found.opacities, store["opacity_logits"].sigmoid())
@@ -239,7 +245,7 @@ def test_change_all_paints_too() -> None:
     outputs, found = avatar.network(network_inputs(avatar)), posed.gaussians.timestep(2)
     assert outputs.shape == (40, 12 + MOVED + 1)
     torch.testing.assert_close(found.sh[:, 0], outputs[:, :3])
-    torch.testing.assert_close(found.means, avatar.store["means"] + HEADGAS.shift_length * outputs[:, 12:15])
+    torch.testing.assert_close(found.means, avatar.store["means"] + SHIFT_LENGTH * outputs[:, 12:15])
     torch.testing.assert_close(found.opacities, outputs[:, -1].sigmoid())
     assert set(avatar.regularizers(posed, rasterize(found, toy_camera(32), torch.ones(3)), Progress(1, 2))) == {"shift"}
 

@@ -11,8 +11,7 @@ from known import known
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar import motion
 from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
-from mien.avatar.mono_gaussian_avatar.constants import MONO
-from mien.avatar.mono_gaussian_avatar.motion import canonical_face, nearest_vertices
+from mien.avatar.mono_gaussian_avatar.motion import CANONICAL_JAW, canonical_face, nearest_vertices
 from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
@@ -45,7 +44,7 @@ def test_canonical_jaw_is_open() -> None:
     names, jaw = follows.joint_names, follows.joint_names.index("jaw")
     expression, joints = canonical_face(follows, mean)
     opening = follows.joint_rotation_basis[:, jaw, 0]
-    assert float(expression @ opening) == pytest.approx(MONO.canonical_jaw, abs=1e-6)
+    assert float(expression @ opening) == pytest.approx(CANONICAL_JAW, abs=1e-6)
     # Only the coefficient that opens the jaw most has changed.
     assert (expression != mean).nonzero()[:, 0].tolist() == [int(opening.argmax())]
     assert joints.abs().max() == 0
@@ -53,7 +52,7 @@ def test_canonical_jaw_is_open() -> None:
     expression, joints = canonical_face(replace(follows, joint_free=all_free, joint_rotation_basis=still), mean)
     assert torch.equal(expression, mean)
     turned = torch.zeros(len(names), 3)
-    turned[jaw, 0] = MONO.canonical_jaw
+    turned[jaw, 0] = CANONICAL_JAW
     torch.testing.assert_close(joints, turned)
     headless = replace(follows, joint_names=tuple("chin" if name == "jaw" else name for name in names))
     assert torch.equal(canonical_face(headless, mean)[0], mean)

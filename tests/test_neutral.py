@@ -10,10 +10,9 @@ import torch
 from mien.avatar import neutral_of
 from mien.commands.parsing.options import check_neutral
 from mien.driving import drive
-from mien.driving.constants import DRIVING
 from mien.driving.drivers import Driver
 from mien.driving.neutral import with_neutral
-from mien.driving.rest import facing, kept_share, rest_of
+from mien.driving.rest import REST_EXPRESSION, REST_GAZE, REST_HEAD, facing, kept_share, rest_of
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.pipeline.drive import open_driver
@@ -109,7 +108,7 @@ def test_who_rests_is_transferred_as_before() -> None:
 
 
 def test_motion_grows_without_a_jump() -> None:
-    for limits in (DRIVING.rest_expression, DRIVING.rest_head, DRIVING.rest_gaze):
+    for limits in (REST_EXPRESSION, REST_HEAD, REST_GAZE):
         sizes = torch.linspace(0, 2 * limits[1], 2001)
         moved = sizes * (1 - kept_share(sizes, limits))
         assert ((moved.diff() >= 0) & (moved.diff() < 0.01)).all()

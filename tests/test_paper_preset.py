@@ -21,8 +21,7 @@ from mien.camera import Camera
 from mien.training import PRESETS, TrainSettings
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import round_steps
-from mien.training.footage.constants import FOOTAGE
-from mien.training.footage.frames import Frame, camera_extent
+from mien.training.footage.frames import LEAST_EXTENT, Frame, camera_extent
 from plain_settings import plain_gaussian_avatars
 from toy_scene import toy_face, toy_face_model, toy_sequence
 
@@ -234,11 +233,11 @@ def test_extent_is_that_of_the_training_cameras() -> None:
 
     three = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (2.0, 30.0, 0.0)]
     assert extent(three, 0, 1, 0) == pytest.approx(1.1 * 2)
-    assert extent(three, 0) == extent([(0, 0, 0), (0.1, 0, 0)], 0, 1) == FOOTAGE.least_extent == 0.5
+    assert extent(three, 0) == extent([(0, 0, 0), (0.1, 0, 0)], 0, 1) == LEAST_EXTENT == 0.5
     angles = torch.linspace(-math.pi / 4, math.pi / 4, 16).tolist()
     arc = [(math.sin(angle), 0.0, math.cos(angle)) for angle in angles]
     assert extent(arc, *range(16)) == pytest.approx(0.8, abs=0.02)
-    assert (PAPER.density.split_size, PAPER.density.prune_size) == (0.005 / FOOTAGE.least_extent, 0.05 / 0.5)
+    assert (PAPER.density.split_size, PAPER.density.prune_size) == (0.005 / LEAST_EXTENT, 0.05 / 0.5)
 
 
 def test_extent_reaches_rates_in_its_unit_only() -> None:

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import torch
+from mien.tracking.constants import TRACKING
 
 from mien.adam import Moments
 from mien.tracking import track, track_subject
-from mien.tracking.constants import TRACKING
 from mien.tracking.descent import epochs, frames
 from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent

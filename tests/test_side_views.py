@@ -30,9 +30,16 @@ from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
 from mien.tracking.scoring import head_cutter
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame, resolved
-from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
-from mien.training.whole_head.soft_cut import opacity_shares, with_soft_cut
+from mien.training.whole_head.soft_cut import (
+    SOFT_CUT_COLLAR,
+    SOFT_CUT_HEAD,
+    SOFT_CUT_LEAST,
+    SOFT_CUT_OFF_SKIN,
+    SOFT_CUT_WIDTH,
+    opacity_shares,
+    with_soft_cut,
+)
 from mien.training.whole_head.unseen import fills_sides
 from plain_settings import plain_gaussian_avatars
 from shared_things import MadeOnce, toy_workspace
@@ -212,15 +219,15 @@ def test_what_is_far_from_the_cut_stays_and_the_end_of_the_neck_is_clear(model, 
     np.testing.assert_array_equal(now[~neck], was[~neck])
     cut = cut_of(model, model(avatar.subject)[0])
     margins = cut.margins(world_means(avatar.pose(avatar.subject).gaussians.timestep(0)).detach()).numpy()
-    between = (margins > 0) & (margins < WHOLE_HEAD.soft_cut_width) & neck
-    far = neck & (margins < -WHOLE_HEAD.soft_cut_head[1])
+    between = (margins > 0) & (margins < SOFT_CUT_WIDTH) & neck
+    far = neck & (margins < -SOFT_CUT_HEAD[1])
     assert far.any()
-    assert (now[far] <= 1.01 * WHOLE_HEAD.soft_cut_least).all()
+    assert (now[far] <= 1.01 * SOFT_CUT_LEAST).all()
     assert (now[between] <= was[between]).all()
     assert (now[between] < 0.9 * was[between]).any()
     # Pictures end as softly as files.
     soft, sharp = posed_softly(avatar)(avatar.subject), avatar.pose(avatar.subject).gaussians.timestep(0)
-    np.testing.assert_allclose(soft.opacities.numpy(), now, atol=WHOLE_HEAD.soft_cut_least + 1e-6)
+    np.testing.assert_allclose(soft.opacities.numpy(), now, atol=SOFT_CUT_LEAST + 1e-6)
     assert torch.equal(soft.means, sharp.means)
     assert float((soft.opacities / sharp.opacities.detach()).min()) < 0.01
 
@@ -235,7 +242,7 @@ def test_shares_grow_with_the_distance_from_the_cut(model: FaceModel) -> None:
     assert (float(shares[0]), float(shares[-1])) == (0.0, 1.0)
     assert ((shares > 0.1) & (shares < 0.9)).any()
     assert (opacity_shares(points, cut, points, points) == 1).all(), "what lies on the head is not cut off"
-    gap, (low, high) = WHOLE_HEAD.soft_cut_off_skin[1] + 1e-3, WHOLE_HEAD.soft_cut_collar
+    gap, (low, high) = SOFT_CUT_OFF_SKIN[1] + 1e-3, SOFT_CUT_COLLAR
     skin = origin + torch.tensor([0.95 * low, 1.1 * high])[:, None] * up
     on_skin, off_skin = (opacity_shares(skin + away * side, cut, far, skin) for away in (0.0, gap))
     assert (on_skin > 0.7).all()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from mien.training.constants import TRAINING
 
 import train_toy
 from instruction_sets import by_threads
@@ -20,7 +21,6 @@ from mien.render.rasterize import rasterize_each
 from mien.training import TrainSettings, train, trainer
 from mien.training.batch import TrainingData, coarse_steps, next_batch
 from mien.training.checkpoint import TrainingState
-from mien.training.constants import TRAINING
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import passed, start, step

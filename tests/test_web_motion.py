@@ -11,11 +11,11 @@ import torch
 from mien import runtime
 from mien.cli import main
 from mien.driving import drive
-from mien.driving.constants import DRIVING
 from mien.driving.rest import rest_of
 from mien.driving.sources.blendshape_json import read_blendshape_json
 from mien.driving.sources.live_link_face import read_live_link_face
 from mien.driving.sources.sides import PAIRS
+from mien.driving.sources.speech import SPEECH_BAND_WEIGHTS, SPEECH_BANDS, SPEECH_LEAST_SHARE
 from mien.driving.transfer import face_of_motion
 from mien.export.web_page import write_page
 from mien.face import FaceParams, load_face_model
@@ -220,10 +220,10 @@ def mouths(voice: Path, sound: np.ndarray) -> list[dict[str, float]]:
         piece = padded[round(index / FPS * RATE) :][:size]
         piece = piece - piece.mean()
         power = np.abs(np.fft.rfft(piece * window)) ** 2
-        bands = ((0, 700), (2500.1, np.inf), *DRIVING.speech_bands)
+        bands = ((0, 700), (2500.1, np.inf), *SPEECH_BANDS)
         parts = (power[(least <= frequencies) & (frequencies < most)].sum() for least, most in bands)
         low, high, *vowel = (part / max(power.sum(), 1e-20) for part in parts)
-        vowel = 10 * np.dot(np.log10(np.maximum(vowel, DRIVING.speech_least_share)), DRIVING.speech_band_weights)
+        vowel = 10 * np.dot(np.log10(np.maximum(vowel, SPEECH_LEAST_SHARE)), SPEECH_BAND_WEIGHTS)
         loudness = 10 * np.log10(max(float((piece**2).mean()), 1e-12))
         heard.append([loudness, float(vowel), float(low), float(high), index / FPS])
     return run_node("voice.mjs", voice, heard)

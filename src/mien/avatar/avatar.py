@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from mien.adam import EPSILON, FactoredGradient, FactoredMoments, Moments
 from mien.avatar.bound_surface import BoundSurface
-from mien.avatar.constants import AVATAR
 from mien.avatar.density import DensityControl
 from mien.avatar.schedules import TRAINED, Progress, Rate
 from mien.avatar.settings import MethodConfig
@@ -25,6 +24,8 @@ from mien.face.params import FaceParams
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.runtime.baked import BakedAvatar, Filmed
+
+_CALM_SHARE = 0.1  # share of the timesteps that are used to estimate the expression at rest
 
 UNBAKED_REMEDY = "export a .ply instead, or draw it with `mien render`"
 """What to do with avatars that have no record of `mien.runtime`."""
@@ -207,7 +208,7 @@ def neutral_of(face: FaceParams) -> FaceParams:
     """
     face = face.detach()
     activity = face.expression.norm(dim=-1)
-    calm = activity.argsort(stable=True)[: max(1, round(AVATAR.calm_share * len(face)))]
+    calm = activity.argsort(stable=True)[: max(1, round(_CALM_SHARE * len(face)))]
     return replace(
         face,
         expression=face.expression[calm].median(0, keepdim=True).values,

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.avatar.constants import AVATAR
+_FILL_HEIGHT_SHARE = 0.9
+"""Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it.
+Measured: 0.5 has 0.2 dB more at 30 degrees and 0.3 less at 90, and 1 has 0.2 dB less at 30 (log, 11-24)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class SurfacePrior:
     @property
     def fill_height(self) -> Float[Tensor, " f"]:
         """Height at which a fill lies above its triangle, in metres."""
-        return AVATAR.fill_height_share * self.hair
+        return _FILL_HEIGHT_SHARE * self.hair
 
 
 class BoundSurface(ABC):

@@ -5,11 +5,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.avatar.constants import AVATAR
 from mien.avatar.ops.expression_changes import expression_inputs
 from mien.face.params import FaceParams
 from mien.runtime.baked import Filmed
 from mien.runtime.filmed import head_angles
+
+_FILMED_LEAST_SPREAD = 0.3  # spread that every direction of expressions has at least, relative to the largest
 
 
 @torch.no_grad()
@@ -24,7 +25,7 @@ def measure_filmed(face: FaceParams, neutral: FaceParams, eyes: Float[Tensor, "b
     inputs = expression_inputs(face.detach()).double().cpu()
     offsets = inputs - expression_inputs(neutral.detach())[0].double().cpu()
     variances, vectors = torch.linalg.eigh(offsets.T @ offsets / len(offsets))
-    least = max(AVATAR.filmed_least_spread**2 * float(variances[-1]), 1e-6)
+    least = max(_FILMED_LEAST_SPREAD**2 * float(variances[-1]), 1e-6)
     directions = vectors / (variances.clamp_min(0) + least).sqrt()
     poses = (face.head_rotation, face.head_translation, eyes)
     angles = head_angles(*(tensor.detach().double().cpu().numpy() for tensor in poses))

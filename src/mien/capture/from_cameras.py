@@ -14,7 +14,6 @@ from mien.capture.cameras.calibration import CalibratedCamera, match_sources, re
 from mien.capture.cameras.calibration_check import advise_on, landmarks_at, some_timesteps, warn_of_misfit
 from mien.capture.cameras.head_path import HeadPath, choose_crops, disagreeing, find_head_path
 from mien.capture.capture import Capture
-from mien.capture.constants import CAPTURE
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.capture.from_video import (
     RECIPE,
@@ -45,6 +44,10 @@ from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.media.pace import frame_rate, tell_pauses
 from mien.storage import file_digest
+
+_LANDMARKS_MOST_ASTRAY = 1.0
+"""Largest distance between landmarks and the projected head, in sides of the landmarks' box. Farther ones are taken for
+a false face, for example in hair seen from behind."""
 
 _MAX_RATE_ERROR = 0.01
 """Largest relative difference between the cameras' frame rates."""
@@ -365,5 +368,5 @@ def _remove_astray(landmarks: Float[np.ndarray, "t c l 2"], path: HeadPath, came
         least, most = found.min(axis=1), found.max(axis=1)
         side = np.maximum((most - least).max(axis=1), 1.0)
         with np.errstate(invalid="ignore"):
-            is_astray = np.linalg.norm((least + most) / 2 - centers, axis=1) > CAPTURE.landmarks_most_astray * side
+            is_astray = np.linalg.norm((least + most) / 2 - centers, axis=1) > _LANDMARKS_MOST_ASTRAY * side
         found[is_astray] = np.nan

@@ -11,11 +11,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.driving.constants import DRIVING
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+
+_TRANSFER_NOISE = 0.0005
+"""Distance in metres by which a landmark of a matched motion may be off: the weight of the fit against the priors
+below. Not varied, as the next three."""
+_TRANSFER_SPREAD = 0.5  # standard deviation of ARKit's coefficients
+_TRANSFER_JAW_SPREAD = 0.2  # the same of the angles of a jaw that is a joint, in radians
+_TRANSFER_JAW = ((-0.05, 0.6), (-0.15, 0.15), (-0.1, 0.1))  # bounds of its angles about x, y and z, in radians
+_TRANSFER_JAW_STEP = 0.2  # angle in radians over which a jaw's motion is taken as linear
+_TRANSFER_SWEEPS = 40  # rounds of the bounded fit
 
 _MARKS = "mediapipe"
 _FACE_MARKS = 468
@@ -88,7 +96,7 @@ def fit_expression_map(source: FaceModel, target: FaceModel) -> ExpressionMap:
     (rest, theirs), (our_rest, ours) = _displacements(_at_landmarks(source)), _displacements(_at_landmarks(target))
     theirs = (theirs @ _registration(rest, our_rest).T).flatten(1)
     ours = ours.flatten(1)
-    noise = DRIVING.transfer_noise
+    noise = _TRANSFER_NOISE
     normal = ours @ ours.T / noise**2 + torch.diag(_precisions(target))
     return ExpressionMap(source, target, theirs @ ours.T / noise**2, normal)
 
@@ -102,16 +110,16 @@ def _motions(model: FaceModel, face: FaceParams) -> Float[Tensor, "b s"]:
 def _bounds(model: FaceModel) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
     bounds = model.expression_bounds.double()
     if _JAW in model.free_joint_names:
-        bounds = torch.cat([bounds, torch.tensor(DRIVING.transfer_jaw, dtype=torch.float64)])
+        bounds = torch.cat([bounds, torch.tensor(_TRANSFER_JAW, dtype=torch.float64)])
     return bounds[:, 0], bounds[:, 1]
 
 
 def _precisions(model: FaceModel) -> Float[Tensor, " t"]:
     """Inverse variances of the motions, by which the fit prefers usual faces."""
     e, sigmas = len(model.expression_names), model.expression_sigmas
-    spread = torch.full((e,), DRIVING.transfer_spread) if sigmas is None else sigmas
+    spread = torch.full((e,), _TRANSFER_SPREAD) if sigmas is None else sigmas
     if _JAW in model.free_joint_names:
-        spread = torch.cat([spread, torch.full((3,), DRIVING.transfer_jaw_spread)])
+        spread = torch.cat([spread, torch.full((3,), _TRANSFER_JAW_SPREAD)])
     return spread.double().clamp_min(1e-6).square().reciprocal()
 
 
@@ -155,10 +163,10 @@ def _displacements(model: FaceModel) -> tuple[Float[Tensor, "l 3"], Float[Tensor
             if motion < e:
                 expression[row, motion] = 1
             else:
-                joints[row, model.free_joint_names.index(_JAW), motion - e] = DRIVING.transfer_jaw_step
+                joints[row, model.free_joint_names.index(_JAW), motion - e] = _TRANSFER_JAW_STEP
         found.append(_marks(model, replace(face, expression=expression, joints=joints)) - rest)
     moved = torch.cat(found)
-    moved[e:] /= DRIVING.transfer_jaw_step
+    moved[e:] /= _TRANSFER_JAW_STEP
     return rest[0], moved
 
 
@@ -180,7 +188,7 @@ def _within_bounds(
         return found
     found = found.clamp(lower, upper)
     slope = found @ normal - wanted
-    for _ in range(DRIVING.transfer_sweeps):
+    for _ in range(_TRANSFER_SWEEPS):
         for motion in range(len(normal)):
             old = found[:, motion]
             new = (old - slope[:, motion] / normal[motion, motion]).clamp(lower[motion], upper[motion])

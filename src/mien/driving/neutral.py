@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 from mien.avatar.avatar import neutral_of
-from mien.driving.constants import DRIVING
 from mien.driving.drivers import Driver
 from mien.driving.rest import rest_of
 from mien.errors import UserError
@@ -11,6 +10,8 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.machine.progress import say
 from mien.rotation import axis_angle_from_matrix
+
+_FIRST_SECONDS = 0.5  # length of the beginning that --neutral first takes, in seconds
 
 _MOST_NAMED = 4
 
@@ -37,8 +38,8 @@ def with_neutral(
     elif neutral == "calm":
         face, taken = neutral_of(seen), "the calmest tenth of its frames"
     elif neutral == "first":
-        face = _median(seen[: max(1, round(DRIVING.first_seconds * driver.fps))])
-        taken = f"its first {DRIVING.first_seconds:g} s"
+        face = _median(seen[: max(1, round(_FIRST_SECONDS * driver.fps))])
+        taken = f"its first {_FIRST_SECONDS:g} s"
     elif neutral == "model":
         face, taken = _of_model(driver, model), "the face model's own neutral, with the head towards the camera"
     else:

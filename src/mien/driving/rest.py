@@ -16,10 +16,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.driving.constants import DRIVING
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, most_frontal_camera
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+
+REST_EXPRESSION = (0.3, 0.6)
+"""Limits of a coefficient of ARKit: up to the first it belongs to the person, from the second on it is motion.
+Measured: calm tenths of nine real sequences have 0.22 at most, of ten drawn ones 0.28 (log, 11-25)."""
+REST_HEAD = (0.524, 0.785)
+"""The same for the angle between the head and the direction to the camera, in radians: 30 and 45 degrees. A camera
+aside is common, so these limits are wide. Measured: 18 degrees at most, 26 on drawn people."""
+REST_GAZE = (0.262, 0.384)
+"""The same for the angle of the gaze, in radians: 15 and 22 degrees. Eyes that look ahead or into the camera are at
+rest however the head is turned. Measured: 11 degrees at most, 12 on drawn people."""
+_REST_JAW = (0.12, 0.24)  # the same for a jaw that is a joint, in radians
+_REST_SIGMAS_OF_ONE = 5.0
+"""Standard deviations of a face model's coefficient that count as 1 of ARKit, so that the limits are 1.5 and 3."""
 
 Limits = tuple[float, float]
 _OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
@@ -58,19 +70,19 @@ def rest_of(calm: FaceParams, model: FaceModel, ahead: Float[Tensor, "3 3"] | No
     expression, joints, turn = calm.expression.clone(), calm.joints.clone(), calm.head_rotation
     units = torch.ones(expression.shape[1]).to(expression)
     if model.expression_sigmas is not None:
-        units = DRIVING.rest_sigmas_of_one * model.expression_sigmas.to(expression)
-    kept = kept_share((expression / units).abs(), DRIVING.rest_expression)
+        units = _REST_SIGMAS_OF_ONE * model.expression_sigmas.to(expression)
+    kept = kept_share((expression / units).abs(), REST_EXPRESSION)
     moved += [f"{model.expression_names[index]} {expression[0, index]:.2f}" for index in (kept[0] < 1).nonzero()[:, 0]]
     expression = torch.where(kept < 1, kept * expression, expression)
 
     away = axis_angle_from_matrix(ahead.T @ matrix_from_axis_angle(turn))
-    head = float(kept_share(away.norm(dim=-1), DRIVING.rest_head))
+    head = float(kept_share(away.norm(dim=-1), REST_HEAD))
     if head < 1:
         moved.append(f"the head {_degrees(away[0].norm())} degrees to the side")
         turn = axis_angle_from_matrix(ahead @ matrix_from_axis_angle(head * away))
     for index, name in enumerate(model.free_joint_names):
         if "eye" not in name.lower():
-            limits = DRIVING.rest_jaw if "jaw" in name.lower() else DRIVING.rest_head
+            limits = _REST_JAW if "jaw" in name.lower() else REST_HEAD
             share = float(kept_share(joints[0, index].norm(), limits))
             if share < 1:
                 moved.append(f"{name} {_degrees(joints[0, index].norm())} degrees")
@@ -78,7 +90,7 @@ def rest_of(calm: FaceParams, model: FaceModel, ahead: Float[Tensor, "3 3"] | No
     eyes = [index for index, name in enumerate(model.free_joint_names) if "eye" in name.lower()]
     if eyes:
         angle = _gaze(joints[:, eyes], ahead.T @ matrix_from_axis_angle(calm.head_rotation))
-        gaze = float(kept_share(angle, DRIVING.rest_gaze))
+        gaze = float(kept_share(angle, REST_GAZE))
         if gaze < 1:
             moved.append(f"the gaze {_degrees(angle)} degrees to the side")
         # Eyes that made up for a turn of the head do so no less than the head moves.

@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mien.face.constants import FACE
+_CHART_FROM = (-0.03, 0.02)  # height and depth of the point from which the outside is seen, in metres in the head frame
+_CHART_FLAT = 0.02  # cosine below which a triangle is seen edge-on
 
 _HEAD_BOX = (0.005, 0.255, 0.99, 0.74)
 _CELLS_BOX = (0.005, 0.005, 0.99, 0.24)
@@ -35,7 +36,7 @@ def unwrap(
 
 def _seen_from_within(template: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 2"]]:
     """Return rays from a point in the head to all vertices, and their angles."""
-    rays = template - np.array([0.0, *FACE.chart_from])
+    rays = template - np.array([0.0, *_CHART_FROM])
     azimuth = np.arctan2(rays[:, 0], rays[:, 2])
     elevation = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
     # More texels for the face: the back of the head gets half as many.
@@ -52,7 +53,7 @@ def _outside(
     facing = (normal * middle).sum(1)
     facing /= np.maximum(np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1), 1e-12)
     names, counts = np.unique(pieces, return_counts=True)
-    seen = (pieces == names[counts.argmax()]) & (facing > FACE.chart_flat) & (np.ptp(flat[faces, 0], axis=1) < 1.0)
+    seen = (pieces == names[counts.argmax()]) & (facing > _CHART_FLAT) & (np.ptp(flat[faces, 0], axis=1) < 1.0)
     if not seen.any():
         return seen
     # Inner layers such as a mouth's back wall also face outwards, but triangles that face inwards separate them from

@@ -7,9 +7,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.face.chart import find_outside
-from mien.face.constants import FACE
 from mien.face.mirror import triangle_geometry
 from mien.face.model import FaceModel
+
+_MOUTH_COLOR = (0.30, 0.12, 0.11)  # colour of the mouth's lining at the lips, in daylight. These seven were set by eye
+_TEETH_COLOR = (0.84, 0.80, 0.72)  # the same of teeth
+_TONGUE_COLOR = (0.62, 0.34, 0.33)  # the same of the tongue
+_MOUTH_FADE = 0.016  # depth in metres over which light falls to 1 / e on the mouth's lining
+_TEETH_FADE = 0.030  # the same on teeth and tongue
+_LIPS_DEPTH = 0.012  # depth behind the lips' front at which the inside of the mouth begins, in metres
+_DARKEST_MOUTH = 0.08  # share of light that reaches the bottom of the mouth
 
 _FACE = ("skin", "face", "nose")
 _SKIN = (*_FACE, "ears", "eyelids", "eye_sockets")
@@ -104,10 +111,10 @@ def mouth_colors(parts: HeadParts, middles: Float[Tensor, "f 3"]) -> Float[Tenso
         parts: Parts of the face model.
         middles: Middles of the triangles of the neutral head, in metres.
     """
-    depth = (parts.front - FACE.lips_depth - middles[:, 2:3]).clamp_min(0)
-    fade = torch.where(parts.mouth[:, None], FACE.mouth_fade, FACE.teeth_fade)
-    light = torch.exp(-depth / fade).clamp_min(FACE.darkest_mouth)
-    colors = middles.new_tensor(FACE.mouth_color).expand_as(middles)
-    for part, color in ((parts.teeth, FACE.teeth_color), (parts.tongue, FACE.tongue_color)):
+    depth = (parts.front - _LIPS_DEPTH - middles[:, 2:3]).clamp_min(0)
+    fade = torch.where(parts.mouth[:, None], _MOUTH_FADE, _TEETH_FADE)
+    light = torch.exp(-depth / fade).clamp_min(_DARKEST_MOUTH)
+    colors = middles.new_tensor(_MOUTH_COLOR).expand_as(middles)
+    for part, color in ((parts.teeth, _TEETH_COLOR), (parts.tongue, _TONGUE_COLOR)):
         colors = torch.where(part[:, None], middles.new_tensor(color), colors)
     return colors * light

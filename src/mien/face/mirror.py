@@ -5,8 +5,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from mien.face.constants import FACE
 from mien.face.model import FaceModel
+
+_MIRROR_REACH = 0.75
+"""Distance between a triangle's reflected middle and its mirror image's, in square roots of the triangle's area."""
+_MIRROR_ALIGNED = 0.5
+"""Cosine between a reflected normal and the mirror image's normal from which two triangles face alike."""
 
 _CHUNK = 512
 
@@ -22,14 +26,14 @@ def mirror_triangles(face_model: FaceModel) -> Int[Tensor, " f"]:
     template, faces = face_model.template.double().cpu(), face_model.faces.long().cpu()
     middles, areas, normals = triangle_geometry(template, faces)
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-    reach = FACE.mirror_reach * areas.sqrt()
+    reach = _MIRROR_REACH * areas.sqrt()
     images = torch.full((len(faces),), -1, dtype=torch.int64)
     for region in face_model.face_regions.unique().tolist():
         members = (face_model.face_regions.cpu() == region).nonzero()[:, 0]
         for own in members.split(_CHUNK):
             # Without matrix products, which lose the digits that tell neighbours apart.
             distance = torch.cdist(middles[own] * flip, middles[members], compute_mode="donot_use_mm_for_euclid_dist")
-            aligned = (normals[own] * flip) @ normals[members].T > FACE.mirror_aligned
+            aligned = (normals[own] * flip) @ normals[members].T > _MIRROR_ALIGNED
             nearest, index = distance.masked_fill(~aligned, torch.inf).min(1)
             image = members[index]
             images[own] = torch.where(nearest <= torch.maximum(reach[own], reach[image]), image, -1)

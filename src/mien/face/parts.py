@@ -5,8 +5,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.face.constants import FACE
 from mien.face.model import FaceModel
+
+_EYES_MARGIN = 0.12  # margin around the eyes' regions on each side, relative to the width of the part. Set by eye
+_MOUTH_MARGIN = 0.2  # the same around the mouth. Set by eye
+_PART_LEAST_COSINE = 0.3
+"""Smallest cosine between the direction from the head's middle to the part and that from the part to the camera at
+which the part counts as seen."""
+_PART_LEAST_SIDE = 8  # smallest side of a part's box, in pixels. Smaller parts show nothing
 
 Box = tuple[int, int, int, int]
 """Left, top, width and height in pixels: `mien.media.pictures.Box`, without its import of OpenCV."""
@@ -27,7 +33,7 @@ def part_boxes(face_model: FaceModel, vertices: Float[Tensor, "v 3"], camera: Ca
         vertices: Its vertices in world space, in metres.
         camera: The camera that sees them.
     """
-    margins: dict[str, float] = {"eyes": FACE.eyes_margin, "mouth": FACE.mouth_margin}
+    margins: dict[str, float] = {"eyes": _EYES_MARGIN, "mouth": _MOUTH_MARGIN}
     found: dict[str, Box] = {}
     for name in PARTS:
         triangles = face_model.faces[face_model.region_mask(*_REGIONS[name])]
@@ -44,7 +50,7 @@ def _box_of(vertices: Float[Tensor, "v 3"], triangles: Tensor, camera: Camera, m
     outward, towards = middle - (vertices.amin(0) + vertices.amax(0)) / 2, camera.position - middle
     if not (depth > 0).all() or not torch.isfinite(points).all():
         return None
-    if float((outward * towards).sum()) < FACE.part_least_cosine * float(outward.norm() * towards.norm()):
+    if float((outward * towards).sum()) < _PART_LEAST_COSINE * float(outward.norm() * towards.norm()):
         return None
     low, high = points.amin(0), points.amax(0)
     beyond = margin * (high[0] - low[0])
@@ -52,6 +58,6 @@ def _box_of(vertices: Float[Tensor, "v 3"], triangles: Tensor, camera: Camera, m
     left, top = max(ends[0], 0), max(ends[1], 0)
     right, bottom = min(ends[2], camera.width), min(ends[3], camera.height)
     width, height = max(right - left, 0), max(bottom - top, 0)
-    if min(width, height) < FACE.part_least_side or 2 * width * height < (ends[2] - ends[0]) * (ends[3] - ends[1]):
+    if min(width, height) < _PART_LEAST_SIDE or 2 * width * height < (ends[2] - ends[0]) * (ends[3] - ends[1]):
         return None
     return left, top, width, height

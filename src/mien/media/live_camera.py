@@ -19,13 +19,14 @@ from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
-from mien.capture.constants import CAPTURE
 from mien.errors import UserError
 from mien.media.camera_names import CameraName, remedy
 from mien.media.colors import UNSPECIFIED
 from mien.media.display import Display, brought_to, has_shape
 from mien.media.video import DEFAULT_FPS
 from mien.media.video_file import find_streams, open_video, read_container_tags
+
+_LIVE_SIDE = 640  # longest side in pixels of a camera's pictures that are kept
 
 _ASKED = {"framerate": "30", "video_size": "640x480"}
 """What a device is asked for first. One that cannot do it gives its own default."""
@@ -161,7 +162,7 @@ class LiveCamera:
         if self.name.is_file:
             path = Path(self.name.device)
             container, _ = read_container_tags(path, find_streams(path)[0])
-        display = Display(str(self.name), 1.0, CAPTURE.live_side, container)
+        display = Display(str(self.name), 1.0, _LIVE_SIDE, container)
         began: float | None = None
         size: tuple[int, int] | None = None
         with contextlib.suppress(av.error.FFmpegError, OSError):

@@ -5,8 +5,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mien.capture.constants import CAPTURE
 from mien.machine.progress import say
+
+_RATE_TOLERANCE = 0.01  # relative difference up to which the measured frame rate is taken for the file's nominal one
+_RATE_STEADY_RATIO = 1.6
+"""Ratio to the median up to which times between frames count for the rate. It is above 1.5, which films at 24 frames a
+second have on a grid of 60: they alternate between two and three steps."""
 
 _MAX_INTERVAL_RATIO = 1.5
 """Ratio of the longest to the median time between frames from which a clip's rate is called variable."""
@@ -61,9 +65,9 @@ def frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
     usual = float(np.median(steps)) if len(steps) else 0.0
     if usual <= 0:
         return nominal
-    steady = (steps <= CAPTURE.rate_steady_ratio * usual) & (steps * CAPTURE.rate_steady_ratio >= usual)
+    steady = (steps <= _RATE_STEADY_RATIO * usual) & (steps * _RATE_STEADY_RATIO >= usual)
     if steady.all():
         measured = float(len(steps) / timestamps[-1])
     else:
         measured = 1 / float(steps[steady].mean() if steady.any() else usual)
-    return nominal if abs(measured - nominal) <= CAPTURE.rate_tolerance * nominal else measured
+    return nominal if abs(measured - nominal) <= _RATE_TOLERANCE * nominal else measured

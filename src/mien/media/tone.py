@@ -17,7 +17,9 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from mien.capture.constants import CAPTURE
+_HDR_WHITE = 203.0  # light in cd/m2 of diffuse white in HDR. ITU-R BT.2408
+_HDR_PEAK = 1000.0  # brightest light in cd/m2 that is shown below white. The peak of BT.2100's nominal HLG display
+_HDR_KNEE = 0.75  # share of diffuse white above which light is compressed. Set by eye
 
 PQ, HLG = 16, 18
 """Codes of the transfer functions in video files (ITU-T H.273)."""
@@ -48,7 +50,7 @@ class ToneMapper:
         self._is_hlg = transfer == HLG
         entries = (_SIXTEEN_BIT_WHITE >> (16 - _SIGNAL_BITS)) + 1
         signal = np.minimum(np.arange(1 << _SIGNAL_BITS) / (entries - 1), 1)
-        decoded = hlg_scene_light(signal) if self._is_hlg else pq_light(signal) / CAPTURE.hdr_white
+        decoded = hlg_scene_light(signal) if self._is_hlg else pq_light(signal) / _HDR_WHITE
         self._light = decoded.astype(np.float32)
 
     def to_srgb(self, picture: UInt16[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -58,10 +60,10 @@ class ToneMapper:
         light = self._light[picture >> (16 - _SIGNAL_BITS)]
         if self._is_hlg:
             luminance = cv2.transform(light, _BT2020_LUMA)
-            light *= ((CAPTURE.hdr_peak / CAPTURE.hdr_white) * np.power(luminance, 0.2))[..., None]
+            light *= ((_HDR_PEAK / _HDR_WHITE) * np.power(luminance, 0.2))[..., None]
         light = cv2.transform(light, _BT2020_TO_BT709)
         brightest = light.max(axis=-1)
-        bright = brightest > CAPTURE.hdr_knee
+        bright = brightest > _HDR_KNEE
         if bright.any():
             values = brightest[bright]
             light[bright] *= (roll_off(values) / values)[:, None]
@@ -101,7 +103,7 @@ def hlg_scene_light(signal: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
 
 def roll_off(light: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
     """Compress light above the knee (1 = diffuse white) into the range between the knee and 1."""
-    knee, peak = CAPTURE.hdr_knee, CAPTURE.hdr_peak / CAPTURE.hdr_white
+    knee, peak = _HDR_KNEE, _HDR_PEAK / _HDR_WHITE
     room = 1 - knee
     above = (np.minimum(light, peak) - knee) / room
     most = (peak - knee) / room

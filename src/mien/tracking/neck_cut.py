@@ -9,8 +9,14 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.face.model import FaceModel
-from mien.tracking.constants import TRACKING
 from mien.tracking.neck_line import bottom_vertices, neck_vertices
+
+_RAISED = 0.4
+"""Height of the cut above the base of the neck, as a share of the way to the middle of the neck: above most collars.
+Measured: without the raise, the front of `mono-sides` has 2 dB less (log, "Capture", 11-23)."""
+_BESIDE = 1.15  # radius that is kept at the neck cut, in radii of the neck. Set by eye
+_SLOPE = 1.0
+"""Growth of that radius with the height above the cut. Hair is kept; collars and shoulders are cut off. Set by eye."""
 
 _BAND = 64
 """Rows of a picture whose cut is computed at once."""
@@ -36,8 +42,7 @@ class NeckCut:
         """Distances of points from what is cut off, below the plane and beside the neck, in metres; negative there."""
         origin, axes, radii = (torch.from_numpy(array).to(points) for array in (self.origin, self.axes, self.radii))
         local = (points - origin) @ axes.T
-        known = TRACKING.neck
-        beside = radii.prod().sqrt() * (known.beside - (local[:, :2] / radii).norm(dim=1)) + known.slope * local[:, 2]
+        beside = radii.prod().sqrt() * (_BESIDE - (local[:, :2] / radii).norm(dim=1)) + _SLOPE * local[:, 2]
         return torch.minimum(local[:, 2], beside)
 
 
@@ -76,7 +81,7 @@ def fit_neck_cut(parts: NeckParts, vertices: Float[Tensor, "v 3"], up: Float[Ten
     axes = np.stack([first, np.cross(normal, first), normal])
     radii = np.maximum(np.abs(offsets @ axes[:2].T).max(0), 1e-3)
     middle = ring.mean(0)
-    return NeckCut(middle - (1 - TRACKING.neck.raised) * normal * ((middle - center) @ normal), axes, radii)
+    return NeckCut(middle - (1 - _RAISED) * normal * ((middle - center) @ normal), axes, radii)
 
 
 def above_neck_cut(cut: NeckCut, camera: Camera) -> Float[np.ndarray, "h w"]:
@@ -110,5 +115,5 @@ def _above_in_rows(cut: NeckCut, camera: Camera, rows: range) -> Float[np.ndarra
     height = start[2] + depth * dz
     radius = float(np.sqrt(cut.radii[0] * cut.radii[1]))
     pixel = np.maximum(depth, np.float32(1e-6)) / np.float32(camera.K[1, 1])
-    beside = radius * (TRACKING.neck.beside - np.sqrt(miss)) + TRACKING.neck.slope * height
+    beside = radius * (_BESIDE - np.sqrt(miss)) + _SLOPE * height
     return (np.clip(height / pixel + 0.5, 0, 1) * np.clip(beside / pixel + 0.5, 0, 1)).astype(np.float32)

@@ -9,7 +9,8 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.tracking.constants import TRACKING
+
+_MIDDLE = (0.4, 0.7)  # range of the middle of the neck, as shares of the way from its base to its top. Set by eye
 
 _CHUNK = 32
 """Number of timesteps posed at once."""
@@ -37,7 +38,7 @@ def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
         return bottom
     heights = face_model.template[neck, 1]
     base = face_model.template[bottom, 1].mean()
-    low, high = (base + share * (heights.max() - base) for share in TRACKING.neck.middle)
+    low, high = (base + share * (heights.max() - base) for share in _MIDDLE)
     middle = neck[(heights >= low) & (heights <= high)]
     return middle if len(middle) > 0 else bottom
 

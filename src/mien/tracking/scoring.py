@@ -17,10 +17,13 @@ from mien.face.params import FaceParams
 from mien.machine.progress import track_progress
 from mien.media.picture_files import PictureStack
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.constants import TRACKING
 from mien.tracking.neck_cut import NeckCut, NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.settings import ScoringSettings
 from mien.tracking.tracking import Tracking
+
+_SILHOUETTE_MARGIN = 0.015
+"""Margin around the projected head, in its own widths, because tracking is not exact to the pixel."""
+_FAINT = 32  # least opacity (of 255) of a pixel that counts for connection and for the crop
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +124,11 @@ def cut_matte(
         keep: The share of the matte that is kept outside of the head, 0..1.
     """
     columns = np.flatnonzero(head.any(0))
-    margin = round(TRACKING.neck.silhouette_margin * (columns[-1] - columns[0] + 1)) if len(columns) else 0
+    margin = round(_SILHOUETTE_MARGIN * (columns[-1] - columns[0] + 1)) if len(columns) else 0
     if margin:
         head = cv2.dilate(head.astype(np.uint8), _disc(margin)).astype(bool)
     mask = np.round(matte * np.where(head, np.float32(1), keep)).astype(np.uint8)
-    _, labels = cv2.connectedComponents((mask >= TRACKING.neck.faint).astype(np.uint8))
+    _, labels = cv2.connectedComponents((mask >= _FAINT).astype(np.uint8))
     ours = np.unique(labels[head & (labels > 0)])
     faint_or_ours = (labels == 0) | np.isin(labels, ours)
     return np.where(faint_or_ours, mask, 0).astype(np.uint8)
@@ -133,7 +136,7 @@ def cut_matte(
 
 def head_crop(mask: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " 4"]:
     """Left, top, width and height of the box of the mask; the whole picture if the mask is empty."""
-    seen = mask >= TRACKING.neck.faint
+    seen = mask >= _FAINT
     rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
     if len(rows) == 0:
         return np.array([0, 0, mask.shape[1], mask.shape[0]])

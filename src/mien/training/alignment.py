@@ -30,7 +30,6 @@ from mien.machine.threads import one_torch_thread
 from mien.render.rasterize import rasterize_each
 from mien.storage import read_tensors, write_tensors
 from mien.training.alignment_settings import AlignmentSettings
-from mien.training.constants import TRAINING
 from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
 from mien.training.footage.frames import Frame, evenly_spread, training_frames
 from mien.training.footage.sequence import Sequence, Target, Targets
@@ -39,6 +38,16 @@ from mien.training.photometric import photometric_loss
 from mien.training.run import read_face_track
 from mien.training.settings import PRESETS, TrainSettings
 from mien.training.trainer import ProgressBar, train
+
+_ALIGNED_TOGETHER = 4  # number of timesteps that are aligned in one pass
+_ALIGNED_JUDGED = 32  # number of training timesteps that say how large gradients are
+_ALIGNED_MOMENTUM = 0.7  # share of the last steps' direction in the next one. Measured: the log, 11-27
+_ALIGNED_EXPRESSION = 10.0
+"""Rate of expression coefficients, as a share of that of the head's rotation. Measured: the log, 11-27."""
+_ALIGNED_JOINTS = 3.0  # rate of joint angles, as a share of that of the head's rotation. Measured: the log, 11-27
+_ALIGNED_SHIFT = 0.3
+"""Rate of the head's position in metres, as a share of that of its rotation in radians: the ratio with which training
+corrects the tracking."""
 
 _WHITE = np.full(3, 255, np.uint8)
 _EPSILON = 1e-12
@@ -169,7 +178,7 @@ def align_faces(
     targets = [Targets(sequence, settings.resolution, len(sequences), cleaned=True) for sequence in sequences]
     timesteps = [one for index, own in enumerate(sequences) for one in _looked_at(index, own, held_out_cameras)]
     trained = {frame[:2] for frame in known}
-    judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, TRAINING.aligned_judged)
+    judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, _ALIGNED_JUDGED)
     with one_torch_thread(), frozen(avatar):
         descent = FaceDescent(
             _sizes([_Batch.of(part, track, targets, gains) for part in _batches(judged)], avatar, track)
@@ -229,15 +238,15 @@ def _values(track: FaceTrack, index: int) -> dict[str, Tensor]:
 
 def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
     """How far a step moves each field."""
-    rates = (TRAINING.aligned_expression, TRAINING.aligned_joints, 1.0, TRAINING.aligned_shift)
+    rates = (_ALIGNED_EXPRESSION, _ALIGNED_JOINTS, 1.0, _ALIGNED_SHIFT)
     own = [Rate(settings.rate).scaled(share) for share in rates]
     return FaceTuning(True, *own, keep_mean_pose=True, keep_turns=single, within_bounds=True)
 
 
 def _batches(timesteps: list[_Timestep]) -> Iterator[list[_Timestep]]:
     """The timesteps in parts that are drawn together."""
-    for first in range(0, len(timesteps), TRAINING.aligned_together):
-        yield timesteps[first : first + TRAINING.aligned_together]
+    for first in range(0, len(timesteps), _ALIGNED_TOGETHER):
+        yield timesteps[first : first + _ALIGNED_TOGETHER]
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +306,7 @@ class FaceDescent:
     @torch.no_grad()
     def step(self, groups: Items[ParameterGroup]) -> None:
         """Move the parameters, and clear their gradients."""
-        kept = TRAINING.aligned_momentum
+        kept = _ALIGNED_MOMENTUM
         for group in groups:
             for (name, tensor), gradient in zip(group.tensors.items(), _taken(group), strict=True):
                 state = _moments(group, name)

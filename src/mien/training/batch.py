@@ -22,13 +22,13 @@ from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
 from mien.training.ahead import Result, TargetQueue
 from mien.training.checkpoint import TrainingState
-from mien.training.constants import TRAINING
-from mien.training.footage.constants import FOOTAGE
-from mien.training.footage.frames import Frame, FrameOrder, background_at, crop_random
+from mien.training.footage.frames import LEAST_EXTENT, Frame, FrameOrder, background_at, crop_random
 from mien.training.footage.sequence import Target, Targets
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
 from mien.training.parts import BatchFrame
 from mien.training.settings import TrainSettings
+
+_LEAST_HALVED = 384  # least longer side of pictures that are halved at the start of a run, in pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class TrainingData:
     order: FrameOrder
     targets: tuple[Targets, ...]
     """One entry per sequence."""
-    extent: float = field(default_factory=lambda: FOOTAGE.least_extent)
+    extent: float = field(default_factory=lambda: LEAST_EXTENT)
     """Extent of the training cameras, in metres."""
     representative: tuple[Frame, ...] = ()
     """A few frames that show the head from all the sides that were filmed."""
@@ -79,7 +79,7 @@ class TrainingData:
 
 def coarse_steps(targets: Items[Targets], settings: TrainSettings) -> int:
     """Number of steps at the start of a run whose pictures are halved: none if some of the pictures are small."""
-    large = all(max(one.width, one.height) >= TRAINING.least_halved for one in targets)
+    large = all(max(one.width, one.height) >= _LEAST_HALVED for one in targets)
     return round(settings.coarse * settings.steps) if large else 0
 
 

@@ -15,11 +15,13 @@ from mien.avatar.avatar import ParameterGroup
 from mien.avatar.schedules import Rate
 from mien.errors import UserError
 from mien.render.rendering import Rendering
-from mien.training.constants import TRAINING
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
 from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
+
+_CAMERA_COLORS_LAST_RATE = 0.1
+"""Learning rate of the cameras' colours, and of gains, at the last step, as a share of that at the first."""
 
 
 class LearnedColors:
@@ -33,7 +35,7 @@ class LearnedColors:
 
     def __init__(self, name: str, values: Tensor, rate: float):
         self.values = values.detach().clone().requires_grad_()
-        self._name, self._rate = name, Rate(rate, TRAINING.camera_colors_last_rate * rate)
+        self._name, self._rate = name, Rate(rate, _CAMERA_COLORS_LAST_RATE * rate)
         self._moments = {"changes": Moments.zeros(values)}
 
     def parameter_groups(self) -> list[ParameterGroup]:

@@ -21,11 +21,12 @@ from mien.errors import UserError
 from mien.render.rendering import Rendering
 from mien.storage import read_tensors
 from mien.training.camera_colors import LearnedColors, recolored
-from mien.training.constants import TRAINING
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
 from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
+
+_GAIN_INTERVAL = 0.1  # time in seconds between knots of the gains of timesteps. Automatic exposure takes longer
 
 GAINS = "gains.safetensors"
 """File of a run with the gains of all timesteps of all sequences. Runs in steady light have none."""
@@ -164,7 +165,7 @@ def _between(
     """
     knots: list[int] = []
     for timestep in used:
-        if not knots or times[timestep] - times[knots[-1]] >= TRAINING.gain_interval:
+        if not knots or times[timestep] - times[knots[-1]] >= _GAIN_INTERVAL:
             knots.append(timestep)
     if not knots:
         return np.zeros((len(times), 2), np.int64), np.zeros((len(times), 2)), 0

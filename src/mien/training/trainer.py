@@ -45,7 +45,6 @@ from mien.training.batch import (
 )
 from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.constants import TRAINING
 from mien.training.density_control import density_strategy
 from mien.training.face_track import FaceTrack, turns_from_mean
 from mien.training.footage.coverage import measure_coverage, representative_frames
@@ -65,6 +64,12 @@ from mien.training.parts import Preparation, Step, passed
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.outline_fit import fitted_faces
+
+ALIGNED_TUNING = 0.2  # share of the learning rates of faces in a training on aligned faces. Measured: the log, 11-27
+_STEADY_EVERY = 25
+"""Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
+_REPRESENTATIVE_FRAMES = 12
+"""Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
 
 ProgressBar = Callable[[str, int, int], AbstractContextManager[Advance]]
 """(title, total, completed) -> a context manager whose value moves the bar on."""
@@ -126,7 +131,7 @@ def train(
         coarse = coarse_steps(targets, settings)
         halved = tuple(one.halved() for one in targets) if coarse else ()
         faces = [sequence.tracking.face for sequence in sequences]
-        looked = TRAINING.representative_frames
+        looked = _REPRESENTATIVE_FRAMES
         representative = representative_frames(faces, sequences, frames, looked, looked)
         data = TrainingData(order, targets, extent, tuple(representative), halved, coarse)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
@@ -290,7 +295,7 @@ def tuning_for(tuning: FaceTuning, sequences: Items[Sequence]) -> FaceTuning:
     if any(len(sequence.tracking.cameras) > 1 for sequence in sequences):
         tuning = replace(tuning, keep_turns=False)
     if all(sequence.tracking.aligned for sequence in sequences):
-        tuning = tuning.slowed(TRAINING.aligned_tuning)
+        tuning = tuning.slowed(ALIGNED_TUNING)
     return tuning
 
 
@@ -342,7 +347,7 @@ def _update(state: TrainingState, now: Step, posed: Items[Posed], renderings: It
     state.adam.step(groups, now.progress)
     for one in now.batch:
         state.track.confine(one.index)
-    if now.reaches(TRAINING.steady_every):
+    if now.reaches(_STEADY_EVERY):
         state.track.steady_pose()
     random = partial(density_random, now.settings, state.step)
     return state.density.adapt(state.avatar.gaussian_store(), posed[0], now.progress, random)

@@ -30,7 +30,6 @@ from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
 from mien.avatar.baking import as_array
 from mien.avatar.density import GradientDensity
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.headgas.constants import HEADGAS
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.headgas.variants import (
     VARIANTS,
@@ -60,6 +59,11 @@ from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.rotation import multiply_quaternions
 from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
+
+_COLOR_RATE = 2.5e-3
+"""Learning rate of colours against which that of opacities in the same tensor is measured. Of 3D Gaussian Splatting."""
+SHIFT_LENGTH = 0.01  # unit of the network's shifts, in metres. The papers do not say one
+_OPACITY_RATE = 0.05  # learning rate of opacities that Gaussians have themselves. Of 3D Gaussian Splatting
 
 _CHUNK = 512
 
@@ -125,7 +129,7 @@ class HeadGas(Avatar):
         moved = [one.moved for one in changes if one.moved is not None]
         if moved:
             shifts, turns = _stacked(moved).split([3, 4], dim=-1)
-            aux["shifts"] = HEADGAS.shift_length * shifts
+            aux["shifts"] = SHIFT_LENGTH * shifts
             means = means + aux["shifts"]
             identity = turns.new_tensor([1.0, 0.0, 0.0, 0.0])
             quats = multiply_quaternions(identity + turns, quats.expand_as(turns))
@@ -146,7 +150,7 @@ class HeadGas(Avatar):
         if parts.blends:
             rates["neutral_features"] = config.features_rate
         if not parts.recolors:
-            rates |= {"sh": config.features_rate, "opacity_logits": Rate(HEADGAS.opacity_rate)}
+            rates |= {"sh": config.features_rate, "opacity_logits": Rate(_OPACITY_RATE)}
         extent = {"means": config.means_times_extent}
         groups = [
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
@@ -278,7 +282,7 @@ class HeadGas(Avatar):
         colors, moved, opacity = output_widths(self._parts, 3 * self._coefficients)
         shares = self._color_shares(progress).flatten()[:colors]
         # Explicit colours and opacities are in one tensor, but opacities learn at their own rate.
-        faster = 1.0 if self._parts.layers else HEADGAS.opacity_rate / HEADGAS.color_rate
+        faster = 1.0 if self._parts.layers else _OPACITY_RATE / _COLOR_RATE
         return torch.cat([shares, torch.ones(moved), torch.full((opacity,), faster)])
 
     def _color_shares(self, progress: Progress) -> Float[Tensor, "s 3"]:

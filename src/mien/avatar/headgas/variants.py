@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mien.avatar.headgas.constants import HEADGAS
 from mien.avatar.headgas.settings import Variant
 from mien.avatar.ops.feature_network import SLOPE
+
+_START_OPACITY = 0.1  # opacity of all Gaussians at the start. Of 3D Gaussian Splatting
 
 MOVED = 7
 """Numbers that move a Gaussian: a shift (3), and a rotation as a quaternion less the identity (4)."""
@@ -81,7 +82,7 @@ def new_network(parts: Parts, inputs: int, hidden: int, colors: int) -> nn.Seque
 
 def start_logit() -> Float[Tensor, ""]:
     """The logit of the opacity at the start."""
-    return torch.logit(torch.tensor(HEADGAS.start_opacity))
+    return torch.logit(torch.tensor(_START_OPACITY))
 
 
 def split_outputs(

@@ -16,7 +16,6 @@ from torch import Tensor
 from mien.arrays import is_native
 from mien.avatar.baked_pose import Kept
 from mien.avatar.baking import as_array
-from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
@@ -25,6 +24,14 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.runtime.baked import Rig
+
+CANONICAL_JAW = 0.4  # angle by which the jaw is open in the canonical face, in radians. As published (log, 11-23)
+_PRETRAINING_POINTS = 1024  # points of a step of pre-training on the face model's motion
+_PRETRAINING_FRAMES = 4  # frames of such a step
+_PRETRAINING_RATE = 3e-3  # learning rate of its first step. It falls to a tenth
+_PRETRAINING_WEIGHT = 100.0
+"""Weight of the distance between points and their places on the moved mesh, beside the losses that keep the networks
+near the face model."""
 
 POINTS_AT_ONCE = 4096
 """Number of points whose distances to all vertices are in memory at once: 74 MB for a face model of 4,535 vertices."""
@@ -156,19 +163,19 @@ class PointMotion:
 
     def learn(self, face: FaceParams, steps: int, known: FaceWeights) -> Iterator[None]:
         """Teach the network the face model's motion in training frames, before the first picture."""
-        optimizer = torch.optim.Adam(self.network.parameters(), lr=MONO.pretraining_rate)
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=_PRETRAINING_RATE)
         canonical, faces = self.at_rest().vertices, self.face_model.faces
         for step in range(steps):
-            optimizer.param_groups[0]["lr"] = MONO.pretraining_rate * 0.1 ** (step / steps)
-            frames = face[torch.randint(len(face), (MONO.pretraining_frames,))].detach()
-            corners, weights = random_places(canonical, faces, MONO.pretraining_points)
+            optimizer.param_groups[0]["lr"] = _PRETRAINING_RATE * 0.1 ** (step / steps)
+            frames = face[torch.randint(len(face), (_PRETRAINING_FRAMES,))].detach()
+            corners, weights = random_places(canonical, faces, _PRETRAINING_POINTS)
             means = at_places(canonical, corners, weights)
             target = at_places(self.face_model.head_vertices(frames), corners, weights)
             found, _ = self.deformed(means, frames)
             distance = (found - target).norm(dim=-1).mean() / LENGTH_UNIT
             optimizer.zero_grad()
             losses = self.face_losses(means, known)
-            torch.autograd.backward([MONO.pretraining_weight * distance, *losses.values()])
+            torch.autograd.backward([_PRETRAINING_WEIGHT * distance, *losses.values()])
             optimizer.step()
             yield
 
@@ -183,13 +190,13 @@ def canonical_face(
     """
     joints = expression.new_zeros(len(model.free_joint_names), 3)
     if "jaw" in model.free_joint_names:
-        joints[model.free_joint_names.index("jaw"), 0] = MONO.canonical_jaw
+        joints[model.free_joint_names.index("jaw"), 0] = CANONICAL_JAW
     elif "jaw" in model.joint_names:
         opening = model.joint_rotation_basis[:, model.joint_names.index("jaw"), 0].to(expression)
         best = opening.argmax()
         if opening[best] > 0:
             expression = expression.clone()
-            expression[best] += (MONO.canonical_jaw - expression @ opening) / opening[best]
+            expression[best] += (CANONICAL_JAW - expression @ opening) / opening[best]
     return expression, joints
 
 

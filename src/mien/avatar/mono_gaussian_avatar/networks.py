@@ -15,8 +15,11 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
 from mien.avatar.encoding import positional_encoding
-from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.ops.point_network import Activation, Layer, point_network
+
+_SKINNING_SHARPNESS = 20.0
+"""Factor on the logits of the skinning weights: their softmax has a temperature of 1/20. As published."""
+_SPHERE_RADIUS = 0.6  # radius of the sphere whose distance a network gives at the start. As published
 
 _SKIP = 3  # the layer, counted from 0, that reads the encoding again
 
@@ -55,7 +58,7 @@ class AttributeNet(nn.Module):
                 plain[self.skip].weight[:, width - inputs + 3 :] = 0
             if sphere:
                 nn.init.normal_(plain[-1].weight, math.sqrt(math.pi / width), 1e-4)
-                nn.init.constant_(plain[-1].bias, -MONO.sphere_radius)
+                nn.init.constant_(plain[-1].bias, -_SPHERE_RADIUS)
         # Last, so that the norms are those of the weights above.
         self.trunk = nn.ModuleList(weight_norm(layer) for layer in plain)
         self.heads = nn.ModuleList(nn.Linear(width, width) for _ in ATTRIBUTE_WIDTHS)
@@ -135,7 +138,7 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight, bias))
         offset, moved, logits = outputs.split([3, 3 * len(coefficients), self.skinning.out_features], dim=-1)
         moved = moved.unflatten(-1, (-1, 3)).transpose(0, 1)
-        return offset, moved, (MONO.skinning_sharpness * logits).softmax(-1)
+        return offset, moved, (_SKINNING_SHARPNESS * logits).softmax(-1)
 
     def whole(self, points: Float[Tensor, "n 3"]) -> Deformation:
         """Everything about some points, with every direction."""
@@ -144,7 +147,7 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight.flatten(0, 1), bias.flatten()))
         directions, logits = outputs.split([3 * sum(widths), self.skinning.out_features], dim=-1)
         offset, expression, pose = directions.unflatten(-1, (3, -1)).split(widths, dim=-1)
-        return Deformation(offset[..., 0], expression, pose, (MONO.skinning_sharpness * logits).softmax(-1))
+        return Deformation(offset[..., 0], expression, pose, (_SKINNING_SHARPNESS * logits).softmax(-1))
 
     def _directions(self) -> tuple[Float[Tensor, "3 _ w"], Float[Tensor, "3 _"]]:
         return self.directions.weight.unflatten(0, (3, -1)), self.directions.bias.unflatten(0, (3, -1))

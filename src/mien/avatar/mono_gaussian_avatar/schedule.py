@@ -4,11 +4,18 @@
 whatever its number of steps. Needs no torch.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from mien.avatar.mono_gaussian_avatar.constants import MONO
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+
+_FIRST_RADIUS = 0.15 * 0.75 ** math.log2(400 / 100)
+"""Radius at the first epoch, of 400 points, in units of the paper. It follows from the published radius of 100."""
+_RADIUS_FACTOR = 0.75  # factor on the radius each time that it shrinks. As published
+_RADIUS_FACTOR_AT_60 = 0.9  # factor on the radius at epoch 60 in the schedule `code`. As published
+_LATE_LENGTH = 0.004  # distance of children from their parents after epoch 100, in units of the paper. As published
+_FACE_HALVINGS = (20, 30, 50, 70)  # epochs at which the weight of the face model's terms halves. As published
 
 ScheduleName = Literal["paper", "code"]
 
@@ -47,11 +54,11 @@ class Schedule:
     def rendering_radius(self, fraction: float) -> float:
         """Length added to all scales, in metres."""
         epoch = self._epoch(fraction)
-        factor = MONO.radius_factor ** sum(epoch >= start for start in _SHRINKING[self.name])
+        factor = _RADIUS_FACTOR ** sum(epoch >= start for start in _SHRINKING[self.name])
         if self.name == "code":
-            factor *= MONO.radius_factor_at_60 if epoch >= 60 else 1.0
+            factor *= _RADIUS_FACTOR_AT_60 if epoch >= 60 else 1.0
         late = epoch if self.name == "code" else min(epoch, 100)
-        return LENGTH_UNIT * MONO.first_radius * factor * MONO.radius_factor ** max(0, (late - 60) // 5)
+        return LENGTH_UNIT * _FIRST_RADIUS * factor * _RADIUS_FACTOR ** max(0, (late - 60) // 5)
 
     def sampling_length(self, fraction: float) -> float:
         """Radius of the sphere (`paper`) or side of the cube (`code`) of children around their parent, in metres.
@@ -59,7 +66,7 @@ class Schedule:
         The time is that of the last step before a round, and therefore in the epoch that ends.
         """
         if self._epoch(fraction) + 1 >= self.late_epoch:
-            return LENGTH_UNIT * MONO.late_length
+            return LENGTH_UNIT * _LATE_LENGTH
         return self.rendering_radius(fraction)
 
     def points_at(self, fraction: float) -> int:
@@ -69,7 +76,7 @@ class Schedule:
 
     def face_decay(self, fraction: float) -> float:
         """Factor on the weight of the face model's terms."""
-        return 0.5 ** sum(self._epoch(fraction) >= epoch for epoch in MONO.face_halvings)
+        return 0.5 ** sum(self._epoch(fraction) >= epoch for epoch in _FACE_HALVINGS)
 
     def _epoch(self, fraction: float) -> int:
         """Number of whole epochs before a time; after the run, the number of its last one."""

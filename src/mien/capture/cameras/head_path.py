@@ -8,9 +8,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mien.camera import Camera
-from mien.capture.constants import CAPTURE
-from mien.capture.person.crop import Crop, whole_picture
+from mien.capture.person.crop import CROP_LEAST_HEAD_SHARE, CROP_MOST_ASPECT, CROP_OUTLIERS, Crop, whole_picture
 from mien.errors import UserError
+
+_HEAD_RADIUS = 0.24
+"""Radius in metres of the sphere about the middle of the face that a crop of a rig shows: head, hair and neck. Set by
+eye."""
+_HEAD_MOST_MISS = 0.5
+"""Largest distance between a found face and the projected one, in sides of the found box, for the two to agree: heads
+agree within 0.15 (log, 11-22)."""
+_HEAD_LEAST_ANGLE = 0.03  # smallest angle between two rays that give a point, in radians
 
 _FACE_WIDTHS = (0.08, 0.35)
 """Plausible median width of a face in metres (eyebrows to chin, as the detector's boxes go)."""
@@ -66,7 +73,7 @@ def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> H
         cost = np.minimum(_misses(points, centers, sides, cameras), 1).sum(axis=1)
         better = np.isfinite(points[:, 0]) & (cost < best_cost)
         best[better], best_cost[better] = points[better], cost[better]
-    agrees = _misses(best, centers, sides, cameras) < CAPTURE.head_most_miss
+    agrees = _misses(best, centers, sides, cameras) < _HEAD_MOST_MISS
     agrees[agrees.sum(axis=1) < 2] = False
     refined = np.full_like(best, np.nan)
     for timestep in np.flatnonzero(agrees.any(axis=1)):
@@ -99,8 +106,8 @@ def choose_crops(
     spans = [_span(path, camera) for camera in cameras]
     sides = [max(span[2] - span[0], span[3] - span[1]) for span in spans]
     is_head = all(
-        max(camera.width, camera.height) <= CAPTURE.crop_most_aspect * min(camera.width, camera.height)
-        and side >= CAPTURE.crop_least_head_share * min(camera.width, camera.height)
+        max(camera.width, camera.height) <= CROP_MOST_ASPECT * min(camera.width, camera.height)
+        and side >= CROP_LEAST_HEAD_SHARE * min(camera.width, camera.height)
         for camera, side in zip(cameras, sides, strict=True)
     )
     shapes = {(camera.width, camera.height) for camera in cameras}
@@ -161,7 +168,7 @@ def _nearest_point(
         sine2 = 1 - cosine**2
         along_first = ((first @ between) - cosine * (second @ between)) / sine2
         along_second = (cosine * (first @ between) - (second @ between)) / sine2
-        usable = (sine2 > CAPTURE.head_least_angle**2) & (along_first > 0) & (along_second > 0)
+        usable = (sine2 > _HEAD_LEAST_ANGLE**2) & (along_first > 0) & (along_second > 0)
     points = (origins[0] + along_first[:, None] * first + origins[1] + along_second[:, None] * second) / 2
     return np.where(usable[:, None], points, np.nan)
 
@@ -195,12 +202,12 @@ def _span(path: HeadPath, camera: Camera) -> Float[np.ndarray, " 4"]:
     """Left, top, right, bottom in pixels of the head's sphere over the whole path."""
     centers = path.centers[path.known]
     depth = (centers @ camera.viewmat[2, :3].numpy().astype(np.float64)) + float(camera.viewmat[2, 3])
-    radius = CAPTURE.head_radius * np.array([[float(camera.K[0, 0]), float(camera.K[1, 1])]]) / depth[:, None]
+    radius = _HEAD_RADIUS * np.array([[float(camera.K[0, 0]), float(camera.K[1, 1])]]) / depth[:, None]
     middle = project(centers, camera)
     if not np.isfinite(middle).all():
         raise UserError("--calibration: the head is behind a camera; check that matrices go from world to camera")
-    least = np.percentile(middle - radius, CAPTURE.crop_outliers, axis=0)
-    return np.concatenate([least, np.percentile(middle + radius, 100 - CAPTURE.crop_outliers, axis=0)])
+    least = np.percentile(middle - radius, CROP_OUTLIERS, axis=0)
+    return np.concatenate([least, np.percentile(middle + radius, 100 - CROP_OUTLIERS, axis=0)])
 
 
 def _check_unit(

@@ -6,8 +6,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.constants import CAPTURE
 from mien.media.source import shrunk_size
+
+_CROP_MARGIN = 1.5
+"""Room around all positions of the face for hair, neck and shoulders, in face boxes (eyebrows to chin). Set by eye."""
+CROP_OUTLIERS = 1.0
+"""Percent of the frames at either end that may lie outside of the crop, so that a false detection does not decide
+it."""
+CROP_MOST_ASPECT = 1.25  # largest aspect ratio of a picture that counts as a head crop already and is kept whole
+CROP_LEAST_HEAD_SHARE = 0.7  # least part of such a picture's shorter side that the chosen crop takes
 
 
 @dataclass(frozen=True)
@@ -56,12 +63,12 @@ def choose_crop(boxes: Float[np.ndarray, "t 4"], width: int, height: int, size: 
     """
     pixels = boxes[np.isfinite(boxes).all(axis=1)] * np.array([width, height, width, height])
     assert len(pixels) > 0
-    left, top = np.percentile(pixels[:, :2], CAPTURE.crop_outliers, axis=0)
-    right, bottom = np.percentile(pixels[:, 2:], 100 - CAPTURE.crop_outliers, axis=0)
+    left, top = np.percentile(pixels[:, :2], CROP_OUTLIERS, axis=0)
+    right, bottom = np.percentile(pixels[:, 2:], 100 - CROP_OUTLIERS, axis=0)
     face = float(np.median(np.maximum(pixels[:, 2] - pixels[:, 0], pixels[:, 3] - pixels[:, 1])))
-    wanted = max(right - left, bottom - top) + CAPTURE.crop_margin * face
+    wanted = max(right - left, bottom - top) + _CROP_MARGIN * face
     shorter, longer = min(width, height), max(width, height)
-    if longer <= CAPTURE.crop_most_aspect * shorter and wanted >= CAPTURE.crop_least_head_share * shorter:
+    if longer <= CROP_MOST_ASPECT * shorter and wanted >= CROP_LEAST_HEAD_SHARE * shorter:
         return whole_picture(width, height, size)
     side = min(round(wanted), shorter)
     crop_left = int(np.clip(round((left + right - side) / 2), 0, width - side))

@@ -11,9 +11,10 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.constants import CAPTURE
 from mien.capture.person.backend import DetectorChoice, choose_detector
 from mien.capture.person.quiet_mediapipe import load_solution, quiet_mediapipe
+
+_FACE_CONFIDENCE = 0.5  # least score of a found face. MediaPipe's default
 
 LANDMARKS = 478
 """Points of MediaPipe's face mesh with irises: 468 of the mesh and 5 of each iris."""
@@ -63,8 +64,7 @@ def _mediapipe_boxes(stack: ExitStack) -> list[Callable[[np.ndarray], _Boxes]]:
     module = load_solution("face_detection")
     with quiet_mediapipe():
         detectors = [
-            module.FaceDetection(model_selection=model, min_detection_confidence=CAPTURE.face_confidence)
-            for model in (0, 1)
+            module.FaceDetection(model_selection=model, min_detection_confidence=_FACE_CONFIDENCE) for model in (0, 1)
         ]
         blank = np.zeros((64, 64, 3), np.uint8)
         for detector in detectors:
@@ -93,7 +93,7 @@ def _litert_boxes() -> list[Callable[[np.ndarray], _Boxes]]:
 
         return find
 
-    return [of(BoxNetwork("near_faces", CAPTURE.face_confidence)), of(BoxNetwork("far_faces", CAPTURE.face_confidence))]
+    return [of(BoxNetwork("near_faces", _FACE_CONFIDENCE)), of(BoxNetwork("far_faces", _FACE_CONFIDENCE))]
 
 
 class MeshReader:

@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mien.capture.constants import CAPTURE
+_MATTE_APART_DISTANCE = 0.02
+"""Distance from the person, as a fraction of the longer side, from which a region of the matte is not theirs. Set by
+eye on d14 and s18, with the next two."""
+_MATTE_APART_MOST_AREA = 0.25
+"""Area of such a region, in areas of the person's, up to which it goes: shoulders below a covered neck stay."""
+_MATTE_BRIDGE = 0.008
+"""Half of the width of what does not join two regions, in longer sides: ends of hair reach to d14's bottle."""
 
 _HALF = 128
 """Opacity from which a pixel belongs to a region. Softer pixels belong to the nearest region."""
@@ -25,7 +31,7 @@ def without_others(
         face: box of the person's face in pixels: left, top, right, bottom.
         others: boxes of other faces. Rows of NaN are none.
     """
-    radius = round(CAPTURE.matte_bridge * max(matte.shape))
+    radius = round(_MATTE_BRIDGE * max(matte.shape))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     # Without what is thinner than a bridge: ends of hair reach to things behind them.
     solid = cv2.erode((matte >= _HALF).astype(np.uint8), kernel)
@@ -43,8 +49,8 @@ def without_others(
         distances = cv2.distanceTransform((regions != own).astype(np.uint8), cv2.DIST_L2, 3)
         nearest = np.full(count, np.inf)
         np.minimum.at(nearest, regions.ravel(), np.asarray(distances).ravel())
-        is_small = areas < CAPTURE.matte_apart_most_area * areas[own]
-        gone |= is_small & (nearest > CAPTURE.matte_apart_distance * max(matte.shape))
+        is_small = areas < _MATTE_APART_MOST_AREA * areas[own]
+        gone |= is_small & (nearest > _MATTE_APART_DISTANCE * max(matte.shape))
     gone[[0, own]] = False
     taken = gone[regions]
     if touching:

@@ -6,8 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mien.capture.constants import CAPTURE
 from mien.capture.person.survey import Survey
+
+_PERSON_MOST_MOVE = 0.6  # sides of a face by which it moves at most from one frame to the next
+_PERSON_MOST_GROWTH = 1.6  # factor by which a face grows or shrinks at most from one frame to the next
+_PERSON_MOST_GAP = 1.0  # seconds without detection after which a face that comes back starts a new track
+_PERSON_MOST_SIZE_RATIO = 2.5  # factor by which the same person's face is larger or smaller at most when it comes back
+_PERSON_MOST_COLOR_CHANGE = 0.12
+"""Largest difference of the mean colours (0..1) of the same person's face when it comes back."""
+_PERSON_LEAST_FRAMES = 3  # frames below which a track counts as a false detection, in clips of at least as many frames
 
 _MAX_CANDIDATES = 8
 """Number of tracks that are considered: those that fill the picture most."""
@@ -52,7 +59,7 @@ def choose_person(survey: Survey) -> Person:
     """
     tracks = _link(survey)
     boxes, others = np.full((len(survey.boxes), 4), np.nan), survey.boxes.copy()
-    least = min(CAPTURE.person_least_frames, len(survey.boxes))
+    least = min(_PERSON_LEAST_FRAMES, len(survey.boxes))
     lasting = [track for track in tracks if len(track.entries) >= least] or tracks
     for track in tracks:
         if track not in lasting:
@@ -87,15 +94,13 @@ def _link(survey: Survey) -> list[_Track]:
     for frame, (seconds, boxes) in enumerate(zip(survey.timestamps, survey.boxes, strict=True)):
         places = np.flatnonzero(np.isfinite(boxes[:, 0])).tolist()
         open_tracks = [
-            track
-            for track in open_tracks
-            if seconds - survey.timestamps[track.entries[-1][0]] <= CAPTURE.person_most_gap
+            track for track in open_tracks if seconds - survey.timestamps[track.entries[-1][0]] <= _PERSON_MOST_GAP
         ]
         pairs = sorted(
             (frame - track.entries[-1][0], distance, index, place)
             for index, track in enumerate(open_tracks)
             for place in places
-            if (distance := _distance(survey.boxes[track.entries[-1]], boxes[place])) <= CAPTURE.person_most_move
+            if (distance := _distance(survey.boxes[track.entries[-1]], boxes[place])) <= _PERSON_MOST_MOVE
         )
         taken: set[int] = set()
         for *_, index, place in pairs:
@@ -114,7 +119,7 @@ def _link(survey: Survey) -> list[_Track]:
 def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> float:
     """Distance between two faces in units of their side; infinite if their sizes differ too much."""
     size_before, size_now = (max(math.sqrt(max((b[2] - b[0]) * (b[3] - b[1]), 0)), 1e-6) for b in (before, now))
-    if not 1 / CAPTURE.person_most_growth <= size_now / size_before <= CAPTURE.person_most_growth:
+    if not 1 / _PERSON_MOST_GROWTH <= size_now / size_before <= _PERSON_MOST_GROWTH:
         return float("inf")
     centers = (before[:2] + before[2:] - now[:2] - now[2:]) / 2
     return float(np.abs(centers).max()) / max(size_before, size_now)
@@ -142,5 +147,5 @@ def _is_same_person(accepted: list[_Track], track: _Track, areas: np.ndarray, co
     before = tuple(np.array([entry for other in accepted for entry in other.entries]).T)
     ratio = math.sqrt(float(np.median(areas[now])) / float(np.median(areas[before])))
     change = np.abs(np.median(colors[now], axis=0) - np.median(colors[before], axis=0)).mean()
-    most = CAPTURE.person_most_size_ratio
-    return bool(1 / most <= ratio <= most and change <= CAPTURE.person_most_color_change)
+    most = _PERSON_MOST_SIZE_RATIO
+    return bool(1 / most <= ratio <= most and change <= _PERSON_MOST_COLOR_CHANGE)

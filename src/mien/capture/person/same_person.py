@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.constants import CAPTURE
 from mien.capture.parts import Part
 from mien.capture.person.backend import DetectorChoice
 from mien.capture.person.faces import LANDMARKS, MeshReader
@@ -19,6 +18,18 @@ from mien.capture.store import JSON_NAME, read_capture
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.terminal import counted
+
+_IDENTITY_PICTURES = 48  # pictures of a capture, spread evenly, of which shapes of faces are compared
+_IDENTITY_MOST_PAIRS = 8  # pairs of pictures that are compared, those of the most similar poses
+_IDENTITY_LEAST_PAIRS = 3  # pairs below which nothing is said
+_IDENTITY_MOST_TURN = 0.35  # angle in radians between the poses of two pictures up to which they are compared
+_IDENTITY_NOISE = 3e-4
+"""Variance of a coordinate below which the spread within a clip is not trusted, in units of the face's size."""
+_IDENTITY_MOST_DIFFERENCE = 4.6
+"""Difference up to which two captures show one person. Halves of a clip differ by at most 3.3, people by 5.4."""
+_IDENTITY_NEAR_TURN = 0.15  # angle up to which that holds; the estimated shape follows the pose
+_IDENTITY_TURN_ALLOWANCE = 20.0  # ...and this much more difference is allowed for each radian beyond
+_IDENTITY_NEIGHBORS = 4  # most captures of a workspace that a new one is compared with
 
 _MIDDLE = (10, 151, 9, 8, 168, 6, 197, 195, 5, 4, 1, 19, 94)
 """Points of the mesh from the forehead down to the base of the nose."""
@@ -37,7 +48,7 @@ picture."""
 
 def face_shapes(pictures: UInt8[np.ndarray, "t h w 3"], detector: DetectorChoice = "auto") -> Shapes:
     """Return the shapes of the face in pictures, taken evenly of all, and then those of the same pictures mirrored."""
-    count = min(len(pictures), CAPTURE.identity_pictures)
+    count = min(len(pictures), _IDENTITY_PICTURES)
     chosen = pictures[np.linspace(0, len(pictures) - 1, count).round().astype(int)]
     with MeshReader(1, is_video=False, detector=detector) as mesh:
         found = [faces[0] for picture in chosen if len(faces := mesh.read(np.ascontiguousarray(picture)))]
@@ -56,12 +67,12 @@ def shape_difference(one: Shapes, other: Float[np.ndarray, "m k 3"]) -> float | 
         The difference, or None if too few of the pictures show the head in similar poses.
     """
     one = one[: len(one) // 2]  # mirrored pictures of one side are enough
-    if min(len(one), len(other) // 2) < CAPTURE.identity_least_pairs:
+    if min(len(one), len(other) // 2) < _IDENTITY_LEAST_PAIRS:
         return None
     turned, rotations = _turned_alike(np.concatenate([one, other]))
     angles = _angles(rotations[: len(one)], rotations[len(one) :])
-    pairs = _nearest_pairs(angles, CAPTURE.identity_most_turn)
-    if len(pairs) < CAPTURE.identity_least_pairs:
+    pairs = _nearest_pairs(angles, _IDENTITY_MOST_TURN)
+    if len(pairs) < _IDENTITY_LEAST_PAIRS:
         return None
     here, there = np.split(turned, [len(one)])
     change = np.median([here[i] - there[j] for i, j in pairs], axis=0).ravel()
@@ -69,9 +80,9 @@ def shape_difference(one: Shapes, other: Float[np.ndarray, "m k 3"]) -> float | 
     spread = np.concatenate([(shapes - np.median(shapes, axis=0)).reshape(len(shapes), -1) for shapes in unmirrored])
     variances, directions = np.linalg.eigh(spread.T @ spread / len(spread))
     # Points that hardly move in a short clip are not known to such a precision.
-    scale = np.sqrt(np.maximum(variances, 0) + CAPTURE.identity_noise)
-    beyond = max(0.0, max(angles[pair] for pair in pairs) - CAPTURE.identity_near_turn)
-    allowed = CAPTURE.identity_most_difference + CAPTURE.identity_turn_allowance * beyond
+    scale = np.sqrt(np.maximum(variances, 0) + _IDENTITY_NOISE)
+    beyond = max(0.0, max(angles[pair] for pair in pairs) - _IDENTITY_NEAR_TURN)
+    allowed = _IDENTITY_MOST_DIFFERENCE + _IDENTITY_TURN_ALLOWANCE * beyond
     return float(np.linalg.norm(change @ directions / scale)) / allowed
 
 
@@ -129,7 +140,7 @@ def check_neighbors(
         UserError: they show somebody else.
     """
     shapes = None
-    for json_path in sorted(sequences.glob(f"*/capture/{JSON_NAME}"))[: CAPTURE.identity_neighbors]:
+    for json_path in sorted(sequences.glob(f"*/capture/{JSON_NAME}"))[:_IDENTITY_NEIGHBORS]:
         folder = json_path.parent.parent
         try:
             other = read_capture(json_path.parent)
@@ -170,7 +181,7 @@ def _angles(one: Float[np.ndarray, "n 3 3"], other: Float[np.ndarray, "m 3 3"]) 
 def _nearest_pairs(angles: Float[np.ndarray, "n m"], most: float) -> list[tuple[int, int]]:
     """Return up to `identity_most_pairs` pairs of frames, the nearest first, each frame once."""
     left, pairs = angles.copy(), []
-    while len(pairs) < CAPTURE.identity_most_pairs and left.size and left.min() <= most:
+    while len(pairs) < _IDENTITY_MOST_PAIRS and left.size and left.min() <= most:
         i, j = divmod(int(left.argmin()), left.shape[1])
         left[i], left[:, j] = np.inf, np.inf
         pairs.append((i, j))

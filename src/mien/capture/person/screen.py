@@ -9,8 +9,22 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.constants import CAPTURE
 from mien.capture.person.alpha import GROUND
+from mien.capture.person.plate import PLATE_BACKGROUND_LEVEL, PLATE_HALO, PLATE_PERSON_LEVEL
+
+_SCREEN_LEAST_LEVEL = 0.2  # least level of a screen's brightest channel, 0..1
+_SCREEN_MOST_RED = 0.7  # most red of a screen, relative to its brightest channel. Skin has most of red
+_SCREEN_LEAST_SATURATION = 0.45  # least difference of a screen's channels, relative to the brightest
+_SCREEN_MOST_DIFFERENCE = 0.15
+"""Largest difference of a screen's channels, relative to the brightest one, from their median."""
+_SCREEN_LEAST_SHARE = 0.8  # part of the border that has the screen's tint at least
+_SCREEN_LEVELS = (0.08, 0.9)
+"""Shares of what is not screen that become 0 and 1. Skin at the edges has some of the screen's light."""
+_SCREEN_INSIDE_MOST = 0.6
+"""Share of screen up to which a pixel inside the person's mask is opaque: green eyes and stripes make no holes."""
+_SCREEN_SPILL = 1 / 40
+"""Width of the edge that loses the screen's light, as a fraction of the longer side; at twice that nothing does."""
+_SCREEN_WINDOW = 1 / 6  # side of the window in which the screen's light is averaged, as a fraction of the longer side
 
 _BORDER = 0.03
 """Width of the border that is looked at, above and on both sides, as a fraction of the shorter side."""
@@ -30,14 +44,14 @@ def screen_of(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"] | No
     border = np.concatenate([side.reshape(-1, 3) for side in sides]).astype(np.float32) / 255
     color = np.median(border, axis=0)
     brightest = float(color.max())
-    if brightest < CAPTURE.screen_least_level or color[0] > CAPTURE.screen_most_red * brightest:
+    if brightest < _SCREEN_LEAST_LEVEL or color[0] > _SCREEN_MOST_RED * brightest:
         return None
-    if brightest - color.min() < CAPTURE.screen_least_saturation * brightest:
+    if brightest - color.min() < _SCREEN_LEAST_SATURATION * brightest:
         return None
     tints = border / np.maximum(border.max(axis=1, keepdims=True), 1e-3)
-    even = np.abs(tints - color / brightest).max(axis=1) < CAPTURE.screen_most_difference
+    even = np.abs(tints - color / brightest).max(axis=1) < _SCREEN_MOST_DIFFERENCE
     even &= border.max(axis=1) > brightest / 2
-    return color.astype(np.float64) if even.mean() > CAPTURE.screen_least_share else None
+    return color.astype(np.float64) if even.mean() > _SCREEN_LEAST_SHARE else None
 
 
 def screen_matte(
@@ -55,13 +69,13 @@ def screen_matte(
     height, width = image.shape[:2]
     soft = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     share = _share_of_screen(image, screen)
-    low, high = CAPTURE.screen_levels
+    low, high = _SCREEN_LEVELS
     alpha = np.clip((1 - share - low) / (high - low), 0, 1)
-    inside = (soft > CAPTURE.plate_person_level) & (share < CAPTURE.screen_inside_most)
-    bare = cv2.distanceTransform((share < CAPTURE.screen_inside_most).astype(np.uint8), cv2.DIST_L2, 3)
-    alpha[inside & (bare > CAPTURE.screen_spill * max(height, width))] = 1
-    away = (soft < CAPTURE.plate_background_level).astype(np.uint8)
-    alpha[cv2.erode(away, _disc(CAPTURE.plate_halo * max(height, width))) > 0] = 0
+    inside = (soft > PLATE_PERSON_LEVEL) & (share < _SCREEN_INSIDE_MOST)
+    bare = cv2.distanceTransform((share < _SCREEN_INSIDE_MOST).astype(np.uint8), cv2.DIST_L2, 3)
+    alpha[inside & (bare > _SCREEN_SPILL * max(height, width))] = 1
+    away = (soft < PLATE_BACKGROUND_LEVEL).astype(np.uint8)
+    alpha[cv2.erode(away, _disc(PLATE_HALO * max(height, width))) > 0] = 0
     return np.rint(alpha * 255).astype(np.uint8)
 
 
@@ -77,7 +91,7 @@ def without_screen(
     front = np.clip(image / np.float32(255) - (1 - alpha) * behind, 0, alpha)
     tint = _tint(screen)
     inside = cv2.distanceTransform((matte > 127).astype(np.uint8), cv2.DIST_L2, 3)
-    near = np.clip(2 - inside / (CAPTURE.screen_spill * max(matte.shape)), 0, 1)
+    near = np.clip(2 - inside / (_SCREEN_SPILL * max(matte.shape)), 0, 1)
     front -= (near * np.maximum(front @ tint, 0))[..., None] * (tint / (tint @ tint))
     return np.rint(np.clip(255 * front + (1 - alpha) * GROUND, 0, 255)).astype(np.uint8)
 
@@ -99,10 +113,10 @@ def _local_screen(image: np.ndarray, screen: np.ndarray) -> Float[np.ndarray, "h
     small = max(1, width // 4), max(1, height // 4)
     picture = cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
     tints = picture / np.maximum(picture.max(axis=-1, keepdims=True), 1e-3)
-    bare = np.abs(tints - (screen / screen.max()).astype(np.float32)).max(axis=-1) < CAPTURE.screen_most_difference
+    bare = np.abs(tints - (screen / screen.max()).astype(np.float32)).max(axis=-1) < _SCREEN_MOST_DIFFERENCE
     bare &= picture.max(axis=-1) > screen.max() / 2
     bare = cv2.erode(bare.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
-    window = [2 * round(CAPTURE.screen_window * max(small) / 2) + 1] * 2
+    window = [2 * round(_SCREEN_WINDOW * max(small) / 2) + 1] * 2
     total = cv2.blur(picture * bare[..., None], window, borderType=cv2.BORDER_REFLECT)
     weight = cv2.blur(bare, window, borderType=cv2.BORDER_REFLECT)[..., None]
     # A little of the whole screen's colour fills in where none is near.

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
 
-from mien.capture.constants import CAPTURE
 from mien.capture.person.backend import DetectorChoice
 from mien.capture.person.faces import MAX_FACES, FaceFinder
 from mien.errors import UserError
@@ -22,6 +21,11 @@ from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import same_shape
 from mien.media.source import FrameSource, SourceFrame
 from mien.storage import expect_whole, read_arrays, write_arrays
+
+_CUT_THUMBNAIL = (32, 18)
+"""Width and height in pixels of the thumbnails that are compared, whatever the picture's shape."""
+_PERSON_COLOR_CELLS = 3  # cells along each side of the grid on which a face's mean colours are computed
+_SURVEY_SIDE = 512  # longest side in pixels of the pictures in which faces are searched
 
 _CHUNK = 1000
 """Frames after which progress is saved."""
@@ -97,7 +101,7 @@ def survey_source(
         return _read(whole)
     for path in itertools.takewhile(Path.exists, (_chunk_path(work, index) for index in itertools.count())):
         done.append(_read(path))
-    stream = itertools.islice(frames.frames(CAPTURE.survey_side), len(done) * _CHUNK, None)
+    stream = itertools.islice(frames.frames(_SURVEY_SIDE), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
     with ExitStack() as stack:
         find = _search(stack.enter_context(FaceFinder(detector))) if landmarks is None else _look_up(landmarks)
@@ -123,7 +127,7 @@ def _read(path: Path) -> Survey:
         UserError: it is damaged, or no survey.
     """
     arrays = read_arrays(path)
-    t, side, colors = len(arrays.get("numbers", ())), CAPTURE.cut_thumbnail[::-1], 3 * CAPTURE.person_color_cells**2
+    t, side, colors = len(arrays.get("numbers", ())), _CUT_THUMBNAIL[::-1], 3 * _PERSON_COLOR_CELLS**2
     kinds = {
         "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MAX_FACES, 4), np.float64),
         "looks": ((t, MAX_FACES, colors), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
@@ -172,7 +176,7 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, advance: Advance) -> Su
         boxes = np.full((MAX_FACES, 4), np.nan)
         boxes[: len(largest)] = found[largest]
         colors = np.stack([_mean_colors(image, box) for box in boxes])
-        thumbnail = cv2.resize(image, CAPTURE.cut_thumbnail, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        thumbnail = cv2.resize(image, _CUT_THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         measured = frame.combs() if len(rows) % _COMB_STRIDE == 0 else np.nan
         seen = frame.is_deinterlaced, measured, frame.alpha() is not None, frame.size()
         rows.append((frame.number, frame.seconds, boxes, colors, thumbnail, *seen))
@@ -188,7 +192,7 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, advance: Advance) -> Su
 
 def _mean_colors(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
     """Return the mean colours of a face; NaN for no face."""
-    cells = CAPTURE.person_color_cells
+    cells = _PERSON_COLOR_CELLS
     if not np.isfinite(box).all():
         return np.full(3 * cells**2, np.nan)
     height, width = image.shape[:2]
@@ -236,7 +240,7 @@ def _best_turn(frames: FrameSource, survey: Survey, detector: DetectorChoice) ->
     chosen = set(numbers[:: -(-len(numbers) // _MAX_TURNED)].tolist())
     totals = np.zeros(4)
     with FaceFinder(detector) as finder:
-        for index, frame in enumerate(itertools.islice(frames.frames(CAPTURE.survey_side), max(chosen) + 1)):
+        for index, frame in enumerate(itertools.islice(frames.frames(_SURVEY_SIDE), max(chosen) + 1)):
             if index in chosen:
                 picture = frame.picture()
                 totals += [finder.surest(np.ascontiguousarray(np.rot90(picture, -quarter))) for quarter in range(4)]
@@ -255,7 +259,7 @@ def _stream_with_face(frames: FrameSource, detector: DetectorChoice) -> int | No
     """Return the first of the file's other streams that shows a face in some pictures at its beginning."""
     for stream in frames.other_streams:
         other, stride = replace(frames, stream=stream), _BEGINNING // _MAX_TURNED
-        pictures = itertools.islice(other.frames(CAPTURE.survey_side), 0, _BEGINNING, stride)
+        pictures = itertools.islice(other.frames(_SURVEY_SIDE), 0, _BEGINNING, stride)
         with FaceFinder(detector) as finder, contextlib.suppress(UserError):
             if any(len(finder.find(frame.picture())) for frame in pictures):
                 return stream

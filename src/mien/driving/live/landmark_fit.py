@@ -12,17 +12,32 @@ import torch
 from jaxtyping import Float
 
 from mien.capture.person.backend import choose_detector
-from mien.driving.constants import DRIVING
 from mien.driving.rest import kept_share
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.parameters import layout_of
-from mien.tracking.landmarks.detector_response import read_response
+from mien.tracking.fitting.shot import FOCAL
+from mien.tracking.landmarks.detector_response import LARGEST_TURN, read_response
 from mien.tracking.landmarks.groups import EYE_CORNERS, NOSE, landmark_weights
+from mien.tracking.landmarks.head_pose import FIRST_OUTLIER
 from mien.tracking.landmarks.model import reduce_face_model
 from mien.tracking.settings import TrackingSettings
+
+_LIVE_STEP = 0.5
+"""Part of a coefficient over which landmarks are taken as linear; for joints, in radians, a quarter of that."""
+_LIVE_OUTLIER = 6.0
+"""Outlier threshold in standard deviations. Measured: 20 has the same mean correlation to 0.001 (log, 11-23)."""
+_LIVE_STEPS = 2
+"""Gauss-Newton steps from the frame before. Measured: 4 have a mean correlation of 0.915 instead of 0.913 (log,
+11-23)."""
+_LIVE_FIRST_STEPS = 12  # gauss-Newton steps from a face that looks ahead
+_LIVE_EXPRESSION_LIMITS = (0.4, 0.7)
+"""Limits of the coefficients of jaw, brows, smiles and rounded lips of the face at rest. They are wider than those of a
+tracking, because the person's shape is unknown: in clips of seven people, medians of the fit are up to 0.34. For lids
+and other lips they are up to 0.9, so their part is always taken as shape."""
+_LIVE_GAZE_LIMITS = (0.35, 0.5)
+"""The same of the angles of eyes, in radians. In clips of seven people, medians are up to 0.24."""
 
 _OPENCV = np.diag([1.0, -1.0, -1.0])
 _DAMPING = 1e-6
@@ -63,8 +78,8 @@ class LandmarkFit:
         self.names = layout.names[6:]
         count = len(self.names)
         state = torch.zeros(count + 1, layout.size, dtype=torch.float64)
-        steps = torch.full((count,), DRIVING.live_step, dtype=torch.float64)
-        steps[len(layout.expression_index) :] = 0.25 * DRIVING.live_step
+        steps = torch.full((count,), _LIVE_STEP, dtype=torch.float64)
+        steps[len(layout.expression_index) :] = 0.25 * _LIVE_STEP
         state[1:, 6:] = torch.diag(steps)
         points = reduced.head_points(
             layout.face_params(state, person.identity.double().reshape(-1)), reduced.response.mean
@@ -97,12 +112,12 @@ class LandmarkFit:
             width: Width of the picture in pixels.
             height: Height of the picture in pixels.
         """
-        centered, focal = landmarks - (0.5 * width, 0.5 * height), TRACKING.camera.focal * max(width, height)
+        centered, focal = landmarks - (0.5 * width, 0.5 * height), FOCAL * max(width, height)
         if self._last is None:
-            start, outlier = self._facing(centered, focal), TRACKING.landmarks.first_outlier
-            start, steps = self._find_pose(start, centered, focal), DRIVING.live_first_steps
+            start, outlier = self._facing(centered, focal), FIRST_OUTLIER
+            start, steps = self._find_pose(start, centered, focal), _LIVE_FIRST_STEPS
         else:
-            start, outlier, steps = self._last, DRIVING.live_outlier, DRIVING.live_steps
+            start, outlier, steps = self._last, _LIVE_OUTLIER, _LIVE_STEPS
         self._last = self._descend(start, centered, focal, self._weights, outlier, steps)
         return self._last
 
@@ -115,7 +130,7 @@ class LandmarkFit:
         self._bias, self._held = np.zeros_like(self._rest), np.zeros_like(self._held)
         if not as_it_is:
             self._held = self._expression_in(seen, width, height)
-        focal, size = TRACKING.camera.focal * max(width, height), np.array((0.5 * width, 0.5 * height))
+        focal, size = FOCAL * max(width, height), np.array((0.5 * width, 0.5 * height))
         self._bias = np.zeros_like(self._rest)
         for _ in range(2):
             offsets = []
@@ -140,8 +155,8 @@ class LandmarkFit:
         middle = torch.from_numpy(np.median(fits, axis=0))
         moved = torch.zeros_like(middle)
         for limits, starts in (
-            (DRIVING.live_expression_limits, _LIMITED),
-            (DRIVING.live_gaze_limits, ("left_eye", "right_eye")),
+            (_LIVE_EXPRESSION_LIMITS, _LIMITED),
+            (_LIVE_GAZE_LIMITS, ("left_eye", "right_eye")),
         ):
             ours = torch.tensor([name.startswith(starts) for name in self.names])
             moved = torch.where(ours, middle * (1 - kept_share(middle.abs(), limits)), moved)
@@ -149,7 +164,7 @@ class LandmarkFit:
 
     def rest_pose(self, landmarks: Float[np.ndarray, "l 2"], width: int, height: int) -> Fitted:
         """The head pose alone in a frame in which the person is at rest."""
-        centered, focal = landmarks - (0.5 * width, 0.5 * height), TRACKING.camera.focal * max(width, height)
+        centered, focal = landmarks - (0.5 * width, 0.5 * height), FOCAL * max(width, height)
         start = replace(self._facing(centered, focal), coefficients=self._held)
         return self._find_pose(start, centered, focal)
 
@@ -163,7 +178,7 @@ class LandmarkFit:
     ) -> Float[np.ndarray, "l 2"]:
         """Where the landmarks of a face are in a picture: what `__call__` fits."""
         points = self._points(Fitted(rotation, translation, coefficients, 0.0))
-        projected = self._project(points @ rotation.T + translation, TRACKING.camera.focal * max(width, height))
+        projected = self._project(points @ rotation.T + translation, FOCAL * max(width, height))
         return projected + (0.5 * width, 0.5 * height)
 
     def face_of(
@@ -175,7 +190,7 @@ class LandmarkFit:
         return replace(given, **{name: tensor.float() for name, tensor in given.tensors().items()})
 
     def _points(self, fitted: Fitted) -> Float[np.ndarray, "l 3"]:
-        most = TRACKING.landmarks.largest_turn
+        most = LARGEST_TURN
         turn = axis_angle_from_matrix(fitted.rotation[None])[0][:2].clip(-most, most)
         shape = self._rest + self._bias + np.tensordot(turn, self._by_turn, 1)
         return shape + self._basis @ fitted.coefficients
@@ -195,7 +210,7 @@ class LandmarkFit:
 
     def _find_pose(self, start: Fitted, centered: Float[np.ndarray, "l 2"], focal: float) -> Fitted:
         """The head pose from landmarks that expressions hardly move."""
-        outlier, steps = TRACKING.landmarks.first_outlier, DRIVING.live_first_steps
+        outlier, steps = FIRST_OUTLIER, _LIVE_FIRST_STEPS
         return self._descend(start, centered, focal, self._rigid, outlier, steps, pose_only=True)
 
     def _descend(

@@ -8,7 +8,9 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from mien.driving.constants import DRIVING
+_SPEED_CUTOFF = 3.0
+"""Cutoff of the low pass of the speeds, in Hz. Chosen for the exported page with the other two numbers of its filter
+(log, "One Euro filter")."""
 
 
 class OneEuro:
@@ -33,7 +35,7 @@ class OneEuro:
         elif seconds > self._seconds:
             elapsed = seconds - self._seconds
             speed = (value - self._value) / elapsed
-            self._speed += _share(np.full(len(value), DRIVING.speed_cutoff), elapsed) * (speed - self._speed)
+            self._speed += _share(np.full(len(value), _SPEED_CUTOFF), elapsed) * (speed - self._speed)
             cutoff = self._cutoff + self._beta * np.abs(self._speed)
             self._value = self._value + _share(cutoff, elapsed) * (value - self._value)
         self._seconds = seconds

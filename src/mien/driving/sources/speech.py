@@ -14,10 +14,44 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mien.driving.constants import DRIVING
 from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.media.sound import RATE, read_sound
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+
+_SPEECH_WINDOW = 0.04
+"""Length of the pieces of sound that are measured, in seconds. Bands, weights, smoothing, exponent and drops were
+chosen on 5 English sentences of 4 voices of a synthesiser, and judged on others (docs/using.md, "A voice")."""
+SPEECH_BANDS = ((500.0, 900.0), (1400.0, 3000.0))
+"""Bands in Hz in which open vowels are louder than closed ones: one of the first of their formants, one above."""
+SPEECH_BAND_WEIGHTS = (1.0, 0.5)  # how much the share of each band counts, in dB, beside the loudness
+SPEECH_LEAST_SHARE = 10**-2.5  # smallest share of the energy that a band counts with
+_SPEECH_SMOOTHING = 0.02
+"""Standard deviation of the smoothing over time, in seconds. It is even before and after, so there is no lag."""
+_SPEECH_FLOOR = 10  # percentile of the level that is the noise floor
+_SPEECH_LOUD = 95  # percentile of the level that is a loud voice
+_SPEECH_RANGE = (25.0, 45.0)  # bounds of the distance from the noise floor to a loud voice, in dB
+_SPEECH_GATE = 0.15  # share of this distance above the noise floor that still counts as silence
+_SPEECH_SILENCE = -55.0
+"""Loudness of silence in dB, where 0 is the loudest possible. Files that are never louder do not move the mouth."""
+_SPEECH_EXPONENT = 2.0  # exponent from the level in dB to opening
+_SPEECH_SPLIT = (700.0, 2500.0)  # frequencies in Hz below which sound is low, and above which it is high
+_SPEECH_JAW = 0.55  # largest coefficient of the open jaw
+_SPEECH_LOWER_LIP = 0.25  # largest coefficient of the lowered lower lip
+_SPEECH_UPPER_LIP = 0.12  # largest coefficient of the raised upper lip
+_SPEECH_FUNNEL = 0.35  # largest coefficient of rounded lips
+_SPEECH_STRETCH = 0.3  # largest coefficient of wide lips
+_SPEECH_LESS_JAW = 0.6  # share of the jaw's opening that high sounds take away
+_SPEECH_PRESS = 0.3  # largest coefficient of pressed lips, at p, b and m
+_SPEECH_SHUT_WITHIN = 0.14  # time within which sound is as loud before and after a drop at which lips shut, in seconds
+_SPEECH_SHUT_DROP = (14.0, 26.0)
+"""Drops of the level in dB from which on lips begin to shut, and at which they are shut. No real speech was
+compared."""
+_SPEECH_SHUT_HISS = 6.0  # how much energy at high frequencies keeps lips open, as at s: from its inverse on, they are
+_SPEECH_SHUT_BESIDE = 0.3  # how shut lips are in the picture before and after that in which they are shut
+_SPEECH_SWAY = (0.012, 0.02, 0.008)  # sizes of the head's slow waves about x, y and z, in radians
+_SPEECH_BLINK_EVERY = 3.5  # mean time between blinks, in seconds, as in the exported page
+_SPEECH_BLINK_CLOSING = 0.08  # time in which lids close, in seconds, as in the exported page
+_SPEECH_BLINK_OPENING = 0.17  # time in which they open, in seconds, as in the exported page
 
 FPS = 30.0
 """Moments a second of the motion."""
@@ -42,16 +76,16 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
     seconds = np.arange(count) / FPS
     blink = np.array([blink_at(moment) for moment in seconds])
     given = {
-        "jawOpen": DRIVING.speech_jaw * opening * (1 - DRIVING.speech_less_jaw * high),
-        "mouthLowerDownLeft": DRIVING.speech_lower_lip * opening,
-        "mouthLowerDownRight": DRIVING.speech_lower_lip * opening,
-        "mouthUpperUpLeft": DRIVING.speech_upper_lip * opening,
-        "mouthUpperUpRight": DRIVING.speech_upper_lip * opening,
-        "mouthFunnel": DRIVING.speech_funnel * opening * low,
-        "mouthStretchLeft": DRIVING.speech_stretch * opening * high,
-        "mouthStretchRight": DRIVING.speech_stretch * opening * high,
-        "mouthPressLeft": DRIVING.speech_press * shut,
-        "mouthPressRight": DRIVING.speech_press * shut,
+        "jawOpen": _SPEECH_JAW * opening * (1 - _SPEECH_LESS_JAW * high),
+        "mouthLowerDownLeft": _SPEECH_LOWER_LIP * opening,
+        "mouthLowerDownRight": _SPEECH_LOWER_LIP * opening,
+        "mouthUpperUpLeft": _SPEECH_UPPER_LIP * opening,
+        "mouthUpperUpRight": _SPEECH_UPPER_LIP * opening,
+        "mouthFunnel": _SPEECH_FUNNEL * opening * low,
+        "mouthStretchLeft": _SPEECH_STRETCH * opening * high,
+        "mouthStretchRight": _SPEECH_STRETCH * opening * high,
+        "mouthPressLeft": _SPEECH_PRESS * shut,
+        "mouthPressRight": _SPEECH_PRESS * shut,
         "eyeBlinkLeft": blink,
         "eyeBlinkRight": blink,
     }
@@ -64,12 +98,12 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
 
 def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Loudness and level of open vowels in dB around each moment, and how much is low and how much is high, 0..1."""
-    size = round(DRIVING.speech_window * RATE)
+    size = round(_SPEECH_WINDOW * RATE)
     padded = np.pad(samples, (size // 2, size + RATE))
     starts = np.round(np.arange(count) / FPS * RATE).astype(int)
     window = np.hanning(size)
     frequencies = np.fft.rfftfreq(size, 1 / RATE)
-    bands = [(frequencies >= lowest) & (frequencies < highest) for lowest, highest in DRIVING.speech_bands]
+    bands = [(frequencies >= lowest) & (frequencies < highest) for lowest, highest in SPEECH_BANDS]
     power, level, low, high = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     for index, start in enumerate(starts):
         piece = padded[start : start + size].astype(np.float64)
@@ -77,10 +111,10 @@ def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarra
         spectrum = np.abs(np.fft.rfft(piece)) ** 2
         total = max(float(spectrum.sum()), 1e-20)
         power[index] = float((piece**2).sum()) / float((window**2).sum())
-        shares = [max(float(spectrum[band].sum()) / total, DRIVING.speech_least_share) for band in bands]
-        level[index] = 10 * np.dot(DRIVING.speech_band_weights, np.log10(shares))
-        low[index] = spectrum[frequencies < DRIVING.speech_split[0]].sum() / total
-        high[index] = spectrum[frequencies > DRIVING.speech_split[1]].sum() / total
+        shares = [max(float(spectrum[band].sum()) / total, SPEECH_LEAST_SHARE) for band in bands]
+        level[index] = 10 * np.dot(SPEECH_BAND_WEIGHTS, np.log10(shares))
+        low[index] = spectrum[frequencies < _SPEECH_SPLIT[0]].sum() / total
+        high[index] = spectrum[frequencies > _SPEECH_SPLIT[1]].sum() / total
     # Most voices have most of their energy in low sounds, so only the rest of the way is rounding.
     loudness = 10 * np.log10(np.maximum(power, 1e-12))
     return loudness, loudness + level, np.clip(2 * low - 1, 0, 1), np.clip(high, 0, 1)
@@ -88,18 +122,18 @@ def _measured(samples: Float32[np.ndarray, " n"], count: int) -> tuple[np.ndarra
 
 def _opening(loudness: Float[np.ndarray, " t"], level: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
     """How open the mouth is, 0..1. What is no louder than the noise floor does not open it, whatever its bands."""
-    if float(np.percentile(loudness, DRIVING.speech_loud)) < DRIVING.speech_silence:
+    if float(np.percentile(loudness, _SPEECH_LOUD)) < _SPEECH_SILENCE:
         return np.zeros(len(level))
-    return _above_floor(level) ** DRIVING.speech_exponent * (_above_floor(loudness) > 0)
+    return _above_floor(level) ** _SPEECH_EXPONENT * (_above_floor(loudness) > 0)
 
 
 def _above_floor(decibels: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
     """How far each moment is above the noise floor, 0..1, where 1 is a loud voice."""
-    loud = float(np.percentile(decibels, DRIVING.speech_loud))
-    bounds = loud - DRIVING.speech_range[1], loud - DRIVING.speech_range[0]
-    floor = float(np.clip(np.percentile(decibels, DRIVING.speech_floor), *bounds))
+    loud = float(np.percentile(decibels, _SPEECH_LOUD))
+    bounds = loud - _SPEECH_RANGE[1], loud - _SPEECH_RANGE[0]
+    floor = float(np.clip(np.percentile(decibels, _SPEECH_FLOOR), *bounds))
     above = (decibels - floor) / (loud - floor)
-    return np.clip((above - DRIVING.speech_gate) / (1 - DRIVING.speech_gate), 0, 1)
+    return np.clip((above - _SPEECH_GATE) / (1 - _SPEECH_GATE), 0, 1)
 
 
 def _shut(level: Float[np.ndarray, " t"], high: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
@@ -107,26 +141,26 @@ def _shut(level: Float[np.ndarray, " t"], high: Float[np.ndarray, " t"]) -> Floa
 
     So it does at t and k, behind open lips. The mouth shuts there, too, for a tenth of a second.
     """
-    reach = round(DRIVING.speech_shut_within * FPS)
+    reach = round(_SPEECH_SHUT_WITHIN * FPS)
     around = np.pad(level, reach, constant_values=-np.inf)
     windows = np.lib.stride_tricks.sliding_window_view(around, reach + 1)
     drop = np.minimum(windows[: len(level)].max(1), windows[reach:].max(1)) - level
-    least, most = DRIVING.speech_shut_drop
-    found = np.clip((drop - least) / (most - least), 0, 1) * (1 - np.clip(DRIVING.speech_shut_hiss * high, 0, 1))
+    least, most = _SPEECH_SHUT_DROP
+    found = np.clip((drop - least) / (most - least), 0, 1) * (1 - np.clip(_SPEECH_SHUT_HISS * high, 0, 1))
     spread = np.pad(found, 1, mode="edge")
-    return np.maximum(found, DRIVING.speech_shut_beside * np.maximum(spread[:-2], spread[2:]))
+    return np.maximum(found, _SPEECH_SHUT_BESIDE * np.maximum(spread[:-2], spread[2:]))
 
 
 def _smooth(values: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    reach = math.ceil(3 * DRIVING.speech_smoothing * FPS)
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (DRIVING.speech_smoothing * FPS)) ** 2)
+    reach = math.ceil(3 * _SPEECH_SMOOTHING * FPS)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (_SPEECH_SMOOTHING * FPS)) ** 2)
     padded = np.pad(values, reach, mode="edge")
     return np.convolve(padded, weights / weights.sum(), mode="valid")
 
 
 def blink_at(seconds: float) -> float:
     """How closed the lids are at a time, 0..1. There is one blink in each stretch of time, as in the exported page."""
-    every, closing, opening = DRIVING.speech_blink_every, DRIVING.speech_blink_closing, DRIVING.speech_blink_opening
+    every, closing, opening = _SPEECH_BLINK_EVERY, _SPEECH_BLINK_CLOSING, _SPEECH_BLINK_OPENING
     stretch = math.floor(seconds / every)
     since = seconds - every * (stretch + 0.7 * _random(stretch))
     if not 0 <= since <= closing + opening:
@@ -142,7 +176,7 @@ def _random(seed: int) -> float:
 
 def sway_at(seconds: Float[np.ndarray, " t"]) -> Float32[np.ndarray, "t 3"]:
     """Turns of a head that is never quite still, as axis-angle vectors in radians: sums of slow waves from 0."""
-    waves = np.stack([size * _wave(seconds, k) for k, size in enumerate(DRIVING.speech_sway)], axis=1)
+    waves = np.stack([size * _wave(seconds, k) for k, size in enumerate(_SPEECH_SWAY)], axis=1)
     turns = matrix_from_axis_angle(waves)
     return axis_angle_from_matrix(turns[0].T @ turns).astype(np.float32)
 

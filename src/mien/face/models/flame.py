@@ -20,10 +20,12 @@ from jaxtyping import Float, Int
 
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
-from mien.face.constants import FACE
 from mien.face.model import EYE_BACK, JOINTS, FaceModel
 from mien.face.models.inert_pickle import read_inert_pickle
 from mien.face.models.npz import read_npz
+
+FLAME_LARGEST_COEFFICIENT = 3.0  # bound of an expression coefficient. FLAME's coefficients are in standard deviations
+FLAME_IRIS_RADIUS = 0.0061  # radius of the iris in metres. Anatomy: it hardly differs between people
 
 REGIONS = ("skin", "neck", "eyes", "irises")
 """Regions that follow from skinning weights. `mien.tracking.landmarks` finds more, by landmarks."""
@@ -125,7 +127,7 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
         identity_basis=_tensor(flame.identity),
         expression_basis=_tensor(flame.expression),
         expression_names=tuple(f"expression_{index:03d}" for index in range(e)),
-        expression_bounds=FACE.flame_largest_coefficient * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
+        expression_bounds=FLAME_LARGEST_COEFFICIENT * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
         expression_sigmas=torch.ones(e),
         pose_basis=_tensor(correctives.reshape(36, -1, 3)),
         landmarks={},
@@ -202,7 +204,7 @@ def _regions(flame: FlameFile, eyes: list[np.ndarray], centers: Float[np.ndarray
     regions[(flame.weights[:, 0] > 0.5)[flame.faces].all(1)] = REGIONS.index("neck")
     for ball, center in zip(eyes, centers, strict=True):
         rays = flame.template - center
-        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < FACE.flame_iris_radius)
+        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < FLAME_IRIS_RADIUS)
         triangles = ball[flame.faces].all(1)
         regions[triangles] = REGIONS.index("eyes")
         regions[triangles & ahead[flame.faces].all(1)] = REGIONS.index("irises")

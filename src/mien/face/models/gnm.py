@@ -17,8 +17,8 @@ from jaxtyping import Float, Int
 
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
-from mien.face.constants import FACE
 from mien.face.model import EYE_BACK, FaceModel
+from mien.face.models.flame import FLAME_LARGEST_COEFFICIENT
 from mien.face.models.npz import read_npz
 from mien.inside import is_plain_name
 
@@ -144,7 +144,7 @@ def gnm_face_model(gnm: GnmFile, name: str) -> FaceModel:
         identity_basis=_tensor(gnm.identity),
         expression_basis=_tensor(gnm.expression),
         expression_names=gnm.expression_names,
-        expression_bounds=FACE.flame_largest_coefficient * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
+        expression_bounds=FLAME_LARGEST_COEFFICIENT * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
         expression_sigmas=torch.ones(e),
         joint_names=("head", "neck", "left_eye", "right_eye"),
         joint_parents=(-1, 0, 0, 0),

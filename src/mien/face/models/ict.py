@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
-from mien.face.constants import FACE
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
+from mien.face.models.flame import FLAME_IRIS_RADIUS
 from mien.face.models.npz import read_npz
 from mien.face.models.obj_files import read_obj, read_obj_positions
 from mien.inside import listed
@@ -258,7 +258,7 @@ def _regions(
         regions[part[faces].all(1)] = REGIONS.index(name)
     for side, center in zip(("left_eye", "right_eye"), centers, strict=True):
         rays = template - center
-        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < FACE.flame_iris_radius)
+        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < FLAME_IRIS_RADIUS)
         ball = parts[side][faces].all(1)
         regions[ball] = REGIONS.index("eyes")
         regions[ball & ahead[faces].all(1)] = REGIONS.index("irises")

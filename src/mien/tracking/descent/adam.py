@@ -7,7 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.adam import BETA1, BETA2, Moments
-from mien.tracking.constants import TRACKING
+
+_SETTLED_GRADIENT = 2.0
+"""Gradient of a squared cost at one standard deviation; it damps steps with smaller gradients. Plain Adam moves by its
+whole rate however small the gradient is. Measured against none: jitter falls from 0.034 to 0.014 mm (log)."""
 
 _EPSILON = 1e-12
 
@@ -46,6 +49,6 @@ class RowStepper:
     def step(self, gradient: Float[Tensor, " p"], rate: float) -> None:
         """Take one step of at most about `rate` standard deviations and clip to the bounds."""
         move = torch.zeros_like(self.row)
-        apply_adam(self.moments, move, gradient @ self.whitening, rate, TRACKING.descent.settled_gradient)
+        apply_adam(self.moments, move, gradient @ self.whitening, rate, _SETTLED_GRADIENT)
         self.row.add_(self.whitening @ move)
         self.row.copy_(torch.minimum(torch.maximum(self.row, self.bounds[0]), self.bounds[1]))

@@ -12,7 +12,6 @@ from torch import Tensor
 from mien.adam import Moments
 from mien.machine.parallel import map_in_threads
 from mien.machine.progress import Advance
-from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import RowStepper, apply_adam
 from mien.tracking.descent.scene import PaperScene, PaperState
 from mien.tracking.descent.terms import (
@@ -29,6 +28,12 @@ from mien.tracking.descent.terms import (
     without_smooth_difference,
 )
 from mien.tracking.fitting.resume import StageCache
+
+_GLOBAL_RATE = 0.1  # factor of the initial learning rates in the first epoch
+_EPOCH_DECAY = 0.9  # factor of the learning rates from one epoch to the next
+_GOOD_COSINE = 0.5  # least cosine of the viewing angle at which a triangle's texels count fully
+_MOST_BATCHES = 40  # largest number of batches in an epoch
+_TEXTURE_EVERY = 4  # fewest frames whose texture gradients are summed for one step
 
 _PIECE = "descent"
 _RATES = {"lights": "light", "log_focals": "focal"}
@@ -82,22 +87,21 @@ class Descent:
 
     def fit_epoch(self, epoch: int, advance: Advance, cache: StageCache) -> None:
         """Take one step of every frame in random order. Each batch of frames also moves the shared parameters."""
-        known = TRACKING.descent
         if self.done >= self.frames * (2 + epoch):
             return
         pairs = [(sequence, row) for sequence, rows in enumerate(self.state.frames) for row in range(len(rows))]
         order = np.random.default_rng((7, epoch)).permutation(len(pairs))
         drawn = [_Place(*pairs[index]) for index in order]
-        batches = np.array_split(np.arange(len(drawn)), min(known.most_batches, len(drawn)))
-        scale = known.global_rate * known.epoch_decay**epoch
+        batches = np.array_split(np.arange(len(drawn)), min(_MOST_BATCHES, len(drawn)))
+        scale = _GLOBAL_RATE * _EPOCH_DECAY**epoch
         texture_gradient, seen = torch.zeros_like(self.state.texture), 0
         for batch in batches:
             gradients = self._step_frames([drawn[index] for index in batch], scale)
             texture_gradient, seen = texture_gradient + gradients.pop("texture"), seen + len(batch)
             self.step_shared(gradients, scale, 1 / len(batches), len(batch))
-            if seen >= known.texture_every:
+            if seen >= _TEXTURE_EVERY:
                 roughness = roughness_gradient(self.scene, self.state.texture)
-                mean = texture_gradient / seen + roughness / known.texture_every
+                mean = texture_gradient / seen + roughness / _TEXTURE_EVERY
                 self._step("texture", self.state.texture, mean, scale * self.scene.settings.rates.texture)
                 texture_gradient, seen = torch.zeros_like(texture_gradient), 0
             advance(len(batch), status=f"epoch {epoch + 1}")
@@ -208,7 +212,7 @@ class Descent:
 
     def trusted(self) -> Float[Tensor, " f"]:
         """Weight of the texels of each triangle, 0..1, by how frontally the triangle was seen."""
-        return self.scene.used * (self.state.visibility / TRACKING.descent.good_cosine).clamp_max(1.0)
+        return self.scene.used * (self.state.visibility / _GOOD_COSINE).clamp_max(1.0)
 
 
 def pack(

@@ -12,7 +12,6 @@ from torch import Tensor
 from mien.adam import Moments
 from mien.face.params import most_frontal_camera
 from mien.machine.progress import Advance
-from mien.tracking.constants import TRACKING
 from mien.tracking.descent.adam import apply_adam
 from mien.tracking.descent.epochs import Descent
 from mien.tracking.descent.terms import (
@@ -28,12 +27,25 @@ from mien.tracking.descent.terms import (
 )
 from mien.tracking.fitting.resume import StageCache
 
+_LAST_RATE = 0.1  # factor of the learning rates at the last of a frame's steps
+_TEXTURE_GAIN = 0.15
+"""Cosine by which a frame must see a triangle more frontally than earlier frames for its texels to be learned again."""
+_TEXTURE_LEAST_COSINE = 0.1  # least cosine of the viewing angle at which a frame's texels are learned at all
+_TEXTURE_FRAMES = 40  # number of frames of each sequence from which texture and light are fitted before the epochs
+_TEXTURE_ROUNDS = 6  # number of steps at each of these frames
+_LOST_LANDMARKS = 3.0  # standard deviations by which landmarks must be farther off than in their own fit to be lost
+_LIGHT_EVERY = 10  # number of a frame's steps between estimates of the unexplained light in its pictures
+_FIRST_CONVERGED = 0.01  # share by which a turn of the very first frame's steps must lower its cost for another turn
+_FIRST_MOST_TURNS = 8  # largest number of turns. One alone leaves vertices 1.51 mm off instead of 1.48 on drawn frames
+_FURTHER_START_DIVISOR = 5
+"""The first frames of further sequences get the first frame's number of steps divided by this."""
+
 
 def fit_appearance(descent: Descent) -> None:
     """Fit texture and light again, all else fixed, to frames spread over the sequences, in random order."""
     chosen = _some_frames(descent)
     moments: dict[str, Moments] = {}
-    order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), TRACKING.descent.texture_rounds))
+    order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), _TEXTURE_ROUNDS))
     for number, index in enumerate(order):
         _step_appearance(descent, descent.targets(*chosen[index]), moments, _fading(number, len(order)))
 
@@ -49,7 +61,7 @@ def measure_visibility(descent: Descent) -> None:
 def _some_frames(descent: Descent) -> list[tuple[int, int]]:
     chosen = []
     for sequence, rows in enumerate(descent.state.frames):
-        count = min(len(rows), TRACKING.descent.texture_frames)
+        count = min(len(rows), _TEXTURE_FRAMES)
         several = torch.linspace(0, len(rows) - 1, count).round().long().unique()
         chosen += [(sequence, row) for row in several.tolist()]
     return chosen
@@ -115,23 +127,23 @@ def _is_lost(descent: Descent, target: Target) -> bool:
     start = descent.start[target.sequence][target.row]
     now, then = (float(landmark_terms(scene, target, at)) for at in (moving, replace(moving, row=start)))
     weight = float(scene.sequences[target.sequence].terms[target.row].weights.sum())
-    return now - then > TRACKING.descent.lost_landmarks**2 * weight
+    return now - then > _LOST_LANDMARKS**2 * weight
 
 
 def fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -> None:
     """Fit the first frame of a sequence. The very first one has turns until its cost no longer falls."""
-    known, settings = TRACKING.descent, descent.scene.settings
+    settings = descent.scene.settings
     if not first_of_all:
-        turn_of_first(descent, targets, settings.first_steps // known.further_start_divisor, appearance_first=True)
+        turn_of_first(descent, targets, settings.first_steps // _FURTHER_START_DIVISOR, appearance_first=True)
         return
     _, face = pose_vertices(descent.scene, descent.moving(targets[0], ())[0])
     cameras = [descent.scene.camera(one.sequence, one.camera, descent.state.log_focals) for one in targets]
     frontal = targets[most_frontal_camera(cameras, face)]
     guess_texture(descent.scene, frontal, descent.moving(frontal, ())[0], descent.state.texture)
     before = math.inf
-    for turn in range(known.first_most_turns):
+    for turn in range(_FIRST_MOST_TURNS):
         cost = turn_of_first(descent, targets, settings.first_steps, appearance_first=turn == 0)
-        if cost > (1 - known.first_converged) * before:
+        if cost > (1 - _FIRST_CONVERGED) * before:
             break
         before = cost
 
@@ -167,7 +179,7 @@ def fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
     weights, even, around = descent.trusted(), list(targets), expected_around(descent, sequence, row)
     for step in range(steps):
         moving, leaves = descent.moving(targets[0], ("row",))
-        if step % TRACKING.descent.light_every == 0:
+        if step % _LIGHT_EVERY == 0:
             even = [without_smooth_difference(descent.scene, target, moving, weights) for target in targets]
         loss = descent.frame_cost(even, moving, weights, around, smoothness)
         (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
@@ -185,11 +197,10 @@ def expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, 
 
 def _learn_texture(descent: Descent, target: Target) -> None:
     """Learn the texels of triangles that this frame shows more frontally than the frames before it."""
-    known = TRACKING.descent
     scene, state = descent.scene, descent.state
     with torch.no_grad():
         visibility = visibility_of(scene, target, descent.moving(target, ())[0])
-        better = (visibility > state.visibility + known.texture_gain) & (visibility > known.texture_least_cosine)
+        better = (visibility > state.visibility + _TEXTURE_GAIN) & (visibility > _TEXTURE_LEAST_COSINE)
     if target.row > 0 and better.any():
         moments, steps = Moments.zeros(state.texture), scene.settings.texture_steps
         for step in range(steps):
@@ -198,10 +209,10 @@ def _learn_texture(descent: Descent, target: Target) -> None:
             loss = color_term(scene, target, moving, vertices, scene.used * better)
             (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
             apply_adam(moments, state.texture, gradient, 3 * scene.settings.rates.texture * _fading(step, steps))
-    seen = visibility > known.texture_least_cosine
+    seen = visibility > _TEXTURE_LEAST_COSINE
     state.visibility = torch.where(better | (seen & (state.visibility == 0)), visibility, state.visibility)
 
 
 def _fading(step: int, steps: int) -> float:
     """Factor of the learning rate at a step."""
-    return 1 - (1 - TRACKING.descent.last_rate) * step / max(steps - 1, 1)
+    return 1 - (1 - _LAST_RATE) * step / max(steps - 1, 1)

@@ -17,11 +17,13 @@ from mien.camera import Camera
 from mien.face.params import FaceParams
 from mien.render.mesh import MeshFragments, rasterize_mesh, vertex_normals
 from mien.render.mesh_gradients import image_points, mesh_loss
-from mien.tracking.constants import TRACKING
 from mien.tracking.descent.scene import PaperScene, PaperState, SequenceScene
 from mien.tracking.fitting.solver import Smoothness
 from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
+
+_BLUR_AT = 4.0  # for a wide blur, pictures are scaled down until its standard deviation is about this many pixels
+_LIGHT_DIFFERENCE = 0.1  # colour difference (0..1) above which a pixel hardly counts as light
 
 _GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 """Pairs of upper and lower landmarks. Their distances show how far eyes and mouth are open."""
@@ -100,7 +102,7 @@ def without_smooth_difference(
     lit = torch.cat([weights, weights.new_zeros(1)])[fragments.face_index.long()][..., None]
     difference = target.image - picture
     # Outliers, such as hair that hides skin, say nothing about the light around them.
-    usual = TRACKING.descent.light_difference**2
+    usual = _LIGHT_DIFFERENCE**2
     lit = lit * (usual / (usual + difference.square().sum(-1, keepdim=True)))
     depth = float(camera.project(vertices.mean(0, keepdim=True))[1])
     sigma = max(scene.settings.light_extent * float(camera.K[0, 0]) / depth, 1.0)
@@ -112,7 +114,7 @@ def without_smooth_difference(
 def _blur(image: Float[np.ndarray, "h w c"], sigma: float) -> Float[np.ndarray, "h w c"]:
     """Blur a picture; a wide blur runs on a smaller copy. The result is the same within 0.01, many times faster."""
     height, width = image.shape[:2]
-    factor = max(int(sigma / TRACKING.descent.blur_at), 1)
+    factor = max(int(sigma / _BLUR_AT), 1)
     small = cv2.resize(image, (max(width // factor, 1), max(height // factor, 1)), interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), sigma / factor)
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)

@@ -10,8 +10,19 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids.eyes import Eye
+from mien.tracking.pixels.texture import LEAST_COSINE
+
+_WIDEST_EYE = 40  # largest width of an eyeball, in pixels. If it is wider, the picture is scaled down
+_NARROWEST_EYE = 20  # smallest width of an eyeball, in pixels. Narrower eyeballs show too little and are skipped
+_SUPERSAMPLING = 2
+"""Multiple of the picture's size at which the mesh is drawn, so that edges of lids can lie between pixels."""
+_EYE_MARGIN = 2  # margin around the eyeball, in pixels
+_RING = 0.3  # width of the ring of skin around the eye, in widths of the opening
+_RING_BLUR = 0.18  # standard deviation of the blur of the ring's colour, in widths of the opening
+_LEAST_RING = 12  # fewest pixels of the ring of skin. With fewer the eye is skipped
+_LEAST_OPENING = 12  # fewest pixels of the opening of the eye. With fewer the eye is skipped
+_DARKEST = 0.03  # value added to colours (0..1) before the logarithm, so that noise in dark pixels does not matter
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +59,6 @@ def eye_crop(
         tracked: Tracked position of the lids, on the same scale.
         positions: Possible positions of the lids, the most open first.
     """
-    known = TRACKING.eyelids
     found = _part(picture, camera, corners[0, eye.faces[: eye.ball].flatten().unique()])
     if found is None:
         return None
@@ -57,13 +67,13 @@ def eye_crop(
     def at(position: float) -> Float[Tensor, "n 3"]:
         return torch.lerp(corners[0], corners[1], position).contiguous()
 
-    sharper = view.resized(view.width * known.supersampling, view.height * known.supersampling)
+    sharper = view.resized(view.width * _SUPERSAMPLING, view.height * _SUPERSAMPLING)
     uncovered = np.stack([_uncovered(eye, at(position), sharper) for position in [*positions, tracked]])
     skin, hidden = _around(eye, at(tracked), view)
     opening = uncovered.max(0) > 1 / 64
     difference, spread = _without_skin(_logarithms(image), opening, skin & inside_picture)
     kept = opening & ~hidden & inside_picture
-    if difference is None or kept.sum() < known.least_opening:
+    if difference is None or kept.sum() < _LEAST_OPENING:
         return None
     open_now = uncovered[-1]
     kernel = np.ones((3, 3), np.uint8)
@@ -82,10 +92,10 @@ def _part(
     points, depth = camera.project(ball)
     if not (depth > 0).all():
         return None
-    left, top = (points.amin(0).floor().long() - TRACKING.eyelids.eye_margin).tolist()
-    right, bottom = (points.amax(0).ceil().long() + TRACKING.eyelids.eye_margin).tolist()
+    left, top = (points.amin(0).floor().long() - _EYE_MARGIN).tolist()
+    right, bottom = (points.amax(0).ceil().long() + _EYE_MARGIN).tolist()
     width, height = right - left, bottom - top
-    least, most = TRACKING.eyelids.narrowest_eye, TRACKING.eyelids.widest_eye
+    least, most = _NARROWEST_EYE, _WIDEST_EYE
     if width < least or left >= camera.width or top >= camera.height or right <= 0 or bottom <= 0:
         return None
     part = picture[max(top, 0) : bottom, max(left, 0) : right]
@@ -105,7 +115,7 @@ def _part(
 def _uncovered(eye: Eye, vertices: Float[Tensor, "n 3"], sharper: Camera) -> Float[np.ndarray, "h w"]:
     seen = rasterize_mesh(vertices, eye.moving, sharper, cull_backfaces=True).face_index.numpy()
     ball = ((seen >= 0) & (seen < eye.ball)).astype(np.float32)
-    size = sharper.width // TRACKING.eyelids.supersampling, sharper.height // TRACKING.eyelids.supersampling
+    size = sharper.width // _SUPERSAMPLING, sharper.height // _SUPERSAMPLING
     return cv2.resize(ball, size, interpolation=cv2.INTER_AREA)
 
 
@@ -118,12 +128,12 @@ def _around(
     normals = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     towards = view.position - triangles.mean(1)
     cosine = (normals * towards).sum(1) / (normals.norm(dim=1) * towards.norm(dim=1)).clamp_min(1e-20)
-    skin = (seen >= 0) & (eye.skin & (cosine > TRACKING.pixels.least_cosine))[seen.clamp_min(0)]
+    skin = (seen >= 0) & (eye.skin & (cosine > LEAST_COSINE))[seen.clamp_min(0)]
     return skin.numpy(), (seen >= eye.lids).numpy()
 
 
 def _logarithms(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    return np.log(image + np.float32(TRACKING.eyelids.darkest))
+    return np.log(image + np.float32(_DARKEST))
 
 
 def _without_skin(
@@ -133,22 +143,21 @@ def _without_skin(
 
     The colours are None if too little skin is seen.
     """
-    known = TRACKING.eyelids
     columns = np.flatnonzero(opening.any(axis=0))
     width = max(int(np.ptp(columns)) if len(columns) else 0, 6)
-    reach = 2 * max(int(known.ring * width), 3) + 1
+    reach = 2 * max(int(_RING * width), 3) + 1
     near, touching = (
         cv2.dilate(opening.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for size in (reach, 3)
     )  # fmt: skip
     ring = near & ~touching & skin
-    if ring.sum() < known.least_ring:
+    if ring.sum() < _LEAST_RING:
         return None, 0.0
     middle = np.median(colors[ring], axis=0)
     away = np.abs(colors - middle).sum(-1)
     # Pixels far from the median colour, such as the frame of glasses, are not skin.
     weight = (ring / (1 + (away / (2 * (np.median(away[ring]) + 0.05))) ** 4)).astype(np.float32)
-    summed = cv2.GaussianBlur(colors * weight[..., None], (0, 0), known.ring_blur * width)
-    total = cv2.GaussianBlur(weight, (0, 0), known.ring_blur * width)[..., None]
+    summed = cv2.GaussianBlur(colors * weight[..., None], (0, 0), _RING_BLUR * width)
+    total = cv2.GaussianBlur(weight, (0, 0), _RING_BLUR * width)[..., None]
     difference = colors - (summed + 1e-4 * middle) / (total + 1e-4)
     spread = float(np.sqrt(((difference**2).sum(-1) * weight).sum() / weight.sum()))
     return difference.astype(np.float32), spread

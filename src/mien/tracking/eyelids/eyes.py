@@ -9,10 +9,15 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import HIDING_REGIONS
 from mien.tracking.fitting.parameters import ParameterLayout
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_LID_PAIRS, RIGHT_EYELIDS, RIGHT_LID_PAIRS
+
+_LIDS_REACH = 1.3  # distance from an eyeball's centre that contains its lids, in radii. Set by eye on the face models
+_AROUND_REACH = 3.5  # distance from an eyeball's centre that contains everything that may hide it, in radii. Set by eye
+_CLOSING_STEPS = 64  # number of equal steps of a coefficient
+_MOST_CLOSING = 1.25  # a coefficient closes an eye if the lids meet within this multiple of its upper bound
+_OTHERS_SHARE = 0.2  # a coefficient is not an eye's own if it moves the other eye's lids by more than this share
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +86,7 @@ def _coefficient(
 ) -> tuple[int, float] | None:
     """The free coefficient that closes an eye with the least motion elsewhere, and its upper bound; or None."""
     bounds = model.expression_bounds[layout.expression_index]
-    known = TRACKING.eyelids
-    able = (closing * known.most_closing * bounds[:, 1] >= 1) & (of_other.abs() < known.others_share * closing)
+    able = (closing * _MOST_CLOSING * bounds[:, 1] >= 1) & (of_other.abs() < _OTHERS_SHARE * closing)
     if not able.any():
         return None
     moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")
@@ -105,8 +109,8 @@ def _eye(
     center = own.mean(0)
     radius = (own - center).norm(dim=1).max()
     distance = (model.template - center).norm(dim=1)
-    lids = (distance < TRACKING.eyelids.lids_reach * radius)[model.faces].any(1) & ~ball
-    around = (distance < TRACKING.eyelids.around_reach * radius)[model.faces].any(1) & ~ball & ~lids
+    lids = (distance < _LIDS_REACH * radius)[model.faces].any(1) & ~ball
+    around = (distance < _AROUND_REACH * radius)[model.faces].any(1) & ~ball & ~lids
     forward = torch.nn.functional.normalize(middle - center, dim=0)
     parts = [part.nonzero()[:, 0] for part in (ball, lids, around)]
     triangles = torch.cat(parts)
@@ -140,7 +144,7 @@ def _where_lids_touch(
         seen = rasterize_mesh(rest + amount * motion, eye.moving, camera).face_index
         return int(((seen >= 0) & (seen < eye.ball)).sum())
 
-    steps = TRACKING.eyelids.closing_steps
+    steps = _CLOSING_STEPS
     amounts = [eye.closed * step / steps for step in range(steps + 1)]
     areas = [left(amount) for amount in amounts]
     return amounts[areas.index(min(areas))]

@@ -17,13 +17,31 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.machine.parallel import map_in_threads
-from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids.colors import EyeColors, learn_colors
 from mien.tracking.eyelids.crops import EyeCrop, eye_crop
 from mien.tracking.eyelids.eyes import Eye, eyes_of
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.shot import Shot
 from mien.tracking.landmarks.model import LandmarkModel
+
+_POSITION_RANGE = (-0.4, 1.2)
+"""First and last of the positions of the lids that are tried: 0 is at rest, 1 is closed, below 0 is wider open than at
+rest."""
+_POSITIONS = 13  # number of these positions
+_EDGE_BAND = 4  # width of the lashes and the edge of the upper lid, in positions
+_FINE_STEP = 0.01  # step of the fine positions to which costs are interpolated
+_COST_BLUR = 0.08  # standard deviation of the kernel that smooths the costs, in positions' units
+_COST_DIVISOR = 8.0  # divisor of the costs, because errors of neighbouring pixels are correlated
+_DISAGREEMENT = 0.07
+"""Largest upper quartile, over the frames, of the cost of the fit's lids above the best one, as a share of the range of
+costs. If it is larger, the colours are misleading and count less. Measured: d3, where they mislead, has 0.12 to 0.14,
+and all other clips up to 0.05 (log)."""
+_FIT_SIGMA = 0.12  # standard deviation of the lids of a good fit. Chosen with the shape of the cost (log) alone
+_OFFSET_SIGMA = 0.4
+"""Wider standard deviation of the fit's lids, for the estimate of the usual offset between colours and fit."""
+_LEARNING_PICTURES = 100  # largest number of pictures that colours are learned from
+_LEAST_PICTURES = 10  # fewest pictures that must show an eye for its lids to be placed
+_LEAST_FACING = 0.35  # smallest cosine between an eye's direction and the direction to the camera
 
 
 def place_lids(
@@ -78,7 +96,7 @@ class _Sequence:
         positions: list[float],
     ) -> EyeCrop | None:
         middle = corners[0].mean(0)
-        capture, best, facing = self.shot.capture, None, TRACKING.eyelids.least_facing
+        capture, best, facing = self.shot.capture, None, _LEAST_FACING
         for index in self.shot.views.seen_by(row):
             K, viewmat = self.own.cameras.K[index].float(), self.own.cameras.viewmat[index].float()
             camera = Camera(K, viewmat, capture.width, capture.height)
@@ -105,7 +123,7 @@ def _place(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
     for number, eye in enumerate(sequence.eyes):
         of_eye = [row[number] for row in costs]
         seen = np.array([cost is not None for cost in of_eye])
-        if seen.sum() >= TRACKING.eyelids.least_pictures:
+        if seen.sum() >= _LEAST_PICTURES:
             known = np.stack([cost for cost in of_eye if cost is not None])
             before = state[torch.from_numpy(seen), eye.column].numpy() / eye.closed
             state[torch.from_numpy(seen), eye.column] = (
@@ -115,18 +133,18 @@ def _place(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
 
 
 def _positions() -> Float[np.ndarray, " k"]:
-    return np.linspace(*TRACKING.eyelids.position_range, TRACKING.eyelids.positions)
+    return np.linspace(*_POSITION_RANGE, _POSITIONS)
 
 
 def _costs(crop: EyeCrop | None, colors: EyeColors | None) -> Float[np.ndarray, " k"] | None:
-    return None if crop is None or colors is None else colors.costs(crop, TRACKING.eyelids.edge_band)
+    return None if crop is None or colors is None else colors.costs(crop, _EDGE_BAND)
 
 
 def _learn(sequence: _Sequence) -> list[EyeColors | None]:
     """The colours of each eye, or None for an eye that is seen too little."""
     timesteps = len(sequence.own.state)
-    rows = torch.linspace(0, timesteps - 1, min(TRACKING.eyelids.learning_pictures, timesteps))
-    ends = [TRACKING.eyelids.position_range[0]]
+    rows = torch.linspace(0, timesteps - 1, min(_LEARNING_PICTURES, timesteps))
+    ends = [_POSITION_RANGE[0]]
     crops = map_in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
     return [
         learn_colors([crop for row in crops if (crop := row[number]) is not None])
@@ -143,22 +161,21 @@ def weigh_positions(
     at the usual position and vanishes where the lids meet. If the colours contradict the fit in many frames, they count
     for little in all frames.
     """
-    known = TRACKING.eyelids
     positions = _positions()
-    fine = np.arange(positions[0], positions[-1] + known.fine_step / 2, known.fine_step)
-    near = np.exp(-0.5 * ((fine[:, None] - positions) / known.cost_blur) ** 2)
+    fine = np.arange(positions[0], positions[-1] + _FINE_STEP / 2, _FINE_STEP)
+    near = np.exp(-0.5 * ((fine[:, None] - positions) / _COST_BLUR) ** 2)
     costs = costs @ (near / near.sum(1, keepdims=True)).T
-    at = np.round((tracked - fine[0]) / known.fine_step).astype(int).clip(0, len(fine) - 1)
+    at = np.round((tracked - fine[0]) / _FINE_STEP).astype(int).clip(0, len(fine) - 1)
     above = (costs[np.arange(len(costs)), at] - costs.min(1)) / np.ptp(costs, axis=1).clip(1e-9)
-    costs = costs * (weight / known.cost_divisor / max(1.0, float(np.quantile(above, 0.75)) / known.disagreement) ** 4)
+    costs = costs * (weight / _COST_DIVISOR / max(1.0, float(np.quantile(above, 0.75)) / _DISAGREEMENT) ** 4)
 
     usual = np.median(tracked)
     often = tracked < usual + 0.1
-    middle = fine[(costs + 0.5 * ((fine - tracked[:, None]) / known.offset_sigma) ** 2).argmin(1)]
+    middle = fine[(costs + 0.5 * ((fine - tracked[:, None]) / _OFFSET_SIGMA) ** 2).argmin(1)]
     shift = np.median((middle - tracked)[often])
     share = ((1 - fine) / max(1 - np.median(tracked[often]), 0.3)).clip(0, 1.2)
     # If the most open position is the best one, the pixels do not show an eye but hair, a brow or a hand.
     costs[costs[:, 0] <= costs.min(1)] = 0
     corrected = fine - shift * share
-    far = np.log1p(((corrected - tracked[:, None]) / known.fit_sigma) ** 2)
+    far = np.log1p(((corrected - tracked[:, None]) / _FIT_SIGMA) ** 2)
     return corrected[(costs + far).argmin(1)]

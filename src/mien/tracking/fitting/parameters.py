@@ -8,8 +8,37 @@ from torch import Tensor
 
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.solver import Bounds
+
+_JOINT_SIGMAS = (
+    ("eye", (0.4, 0.4, 0.0)),
+    ("neck", (0.0, 0.0, 0.0)),
+    ("jaw", (0.25, 0.05, 0.03)),
+)
+"""Prior standard deviations of joint angles in radians, by a word in the joint's name; 0 fixes an angle. Eyes do not
+roll, a face says nothing about its neck, and a jaw opens (about x), shifts a little (about y) and hardly twists.
+Anatomy."""
+_OTHER_JOINT_SIGMAS = (0.2, 0.2, 0.2)  # the same for all other joints, which no face model has so far
+_JAW_BOUNDS = (-0.03, 0.6)  # bounds of the jaw's opening angle in radians
+_JAW_OPEN = 0.35  # opening angle of a wide open mouth, in radians. Anatomy
+_EYES_ALIKE_SIGMAS = (0.1, 0.03)
+"""Standard deviations of the difference of the two eyes' angles (up-down, left-right), in radians. The eyes look at the
+same thing."""
+_EXPRESSION_SIGMAS = (
+    ("brow", 0.25),
+    ("cheek", 0.3),
+    ("nose", 0.3),
+    ("jaw", 0.5),
+    ("mouth", 0.4),
+    ("eyeLook", 0.3),
+    ("eyeBlink", 2.0),
+    ("eyeWide", 1.0),
+    ("eye", 0.5),
+)
+"""Prior standard deviations of expression coefficients, by the beginning of their name. That of brows is small, because
+otherwise they follow the head's pitch. Not varied one by one. Measured: a third of all of them has the same errors, and
+d3's frown shrinks to a third (log, "Fit to pixels")."""
+_OTHER_EXPRESSION_SIGMA = 0.4  # the same for all other names
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +115,7 @@ def layout_of(face_model: FaceModel) -> ParameterLayout:
     lower[expression], upper[expression] = bounds[expression_index].unbind(-1)
     for column, name in enumerate(names[6:], start=6):
         if name == "jaw_x":
-            lower[column], upper[column] = TRACKING.priors.jaw_bounds
+            lower[column], upper[column] = _JAW_BOUNDS
     prior_sigmas = _expression_sigmas(face_model)[expression_index].tolist() + sigmas[joint_index].tolist()
     precision = torch.zeros(len(names), len(names), dtype=torch.float64)
     precision.diagonal()[6:] = torch.tensor(prior_sigmas, dtype=torch.float64) ** -2
@@ -108,8 +137,8 @@ def _joints_behind_landmarks(face_model: FaceModel) -> list[int]:
 
 
 def _joint_sigmas(name: str) -> tuple[float, float, float]:
-    matches = [sigmas for word, sigmas in TRACKING.priors.joint_sigmas if word in name.lower()]
-    return matches[0] if matches else TRACKING.priors.other_joint_sigmas
+    matches = [sigmas for word, sigmas in _JOINT_SIGMAS if word in name.lower()]
+    return matches[0] if matches else _OTHER_JOINT_SIGMAS
 
 
 def _expression_sigmas(face_model: FaceModel) -> Float[Tensor, " e"]:
@@ -119,21 +148,21 @@ def _expression_sigmas(face_model: FaceModel) -> Float[Tensor, " e"]:
 
 
 def _expression_sigma(name: str) -> float:
-    matches = [sigma for word, sigma in TRACKING.priors.expression_sigmas if name.startswith(word)]
-    return matches[0] if matches else TRACKING.priors.other_expression_sigma
+    matches = [sigma for word, sigma in _EXPRESSION_SIGMAS if name.startswith(word)]
+    return matches[0] if matches else _OTHER_EXPRESSION_SIGMA
 
 
 def _units(face_model: FaceModel, expression_index: Int[Tensor, " n"], names: list[str]) -> Float[Tensor, " q"]:
     units = torch.ones(len(names) - 6, dtype=torch.float64)
     if face_model.expression_sigmas is not None:
-        relative = _expression_sigmas(face_model)[expression_index] / TRACKING.priors.other_expression_sigma
+        relative = _expression_sigmas(face_model)[expression_index] / _OTHER_EXPRESSION_SIGMA
         units[: len(expression_index)] = relative
-    units[len(expression_index) :] = TRACKING.priors.jaw_open
+    units[len(expression_index) :] = _JAW_OPEN
     return units
 
 
 def _tie_eyes(precision: Float[Tensor, "p p"], names: list[str]) -> None:
-    for axis, sigma in zip("xy", TRACKING.priors.eyes_alike_sigmas, strict=True):
+    for axis, sigma in zip("xy", _EYES_ALIKE_SIGMAS, strict=True):
         pair = [index for index, name in enumerate(names) if "eye" in name.lower() and name.endswith(f"_{axis}")]
         if len(pair) == 2:
             stiffness = torch.tensor([[1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64) / sigma**2

@@ -16,7 +16,10 @@ from torch import Tensor
 
 from mien.capture.person.backend import Detector
 from mien.face.model import FaceModel
-from mien.tracking.constants import TRACKING
+
+LARGEST_TURN = 0.6
+"""Largest turn of the head from which the detector's response was measured, in radians. Farther turns count as this
+one. It belongs to the drawn people of the measurement (log, "The landmark detector")."""
 
 _COMMAND = "python -m mien.lab.synthetic.detector_calibration"
 _ARRAYS = ("mean", "by_turn", "by_expression", "by_person")
@@ -43,7 +46,7 @@ class DetectorResponse:
 
     def of_turns(self, head_rotation: Float[Tensor, "b 3"]) -> Float[Tensor, "b l 3"]:
         """The part of the offsets that depends on how far the head turns away from the camera."""
-        turns = head_rotation[:, :2].clamp(-TRACKING.landmarks.largest_turn, TRACKING.landmarks.largest_turn)
+        turns = head_rotation[:, :2].clamp(-LARGEST_TURN, LARGEST_TURN)
         return (turns @ self.by_turn.flatten(1)).reshape(len(turns), *self.mean.shape)
 
     def of_person(self, person: Float[Tensor, " k"]) -> Float[Tensor, "l 3"]:

@@ -22,8 +22,16 @@ from mien.face.params import FaceParams
 from mien.machine.progress import track_progress
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform
-from mien.tracking.constants import TRACKING
 from mien.tracking.landmarks.groups import IBUG68, LEFT_IRIS, RIGHT_IRIS
+
+_SCALP_FRONT = 0.06  # landmarks may lie on the scalp only farther ahead of the head frame's origin than this, in metres
+_LEAST_SEEN = 0.25
+"""Landmarks may lie on a triangle only if it is seen in at least this share of the pictures. Measured against 0:
+landmarks of lids lie up to 0.9 instead of 3.0 mm inside the eyeball (log, "Face model")."""
+_SUBDIVISIONS = 12  # number of steps along a triangle's side between the points that are tried
+_COARSE_VIEWS = 16  # number of views of the coarse search over all triangles
+_COARSE_SUBDIVISIONS = 3  # number of steps along a triangle's side in the coarse search
+_BEST_TRIANGLES = 16  # number of triangles that the coarse search passes on
 
 _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "ears")
 _EYE_REGIONS = ("eyes", "irises")
@@ -193,25 +201,24 @@ def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> C
 def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
     mask = model.region_mask(*regions)
     assert mask.any(), f"{model.name} has none of the regions {', '.join(regions)}"
-    mask &= ~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > TRACKING.embedding.scalp_front)
+    mask &= ~model.region_mask("scalp") | (model.template[model.faces].mean(1)[:, 2] > _SCALP_FRONT)
     # Hidden triangles, such as the inner side of a lid, may project nearer in every picture and still be wrong.
-    return mask & (seen >= TRACKING.embedding.least_seen)
+    return mask & (seen >= _LEAST_SEEN)
 
 
 def best_point(
     views: DetectedViews, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
-    known = TRACKING.embedding
     # First try few points of all triangles in some of the views, then all points of the best triangles in all views.
     some = DetectedViews(
-        *(part[:: max(1, len(part) // known.coarse_views)] for part in (views.vertices, views.depth, views.detected))
+        *(part[:: max(1, len(part) // _COARSE_VIEWS)] for part in (views.vertices, views.depth, views.detected))
     )
     everywhere = allowed.nonzero()[:, 0]
-    rough = _errors(some, faces[everywhere], _triangle_grid(known.coarse_subdivisions), landmark)
+    rough = _errors(some, faces[everywhere], _triangle_grid(_COARSE_SUBDIVISIONS), landmark)
     scores = rough.clamp_max(4 * clamp).sum(0).amin(1)
-    triangles = everywhere[scores.topk(min(known.best_triangles, len(scores)), largest=False).indices]
-    weights = _triangle_grid(known.subdivisions)
+    triangles = everywhere[scores.topk(min(_BEST_TRIANGLES, len(scores)), largest=False).indices]
+    weights = _triangle_grid(_SUBDIVISIONS)
     error = _errors(views, faces[triangles], weights, landmark)
     best = int(error.clamp_max(clamp).sum(0).argmin())
     triangle, point = divmod(best, len(weights))

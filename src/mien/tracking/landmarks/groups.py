@@ -5,8 +5,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.capture.person.faces import LANDMARKS
-from mien.tracking.constants import TRACKING
 from mien.tracking.settings import LandmarkSet
+
+_OVAL_WEIGHT = 0.15  # weight of landmarks on the face's outline, where that of a landmark of the cheeks is 1
+_NOSE_WEIGHT = 3.0  # the same of the nose
+_LIPS_WEIGHT = 3.0  # the same of the lips
+_EYELIDS_WEIGHT = 5.0  # the same of the eyelids
+_IRISES_WEIGHT = 4.0  # the same of the irises
 
 OVAL = (
     10, 21, 54, 58, 67, 93, 103, 109, 127, 132, 136, 148, 149, 150, 152, 162, 172, 176, 234, 251, 284, 288, 297, 323,
@@ -44,13 +49,13 @@ _CONTOUR = 17
 
 def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:
     """Weight of each landmark in a fit. It is 0 for landmarks outside the set, and the mean is 1."""
-    weights, known = torch.ones(LANDMARKS, dtype=torch.float64), TRACKING.landmarks
+    weights = torch.ones(LANDMARKS, dtype=torch.float64)
     for group, weight in (
-        (OVAL, known.oval_weight),
-        (NOSE, known.nose_weight),
-        (LIPS, known.lips_weight),
-        (LEFT_EYELIDS + RIGHT_EYELIDS, known.eyelids_weight),
-        (LEFT_IRIS + RIGHT_IRIS, known.irises_weight),
+        (OVAL, _OVAL_WEIGHT),
+        (NOSE, _NOSE_WEIGHT),
+        (LIPS, _LIPS_WEIGHT),
+        (LEFT_EYELIDS + RIGHT_EYELIDS, _EYELIDS_WEIGHT),
+        (LEFT_IRIS + RIGHT_IRIS, _IRISES_WEIGHT),
     ):
         weights[list(group)] = weight
     if landmarks == "ibug51":

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.rotation import axis_angle_from_matrix
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import Subject
 from mien.tracking.fitting.parameters import pose_only
 from mien.tracking.fitting.solver import minimize_frames
@@ -16,6 +15,9 @@ from mien.tracking.landmarks.groups import rigid_weights
 from mien.tracking.landmarks.model import LandmarkModel
 from mien.tracking.landmarks.term import LandmarkTerm, landmark_term
 from mien.tracking.settings import TrackingSettings
+
+FIRST_OUTLIER = 40.0  # outlier threshold of the first head pose, in standard deviations
+_POSE_ITERATIONS = 15  # number of iterations of the first head pose
 
 
 def fit_head_pose(
@@ -51,7 +53,7 @@ def _wide(
     settings: TrackingSettings,
 ) -> LandmarkTerm:
     term = landmark_term(model, views, weights, state, cameras, settings)
-    return replace(term, outlier=TRACKING.landmarks.first_outlier)
+    return replace(term, outlier=FIRST_OUTLIER)
 
 
 def _minimize(
@@ -60,7 +62,7 @@ def _minimize(
     layout = term.model.layout
     return minimize_frames(
         lambda state: term.equations(state, subject, cameras), lambda state: term.cost(state, subject, cameras),
-        start, layout.bounds, TRACKING.landmarks.pose_iterations,
+        start, layout.bounds, _POSE_ITERATIONS,
     )  # fmt: skip
 
 

@@ -9,8 +9,14 @@ from jaxtyping import Bool, Float
 
 from mien.face.chart import edge_connected, find_outside
 from mien.face.model import FaceModel
-from mien.tracking.constants import TRACKING
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
+
+_LIP_DEPTH = 0.008  # largest distance of lips from their landmarks, in metres
+_LID_WIDTH = 0.006  # largest distance of lids from their landmarks, in metres
+_MOUTH_REACH = 0.075  # largest distance of the mouth's inside from the middle of the lips, in metres
+_SOCKET_REACH = 0.025  # largest distance of a socket from its eyeball, in metres
+_HAIRLINE = 0.010  # height of the hairline above the forehead's highest landmark, in metres
+_NECK = 0.030  # distance of the neck below the chin, measured to a plane slanted like the jaw, in metres
 
 _LIPS_OUTER = (61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185)
 _BROWS = ((70, 63, 105, 66, 107, 55, 65, 52, 53, 46), (300, 293, 334, 296, 336, 285, 295, 282, 283, 276))
@@ -26,12 +32,12 @@ def with_regions_by_landmarks(model: FaceModel) -> FaceModel:
     found["nose"] = _within(middle, marks[list(NOSE)], hull=True) & (middle[:, 2] > marks[list(_TEMPLES), 2].mean())
     found["brows"] = outside & (_within(middle, marks[list(_BROWS[0])]) | _within(middle, marks[list(_BROWS[1])]))
     found["eyelids"], found["eye_sockets"] = _around_eyes(model, middle, marks, outside)
-    near = _distance(middle, marks[list(LIPS)]) < TRACKING.embedding.lip_depth
+    near = _distance(middle, marks[list(LIPS)]) < _LIP_DEPTH
     found["lips"] = _within(middle, marks[list(_LIPS_OUTER)]) & near
     hidden = ~outside & ~found["lips"] & ~found["eyelids"] & ~found["eye_sockets"]
     inside = edge_connected(model.faces.numpy(), ~outside)
     behind_lips = _within(middle, marks[list(_LIPS_OUTER)]) & (middle[:, 2] > marks[list(_TRAGI), 2].mean())
-    near = np.linalg.norm(middle - marks[list(LIPS)].mean(0), axis=1) < TRACKING.embedding.mouth_reach
+    near = np.linalg.norm(middle - marks[list(LIPS)].mean(0), axis=1) < _MOUTH_REACH
     found["mouth"] = hidden & near & np.isin(inside, inside[behind_lips & hidden])
     return _named(model, found)
 
@@ -41,10 +47,10 @@ def _around_the_face(
 ) -> dict[str, Bool[np.ndarray, " f"]]:
     x, y, z = middle.T
     tragus, corner, temple = (marks[list(pair)].mean(0) for pair in (_TRAGI, _JAW_CORNERS, _TEMPLES))
-    scalp = (y > marks[_FOREHEAD, 1] + TRACKING.embedding.hairline) | ((y > corner[1]) & (z < tragus[2] - 0.02))
+    scalp = (y > marks[_FOREHEAD, 1] + _HAIRLINE) | ((y > corner[1]) & (z < tragus[2] - 0.02))
     scalp |= (y > temple[1]) & (z < temple[2] + 0.8 * (y - temple[1]))
     slant = np.array([0.0, 1.0, 0.5])
-    neck = model.region_mask("neck").numpy() | (middle @ slant < marks[_CHIN] @ slant - TRACKING.embedding.neck)
+    neck = model.region_mask("neck").numpy() | (middle @ slant < marks[_CHIN] @ slant - _NECK)
     neck |= (y < corner[1]) & (z < corner[2] - 0.02)
     level = (y > corner[1]) & (y < marks[list(_BROWS[0]), 1].min())
     ears = level & (np.abs(x) > 0.97 * np.abs(marks[list(_TRAGI), 0]).mean()) & (z < tragus[2] + 0.006)
@@ -55,15 +61,14 @@ def _around_eyes(
     model: FaceModel, middle: Float[np.ndarray, "f 3"], marks: Float[np.ndarray, "l 3"], outside: Bool[np.ndarray, " f"]
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     """The triangles of the lids and of the sockets."""
-    known = TRACKING.embedding
     balls = model.region_mask("eyes", "irises").numpy()
     eyelids, sockets = np.zeros(len(middle), bool), np.zeros(len(middle), bool)
     for lids in (LEFT_EYELIDS, RIGHT_EYELIDS):
         rim = marks[list(lids)]
         ball = middle[balls & (np.sign(middle[:, 0]) == np.sign(rim[0, 0]))].mean(0)
         far = _distance(middle, rim)
-        behind = ~outside & (np.linalg.norm(middle - ball, axis=1) < known.socket_reach) & (far > 0.5 * known.lid_width)
-        eyelids |= (outside & _within(middle, rim, hull=True)) | (~behind & (far < known.lid_width))
+        behind = ~outside & (np.linalg.norm(middle - ball, axis=1) < _SOCKET_REACH) & (far > 0.5 * _LID_WIDTH)
+        eyelids |= (outside & _within(middle, rim, hull=True)) | (~behind & (far < _LID_WIDTH))
         sockets |= behind
     return eyelids, sockets
 

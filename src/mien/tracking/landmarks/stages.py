@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.machine.progress import progress_bar
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import (
     Course,
     Fit,
@@ -30,6 +29,10 @@ from mien.tracking.landmarks.model import LandmarkModel
 from mien.tracking.landmarks.shared_fit import fit_bias, fit_shared
 from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, unknown_subject
 from mien.tracking.settings import TrackingSettings
+
+_FRAME_ITERATIONS = 12  # number of iterations of the fit of single frames
+_SEQUENCE_ROUNDS = 2  # rounds of the fit over time, with new turn habits in each
+_SEQUENCE_ITERATIONS = 10  # largest number of iterations of the fit over time, in all rounds together
 
 FRAMES_AT_ONCE = 512
 """Number of timesteps fitted in one batch, which takes about 100 MB of memory."""
@@ -118,7 +121,7 @@ def _fit_motion(
     course.show("sequence", lambda: alone)
     smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
                   for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
-    advance = partial(_advance, course, "sequence", TRACKING.landmarks.sequence_iterations)
+    advance = partial(_advance, course, "sequence", _SEQUENCE_ITERATIONS)
     return fit_sequences(terms, alone, smoothness, advance, cache, fixed_subject)
 
 
@@ -165,7 +168,7 @@ def fit_frames(
         state = minimize_frames(
             lambda state: part.equations(state, subject, own.cameras),
             lambda state: part.cost(state, subject, own.cameras),
-            own.state[rows], term.model.layout.bounds, TRACKING.landmarks.frame_iterations,
+            own.state[rows], term.model.layout.bounds, _FRAME_ITERATIONS,
         )  # fmt: skip
         return {"state": state}
 
@@ -196,7 +199,7 @@ def fit_sequences(
         chains = tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts)
         return replace(fit, sequences=chains).tensors()
 
-    for number in range(TRACKING.landmarks.sequence_rounds):
+    for number in range(_SEQUENCE_ROUNDS):
         fit = fit_of(cache.get_or_compute(f"sequence-{number}", partial(round_from, fit)))
     return fit
 
@@ -208,8 +211,8 @@ def _fit_chain(
     smoothness: Smoothness,
     advance: Callable[[int], None],
 ) -> SequenceFit:
-    bounds, known = term.model.layout.bounds, TRACKING.landmarks
-    iterations = known.sequence_iterations // known.sequence_rounds
+    bounds = term.model.layout.bounds
+    iterations = _SEQUENCE_ITERATIONS // _SEQUENCE_ROUNDS
 
     def cost(state: Float[Tensor, "v p"]) -> float:
         return float(term.cost(state, subject, own.cameras).sum() + smoothness.cost(state))

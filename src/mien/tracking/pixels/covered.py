@@ -18,13 +18,44 @@ from mien.face.model import FaceModel
 from mien.machine.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import matrix_from_axis_angle
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import HIDING_REGIONS
 from mien.tracking.fitting.views import batch_of
 from mien.tracking.landmarks.groups import BROWS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 from mien.tracking.pixels.comparison import window_of
 from mien.tracking.pixels.pictures import Picture, Pictures
 from mien.tracking.tracking import PARTS, Tracking
+
+_MOUTH_REACH = 0.014
+"""Distance from the landmarks of the lips up to which triangles belong to the mouth, in metres. Set by eye."""
+_NOSE_REACH = 0.008  # the same of the nose. Set by eye
+_EYES_REACH = 0.010  # the same of lids and brows. Set by eye
+_PICTURE_SIZE = 256  # shorter side of the pictures that are compared, in pixels
+_LIGHT_EXTENT = 0.012  # standard deviation of the blur that counts as light and is left out, in metres on the face
+_LEAST_COSINE = 0.3  # least cosine between the surface's normal and the direction to the camera of a point that counts
+_LEAST_SEEN = 0.4  # least share of a part's points that a picture must show
+_LEAST_LIKENESS = 0.35
+"""Correlation with the usual look of a part below which something covers it. Measured: a drawn hand reaches 0.29 at
+most. Seven real clips without hands have 0.43 or more, except for one frame of a grimace with 0.22, which `lasting`
+leaves out."""
+_LASTING = 0.05  # half of the least time that something covers a part, in seconds. A grimace is shorter than a hand
+_LEAST_LASTING = 3
+"""Fewest pictures in a row that something covers. At 25 frames a second it is what `lasting` says; with fewer, one
+grimace or one turn of the head was taken for a hand."""
+_SIMILAR_TURN = 15.0  # angle in degrees between the turns of a head up to which its pictures are compared
+_LEAST_SIMILAR = 5  # fewest usual pictures of a similar turn without which a picture is not judged
+_ALIKE = 0.5  # correlation with the usual look above which a frame has a part in it
+_FLAT = 0.05
+"""Share of the usual contrast below which a picture is flat, such as a phone's back: it correlates with nothing."""
+_USUAL_SHARE = 0.3  # share of the pictures that the usual look comes from. Fewer could be those of a hand that rests
+_USUAL_ROUNDS = 5
+"""Rounds in which the usual look is made of all pictures that are like it. Without them, 20 frames of wojtek were
+found."""
+_MANY = 0.25  # share of odd pictures from which on they may be the face itself
+_CLEARLY = 0.1
+"""Difference of correlations by which what moves in front of the face is less alike from picture to picture."""
+_LEAST_PICTURES = 8  # fewest pictures of a part that can tell what is usual
+_LOOK_EVERY = 0.2  # seconds between the frames that are looked at first
+_LEAST_LOOKS = 60  # least number of these frames
 
 _PLACES = {"mouth": LIPS, "nose": NOSE, "eyes": LEFT_EYELIDS + RIGHT_EYELIDS + BROWS}
 """Landmarks of each part."""
@@ -38,14 +69,13 @@ def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -
     what moves in front of it does not look alike from frame to frame. A picture that hardly correlates with it is
     covered. The result depends on no texture and on no landmark of a covered part.
     """
-    known = TRACKING.covered
     seen = torch.from_numpy(np.asarray(capture.valid)) & tracking.valid[:, None]
     found = torch.zeros(*seen.shape, len(PARTS), dtype=torch.bool)
     places = _points_of(face_model)
-    pictures = Pictures(capture, max(round(min(capture.width, capture.height) / known.picture_size), 1))
+    pictures = Pictures(capture, max(round(min(capture.width, capture.height) / _PICTURE_SIZE), 1))
     for camera in range(seen.shape[1]):
         timesteps = seen[:, camera].nonzero()[:, 0]
-        stride = max(min(round(known.look_every * capture.fps), len(timesteps) // known.least_looks), 1)
+        stride = max(min(round(_LOOK_EVERY * capture.fps), len(timesteps) // _LEAST_LOOKS), 1)
         first = timesteps[::stride]
         looks = _looks(pictures, tracking, face_model, places, camera, first)
         usual = [usual_look(*part) for part in looks]
@@ -57,7 +87,7 @@ def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -
             odd = [_unlike(look, *part) for look, part in zip(usual, looks, strict=True)]
         turns = matrix_from_axis_angle(tracking.face.head_rotation[first]).reshape(-1, 9).numpy()
         odd = [_compared(part, weights, turns) for part, (_, weights) in zip(odd, looks, strict=True)]
-        least = max(2 * int(known.lasting * capture.fps) + 1, known.least_lasting)
+        least = max(2 * int(_LASTING * capture.fps) + 1, _LEAST_LASTING)
         found[first, camera] = torch.from_numpy(_lasting(np.stack(odd, axis=1), least))
     return found
 
@@ -71,21 +101,20 @@ def usual_look(
         values: Colours of the points of a part without the light; 0 where a picture does not show a point.
         weights: 1 where a picture shows a point.
     """
-    known = TRACKING.covered
-    enough = weights.mean(1) >= known.least_seen
-    if enough.sum() < known.least_pictures:
+    enough = weights.mean(1) >= _LEAST_SEEN
+    if enough.sum() < _LEAST_PICTURES:
         return None
     values, weights = values[enough], weights[enough]
     flat, wide = values.reshape(len(values), -1), weights.repeat(3, axis=1)
     power = (flat**2) @ wide.T
-    power += known.flat * np.quantile(power.diagonal(), 0.9) + 1e-9
+    power += _FLAT * np.quantile(power.diagonal(), 0.9) + 1e-9
     alike = flat @ flat.T / np.sqrt(power * power.T)
-    count = max(round(known.usual_share * len(flat)), 3)
+    count = max(round(_USUAL_SHARE * len(flat)), 3)
     center = np.sort(alike, axis=1)[:, -count].argmax()
     members = alike[center] >= np.sort(alike[center])[-count]
     look = _mean(values[members], weights[members])
-    for _ in range(known.usual_rounds):
-        members = _likeness(look, values, weights) >= known.alike
+    for _ in range(_USUAL_ROUNDS):
+        members = _likeness(look, values, weights) >= _ALIKE
         if members.sum() < count:
             return None
         look = _mean(values[members], weights[members])
@@ -104,13 +133,13 @@ def the_face(
     Then a hand rests, or the light changed, and nothing says which of the two looks is the face.
     """
     odd = _unlike(look, values, weights)
-    if look is None or odd.mean() < TRACKING.covered.many:
+    if look is None or odd.mean() < _MANY:
         return look
     other = usual_look(values[odd], weights[odd])
     if other is None:
         return look
     own = np.median(_likeness(look, values[~odd], weights[~odd]))
-    return None if np.median(_likeness(other, values[odd], weights[odd])) > own - TRACKING.covered.clearly else look
+    return None if np.median(_likeness(other, values[odd], weights[odd])) > own - _CLEARLY else look
 
 
 def _likeness(
@@ -118,7 +147,7 @@ def _likeness(
 ) -> Float[np.ndarray, " n"]:
     """The correlation of each picture with the usual look, over the points that it shows."""
     flat, expected = values.reshape(len(values), -1), weights @ (look**2).sum(1) + 1e-9
-    return flat @ look.reshape(-1) / np.sqrt(((flat**2).sum(1) + TRACKING.covered.flat * expected) * expected)
+    return flat @ look.reshape(-1) / np.sqrt(((flat**2).sum(1) + _FLAT * expected) * expected)
 
 
 def _unlike(
@@ -126,8 +155,7 @@ def _unlike(
 ) -> Bool[np.ndarray, " n"]:
     if look is None:
         return np.zeros(len(values), bool)
-    known = TRACKING.covered
-    return (_likeness(look, values, weights) < known.least_likeness) & (weights.mean(1) >= known.least_seen)
+    return (_likeness(look, values, weights) < _LEAST_LIKENESS) & (weights.mean(1) >= _LEAST_SEEN)
 
 
 def _compared(
@@ -142,12 +170,11 @@ def _compared(
         weights: 1 where a picture shows a point of the part.
         turns: The head's rotation in each picture, row by row.
     """
-    known = TRACKING.covered
-    usual = ~odd & (weights.mean(1) >= known.least_seen)
+    usual = ~odd & (weights.mean(1) >= _LEAST_SEEN)
     # The trace of R^T S is 1 + 2 cos of the angle between the rotations R and S.
-    near = turns[odd] @ turns[usual].T >= 1 + 2 * np.cos(np.radians(known.similar_turn))
+    near = turns[odd] @ turns[usual].T >= 1 + 2 * np.cos(np.radians(_SIMILAR_TURN))
     compared = odd.copy()
-    compared[odd] = near.sum(1) >= known.least_similar
+    compared[odd] = near.sum(1) >= _LEAST_SIMILAR
     return compared
 
 
@@ -161,8 +188,7 @@ def _points_of(face_model: FaceModel) -> list[Int[Tensor, " _"]]:
     marks = face_model.landmark_positions(face_model.template, "mediapipe")
     middle = face_model.template[face_model.faces].mean(1)
     free, places = ~face_model.region_mask(*HIDING_REGIONS), []
-    known = TRACKING.covered
-    reaches = {"mouth": known.mouth_reach, "nose": known.nose_reach, "eyes": known.eyes_reach}
+    reaches = {"mouth": _MOUTH_REACH, "nose": _NOSE_REACH, "eyes": _EYES_REACH}
     for name in PARTS:
         near = free & (torch.cdist(middle, marks[list(_PLACES[name])]).amin(1) < reaches[name])
         free = free & ~near
@@ -212,12 +238,12 @@ def _sampled(
     mask = mask * ((shown >= 0) & skin.numpy()[shown])
     points = vertices[triangles].mean(1)
     at, depth = camera.project(points)
-    sigma = TRACKING.covered.light_extent * float(camera.K[0, 0]) / max(float(depth.mean()), 1e-3)
+    sigma = _LIGHT_EXTENT * float(camera.K[0, 0]) / max(float(depth.mean()), 1e-3)
     light = cv2.GaussianBlur(image * mask[..., None], (0, 0), sigma)
     light /= cv2.GaussianBlur(mask, (0, 0), sigma).clip(1e-3)[..., None]
     normals = torch.nn.functional.normalize(vertex_normals(vertices, face_model.faces)[triangles].mean(1), dim=1)
     cosine = (normals * torch.nn.functional.normalize(camera.position - points, dim=1)).sum(1).numpy()
     x, y = np.split((at - 0.5).numpy().astype(np.float32), 2, axis=1)
-    seen = (cv2.remap(mask, x, y, cv2.INTER_LINEAR)[:, 0] > 0.5) & (cosine > TRACKING.covered.least_cosine)
+    seen = (cv2.remap(mask, x, y, cv2.INTER_LINEAR)[:, 0] > 0.5) & (cosine > _LEAST_COSINE)
     colors = cv2.remap(image - light, x, y, cv2.INTER_LINEAR)[:, 0]
     return colors * seen[:, None], seen.astype(np.float32)

@@ -18,11 +18,19 @@ from mien.capture.capture import Capture
 from mien.machine.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.render.mesh_gradients import mesh_edges
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import Subject
 from mien.tracking.fitting.solver import NormalEquations, SharedEquations
 from mien.tracking.fitting.views import CameraBatch, Views
 from mien.tracking.pixels.surface import SurfaceModel, by_log_focal
+
+_OUTLINE_REACH = 0.012  # largest distance along the normal at which an edge of the matte is searched, in metres
+_OUTLINE_SAMPLES = 49  # number of samples of the matte along the normal
+_OUTLINE_BESIDE = 1.5  # distance outside of the outline, in pixels, at which there must be no mesh
+_OUTLINE_SIGMA = 0.0015  # expected distance between outline and matte, in metres. Set with the outlier thresholds
+_OUTLINE_OUTLIERS = (4.0, 2.0)
+"""Outlier thresholds in these standard deviations, for mattes that end inside and outside of the mesh. The second is
+smaller, because hair, beards and collars extend the matte. Chosen on d3, whose hair over the ears pulled them outwards
+(log)."""
 
 _HIDDEN_REGIONS = ("scalp", "neck", "mouth", "teeth", "tongue", "eye_sockets", "eyes", "irises", "eyelids")
 """Regions whose outline is not used, because hair, collars and lashes hide it."""
@@ -101,7 +109,6 @@ class OutlineTerm:
         Returns:
             Derivatives of each point's outward motion, each point's distance to the edge, the weights, and the cost.
         """
-        known = TRACKING.pixels
         size = (self.capture.width, self.capture.height)
         view = Camera(cameras.K[camera], cameras.viewmat[camera], *size).to(torch.zeros(()))
         outline = self.outline(vertices, view)
@@ -109,7 +116,7 @@ class OutlineTerm:
         x, y, z = middle.unbind(-1)
         scale = float(view.K[0, 0] / vertices.new_tensor([z.median() if len(z) else 1.0]))
         matte = np.asarray(self.capture.mattes[int(self.timesteps[row]), camera])
-        distance = edge_distances(matte, outline, known.outline_reach * scale)
+        distance = edge_distances(matte, outline, _OUTLINE_REACH * scale)
         seen = distance.isfinite()
         zero = torch.zeros_like(x)
         by_point = torch.stack([
@@ -119,9 +126,9 @@ class OutlineTerm:
         outwards = torch.einsum("kx,kxc->kc", outline.normals, by_point) @ view.viewmat[:3, :3]
         moved = jacobian[outline.ends[:, 0]] + jacobian[outline.ends[:, 1]]
         slopes = 0.5 * torch.einsum("kc,kcq->kq", outwards, moved)
-        sigma = known.outline_sigma * scale
+        sigma = _OUTLINE_SIGMA * scale
         squared = (distance[seen] / sigma).square()
-        least = torch.where(distance[seen] < 0, *known.outline_outliers) ** 2
+        least = torch.where(distance[seen] < 0, *_OUTLINE_OUTLIERS) ** 2
         share = outline.lengths[seen] / outline.lengths.sum().clamp_min(1.0)
         weights = share * (least / (least + squared)).square() / sigma**2
         cost = float((share * least * squared / (least + squared)).sum())
@@ -145,9 +152,9 @@ class OutlineTerm:
         normals = normals * torch.where(((points - inside) * normals).sum(1, keepdim=True) < 0, -1.0, 1.0)
         drawn = rasterize_mesh(vertices, faces, camera).face_index
         depth = (vertices[ends].mean(1) @ camera.viewmat[2, :3]) + camera.viewmat[2, 3]
-        reach = TRACKING.pixels.outline_reach * camera.K[0, 0] / depth
+        reach = _OUTLINE_REACH * camera.K[0, 0] / depth
         free = torch.ones(len(points), dtype=torch.bool)
-        for step in (torch.full_like(reach, TRACKING.pixels.outline_beside), 0.25 * reach, 0.5 * reach, reach):
+        for step in (torch.full_like(reach, _OUTLINE_BESIDE), 0.25 * reach, 0.5 * reach, reach):
             free &= ~_covered(drawn, points + step[:, None] * normals)
         return Outline(ends[free], points[free], normals[free], lengths[free])
 
@@ -173,7 +180,7 @@ def _covered(drawn: Int[Tensor, "h w"], points: Float[Tensor, "k 2"]) -> Bool[Te
 
 def edge_distances(matte: np.ndarray, outline: Outline, reach: float) -> Float[Tensor, " k"]:
     """Distance along the normal from each point to the edge of the matte, in pixels; NaN if there is none in reach."""
-    steps = np.linspace(-reach, reach, TRACKING.pixels.outline_samples, dtype=np.float32)
+    steps = np.linspace(-reach, reach, _OUTLINE_SAMPLES, dtype=np.float32)
     path = outline.points.numpy()[:, None] + steps[:, None] * outline.normals.numpy()[:, None]
     if not len(path):
         return torch.zeros(0)

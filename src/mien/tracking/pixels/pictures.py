@@ -10,8 +10,11 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.views import CameraBatch
+
+_BLUR = 0.8  # standard deviation of the blur, in pixels of the scaled picture
+_MATTE_MARGIN = 2
+"""Margin along the person's outline that is masked, in pixels of the scaled picture: it mixes with the background."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,6 @@ class Pictures:
 
     def picture(self, timestep: int, camera: int, cameras: CameraBatch) -> Picture:
         """The picture of one camera. Several threads may call this at once."""
-        known = TRACKING.pixels
         capture = self.capture
         width, height = max(capture.width // self.shrink, 8), max(capture.height // self.shrink, 8)
         image = np.asarray(capture.images[timestep, camera])
@@ -43,8 +45,8 @@ class Pictures:
         if self.shrink > 1:
             image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
             matte = cv2.resize(matte, (width, height), interpolation=cv2.INTER_AREA)
-        image = cv2.GaussianBlur(image.astype(np.float32) * np.float32(1 / 255), (0, 0), known.blur)
-        kernel = np.ones((2 * known.matte_margin + 1, 2 * known.matte_margin + 1), np.uint8)
+        image = cv2.GaussianBlur(image.astype(np.float32) * np.float32(1 / 255), (0, 0), _BLUR)
+        kernel = np.ones((2 * _MATTE_MARGIN + 1, 2 * _MATTE_MARGIN + 1), np.uint8)
         mask = cv2.erode(matte, kernel, borderType=cv2.BORDER_REPLICATE).astype(np.float32) * np.float32(1 / 255)
         view = Camera(cameras.K[camera], cameras.viewmat[camera], capture.width, capture.height)
         view = view.resized(width, height).to(torch.zeros(()))

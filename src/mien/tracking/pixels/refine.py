@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mien.machine.parallel import map_in_threads
 from mien.machine.progress import progress_bar, say
-from mien.tracking.constants import TRACKING
 from mien.tracking.eyelids.placing import place_lids
 from mien.tracking.fitting.fit import Course, Fit, SequenceFit, Subject, Watch, smoothness_of
 from mien.tracking.fitting.resume import StageCache
@@ -36,6 +35,13 @@ from mien.tracking.pixels.texture import (
 )
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 
+_FRAME_DAMPING = 1e-3  # damping of a frame's step, as a share of the diagonal
+_WORSE = 1.02  # a step of a frame is undone if it multiplies the frame's cost by this factor or more
+_LEAST_KEYFRAMES = 3
+"""Fewest keyframes for any number of cameras, because the mouth must be seen open and closed. Measured: with 16
+cameras, 3 are as good as 24 (log, "Several cameras in the fit")."""
+_LEAST_SHARE = 0.03  # least weight of a frame in the texture, however far from the middle pose
+
 FRAMES_AT_ONCE = 256
 """Number of timesteps whose equations are stored as one piece: a few seconds of work, about 10 MB."""
 _SHARED_COST, _APPEARANCE_COST, _LIDS_PART = 100, 40, 4
@@ -60,7 +66,7 @@ class _Round:
     def keyframes(self) -> int:
         """Number of keyframes of each sequence for the steps of the shared parameters."""
         pictures = 2 * self.settings.keyframes // max(shot.capture.valid.shape[1] for shot in self.shots)
-        return min(self.settings.keyframes, max(pictures, TRACKING.pixels.least_keyframes))
+        return min(self.settings.keyframes, max(pictures, _LEAST_KEYFRAMES))
 
     def pictures(self, shot: Shot) -> Pictures:
         """The pictures of a sequence at this round's size."""
@@ -112,7 +118,7 @@ class _Round:
         pictures, timesteps = self.pictures(shot), shot.valid.nonzero()[:, 0]
         middle = own.state[:, :3].median(0).values
         away = (own.state[:, :3] - middle).norm(dim=1) / self.settings.reference_angle
-        shares = 1 / (1 + away**4) + TRACKING.pixels.least_share if len(own.cameras) == 1 else torch.ones_like(away)
+        shares = 1 / (1 + away**4) + _LEAST_SHARE if len(own.cameras) == 1 else torch.ones_like(away)
 
         def sight(row: int) -> list[Sighting]:
             posed = self.model.pose(own.state[row], identity, derive=False)
@@ -339,9 +345,9 @@ def _step(
     """Move all timesteps by one Gauss-Newton step, except those that it makes worse; also returns which ones moved."""
     bounds, state = term.layout.bounds, own.state
     equations = _equations(term, subject, own, cache, name, advance)
-    damping = torch.diag_embed(TRACKING.pixels.frame_damping * equations.hessian.diagonal(dim1=1, dim2=2))
+    damping = torch.diag_embed(_FRAME_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
     held = bounds.held(state, equations.gradient + smoothness.gradient(state))
     damped = replace(equations, hessian=equations.hessian + damping)
     candidate = bounds.clip(state + solve_chain(damped, smoothness, state, held))
-    better = term.costs(candidate, subject, own.cameras) < TRACKING.pixels.worse * equations.cost
+    better = term.costs(candidate, subject, own.cameras) < _WORSE * equations.cost
     return torch.where(better[:, None], candidate, state), better

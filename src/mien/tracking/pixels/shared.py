@@ -8,12 +8,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import Fit, SequenceFit, choose_keyframes
 from mien.tracking.fitting.solver import join_frames, join_shared, place_shared, solve_arrow
 from mien.tracking.landmarks.term import move_subject
 from mien.tracking.pixels.outline import OutlineTerm
 from mien.tracking.pixels.term import PhotometricTerm
+
+_SHARED_DAMPING = 1e-6
+"""Damping of a step of identity and focal length. It is tiny, because the effect that separates focal length from depth
+is a thousandth of the effect of either alone. Measured: 1e-3 keeps the focal length where it was (log, "Focal
+length")."""
+_POSE_SMOOTHING = 0.3  # ridge regularisation of the affine map from poses to pose steps, in keyframes
+_FOCAL_STEP = 0.2  # largest change of the logarithm of a focal length in one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +48,6 @@ def step_shared(
     A texture that was estimated with these very poses hardly resists a change that shifts all views alike, but it
     resists a change that the views contradict. So the step gains depth, from parallax. Outlines show the perspective.
     """
-    known = TRACKING.pixels
     subject, bounds = fit.subject, terms[0].layout.bounds
     rows = [choose_keyframes(own.state[:, :6], keyframes) for own in fit.sequences]
     frames, shared = [], []
@@ -59,12 +64,12 @@ def step_shared(
     held = bounds.held(state, equations.gradient)
     held[:, 6:] = True  # An expression that all frames share belongs to identity, but would drift here.
     with_prior = join_shared(shared).with_prior(precision, values)
-    step, shared_step = solve_arrow(equations, with_prior, held, known.shared_damping)
+    step, shared_step = solve_arrow(equations, with_prior, held, _SHARED_DAMPING)
     sequences = []
     steps = step.split([len(chosen) for chosen in rows])
     for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, prior.lenses, strict=True):
         longer = 0.0 if lens is None else float(shared_step[len(subject.shared) + lens])
-        factor = math.exp(min(max(longer, -known.focal_step), known.focal_step))
+        factor = math.exp(min(max(longer, -_FOCAL_STEP), _FOCAL_STEP))
         sequences.append(SequenceFit(own.cameras.with_focal(factor), move_like_keyframes(own.state, chosen, own_step)))
     response = terms[0].landmarks.model.response
     return Fit(move_subject(subject, shared_step[: len(subject.shared)], response), tuple(sequences))
@@ -81,7 +86,7 @@ def move_like_keyframes(
     middle, scale = pose[chosen].mean(0), pose[chosen].std(0, correction=0).clamp_min(1e-3)
     features = torch.cat([torch.ones_like(pose[:, :1]), (pose - middle) / scale], dim=1)
     keys = features[chosen]
-    ridge = TRACKING.pixels.pose_smoothing * torch.eye(7).to(pose)
+    ridge = _POSE_SMOOTHING * torch.eye(7).to(pose)
     ridge[0, 0] = 0
     slopes = torch.linalg.solve(keys.T @ keys + ridge, keys.T @ step[:, :6])
     return torch.cat([pose + features @ slopes, state[:, 6:]], dim=1)

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from mien import _native
 from mien.machine.parallel import map_in_threads
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import Subject
 from mien.tracking.fitting.parameters import ParameterLayout
 from mien.tracking.fitting.solver import NormalEquations, SharedEquations, join_frames
 from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.term import LandmarkTerm
+from mien.tracking.pixels.comparison import LEAST_PIXELS
 from mien.tracking.pixels.pictures import Pictures
 from mien.tracking.pixels.surface import PosedSurface, SurfaceModel, by_log_focal
 from mien.tracking.pixels.texture import Sighting
@@ -76,7 +76,7 @@ class PhotometricTerm:
                 picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
                 seen = Sighting(posed, picture, self.light).arrays()
                 cost, weight = _native.align_mesh(self.surface, seen, self.light_radius, None, None, None)
-                if weight >= TRACKING.pixels.least_pixels:
+                if weight >= LEAST_PIXELS:
                     found[row, camera] = self.sigma * cost**0.5
 
         map_in_threads(of_row, list(range(len(state))))

@@ -15,10 +15,18 @@ from mien import _native
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.render.mesh import MeshFragments, rasterize_mesh
-from mien.tracking.constants import TRACKING
 from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, fit_of
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.surface import PosedSurface
+
+LEAST_COSINE = 0.25
+"""Least cosine between the surface's normal and the direction to the camera at which the surface's colour is used."""
+_LEAST_WEIGHT = 0.05  # least total weight of a texel's sightings (each the squared cosine) for the texel to be known
+_FIRST_SIGMA = 0.1  # expected colour difference (0..1) before anything is known
+_SIGMA_BOUNDS = (0.01, 0.1)  # bounds of the expected colour difference afterwards
+_LIGHT_ROUNDS = 3  # number of rounds of albedo and light in turn
+_LIGHT_STIFFNESS = 0.02
+"""Weight of the prior that pulls the light towards an even one, relative to the evidence of the pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,7 @@ class TextureSpace:
         """The surface with a texture, for the native core."""
         return _native.AlignSurface(
             self.faces, self.corners, self.used.to(torch.uint8), texture.albedo, texture.trust,
-            texture.sigma, outlier, TRACKING.pixels.least_cosine,
+            texture.sigma, outlier, LEAST_COSINE,
         )  # fmt: skip
 
 
@@ -93,7 +101,7 @@ def even_light() -> Float[Tensor, "9 3"]:
 def unknown_texture(space: TextureSpace) -> SkinTexture:
     """The appearance before any picture: no texel is known."""
     size = space.fragments.face_index.shape
-    return SkinTexture(torch.zeros(*size, 3), torch.zeros(size), TRACKING.pixels.first_sigma)
+    return SkinTexture(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
 
 
 def estimate_appearance(
@@ -112,7 +120,7 @@ def estimate_appearance(
     """
     texture, known = start, bool((start.trust > 0).any())
     lights = [own[0].light for own in sightings]
-    for turn in range(TRACKING.pixels.light_rounds):
+    for turn in range(_LIGHT_ROUNDS):
         texture = _bake(space, sightings, lights, texture, outlier)
         if not texture.trust.any():
             return texture, lights
@@ -152,10 +160,10 @@ def _bake(
         for sighting in own:
             seen = replace(sighting, light=light).weighted().arrays()
             _native.bake_texture(surface, seen, space.fragments.face_index, space.fragments.barycentric, sums)
-    known = weight > TRACKING.pixels.least_weight
+    known = weight > _LEAST_WEIGHT
     albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
     variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
-    bounds = TRACKING.pixels.sigma_bounds
+    bounds = _SIGMA_BOUNDS
     sigma = float(variance[known].median().sqrt().clamp(*bounds)) if known.any() else texture.sigma
     trust = known * (sigma**2 / (0.5 * sigma**2 + variance)).clamp_max(1.0)
     return SkinTexture(albedo, trust, sigma)
@@ -164,7 +172,7 @@ def _bake(
 def _one_color(texture: SkinTexture) -> SkinTexture:
     """The texture with its median colour in all known texels. At the start, all variation counts as light."""
     median = texture.albedo[texture.trust > 0].median(0).values
-    return replace(texture, albedo=(texture.trust > 0)[..., None] * median, sigma=TRACKING.pixels.first_sigma)
+    return replace(texture, albedo=(texture.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
 
 
 def _fit_light(
@@ -180,7 +188,7 @@ def _fit_light(
         _native.light_equations(surface, replace(sighting, light=light).arrays(), hessian, right)
     hessian = hessian + hessian.triu(1).mT
     most = hessian.diagonal(dim1=1, dim2=2).amax(1)
-    stiffness = TRACKING.pixels.light_stiffness * most[:, None].expand(3, 9).clone() + 1e-9
+    stiffness = _LIGHT_STIFFNESS * most[:, None].expand(3, 9).clone() + 1e-9
     hessian = hessian + torch.diag_embed(stiffness)
     right = right + stiffness * even_light().T.double()
     return torch.linalg.solve(hessian, right).T.float().contiguous()

@@ -19,10 +19,18 @@ from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
-from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, spread_frames
-from mien.training.footage.mesh_colors import sample_picture
+from mien.training.footage.mesh_colors import DEPTH_TOLERANCE, sample_picture
 from mien.training.footage.sequence import Sequence
+
+_COVERAGE_EVEN_FRAMES = 48  # number of evenly spread frames in which coverage is measured
+_COVERAGE_TURNED_FRAMES = 24  # number of other frames: those in which the head turns furthest to each side
+_COVERAGE_FACING = (0.1, 0.3)
+"""Cosines between a triangle's normal and the direction to the camera, between which its view begins to count."""
+_COVERAGE_ENOUGH = 1.0
+"""Sum of squared cosines over the frames from which a triangle is certain. Rare sights, such as teeth, count fully.
+Geometry: one picture from straight ahead."""
+_COVERAGE_CUT_SOFTNESS = 0.001  # distance in metres below the cut at the neck to which a vertex counts as above
 
 _INTERIOR = ("mouth", "teeth", "tongue")
 """Regions inside the mouth. Lips hide them in most frames, so the mesh cannot say which of them pictures show."""
@@ -63,7 +71,7 @@ def measure_coverage(
     """
     count = len(face_model.faces)
     colors, weights, above = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
-    even, turned = FOOTAGE.coverage_even_frames, FOOTAGE.coverage_turned_frames
+    even, turned = _COVERAGE_EVEN_FRAMES, _COVERAGE_TURNED_FRAMES
     chosen = representative_frames(faces, sequences, frames, even, turned)
 
     neck = NeckParts.of(face_model)
@@ -80,7 +88,7 @@ def measure_coverage(
         above += line
     known = weights > 1e-3
     colors = torch.where(known[:, None], colors / weights.clamp_min(1e-3)[:, None], torch.tensor(0.5))
-    seen = torch.where(known, smoothstep(weights / FOOTAGE.coverage_enough), 0.0)
+    seen = torch.where(known, smoothstep(weights / _COVERAGE_ENOUGH), 0.0)
     return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 1))
 
 
@@ -155,15 +163,15 @@ def _seen_colors(
     colors, head = (sample_picture(whole, grid, "bilinear") for whole in (picture, mask))
     front = sample_picture(nearest, grid, "nearest")[:, 0]
     cosine = triangle_views(vertices, faces, camera.position)
-    visible = smoothstep((front + 2 * FOOTAGE.depth_tolerance - depth) / FOOTAGE.depth_tolerance)
-    hardly, well = FOOTAGE.coverage_facing
+    visible = smoothstep((front + 2 * DEPTH_TOLERANCE - depth) / DEPTH_TOLERANCE)
+    hardly, well = _COVERAGE_FACING
     facing = smoothstep((cosine - hardly) / (well - hardly))
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
     weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
     line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
     corners, _ = camera.project(vertices)
     # What is below the neck line in the picture, or below the cut in space, is not scored.
-    in_space = (cut.heights(vertices) / FOOTAGE.coverage_cut_softness + 2).clamp(0, 1)
+    in_space = (cut.heights(vertices) / _COVERAGE_CUT_SOFTNESS + 2).clamp(0, 1)
     above = torch.minimum((corners @ line[:2] + line[2]).clamp(0, 1), in_space)
     # All of the triangle has to be above: what hangs over the cut is scored as background.
     return colors, torch.where(inside, weight, 0.0), above[faces.long()].amin(1)

@@ -16,8 +16,13 @@ from mien.render.camera_paths import turned_camera
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.runtime.baked import Filmed
 from mien.storage import expect_whole, read_tensors, write_tensors
-from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.coverage import Coverage
+
+_FILMED_CONFIDENCE = 0.85  # mean confidence of the visible surface from which a view counts as filmed. Set by eye
+_SHOWN_CONFIDENCE = 0.5  # the same from which the head of a filled avatar may turn there. Set by eye (log, 11-23)
+_SHOWN_MOST_YAW = 60
+"""Degrees to the side beyond which that does not hold, since fills have no folds. Set by eye (log, 11-23)."""
+_SHOWN_MOST_PITCH = 30  # the same up and down
 
 FILE = "coverage.safetensors"
 """Name of the file in a run's folder."""
@@ -76,7 +81,7 @@ def filmed_yaws(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage:
     """
 
     def is_filmed(yaw: int) -> bool:
-        return filmed_share(vertices, face_model, coverage, view_of_head(vertices, yaw)) >= FOOTAGE.filmed_confidence
+        return filmed_share(vertices, face_model, coverage, view_of_head(vertices, yaw)) >= _FILMED_CONFIDENCE
 
     if not is_filmed(0):
         return None
@@ -93,12 +98,12 @@ def with_shown_angles(
 
     def is_shown(yaw: int, pitch: int) -> bool:
         camera = view_of_head(vertices, yaw, pitch=pitch)
-        return filmed_share(vertices, face_model, coverage, camera) >= FOOTAGE.shown_confidence
+        return filmed_share(vertices, face_model, coverage, camera) >= _SHOWN_CONFIDENCE
 
     if not is_shown(0, 0):
         return filmed
-    right, left = (_reached(lambda turn, to=to: is_shown(to * turn, 0), FOOTAGE.shown_most_yaw) for to in (-1, 1))
-    down, up = (_reached(lambda turn, to=to: is_shown(0, to * turn), FOOTAGE.shown_most_pitch) for to in (-1, 1))
+    right, left = (_reached(lambda turn, to=to: is_shown(to * turn, 0), _SHOWN_MOST_YAW) for to in (-1, 1))
+    down, up = (_reached(lambda turn, to=to: is_shown(0, to * turn), _SHOWN_MOST_PITCH) for to in (-1, 1))
     shown, known = np.radians(np.array([[-right, left], [-down, up]], np.float32)), filmed.head_angles
     lowest, highest = np.minimum(known[:, 0], shown[:, 0]), np.maximum(known[:, 1], shown[:, 1])
     return replace(filmed, head_angles=np.stack([lowest, highest], axis=1))

@@ -12,7 +12,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32, UInt8
 
-from mien.training.footage.constants import FOOTAGE
+_FOREGROUND_WINDOWS = (1 / 11, 1 / 73)
+"""Sides of the windows of both passes, as shares of the picture's longer side: 45 and 7 pixels of 500. Two passes are
+of the paper (Forte 2021); the sizes were not varied."""
+_FOREGROUND_SOLID = 252  # opacity from which a pixel is person alone, of 255
 
 
 def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -38,7 +41,7 @@ def soft_colors(
     left, top, width, height = cv2.boundingRect(matte)
     if width == 0:
         return np.zeros(0, np.int32), np.zeros((0, 3), np.uint8)
-    windows = [max(3, 2 * round(share * max(image.shape[:2]) / 2) + 1) for share in FOOTAGE.foreground_windows]
+    windows = [max(3, 2 * round(share * max(image.shape[:2]) / 2) + 1) for share in _FOREGROUND_WINDOWS]
     # Only the head's box with the first window's margin counts; the picture's own edge stays an edge.
     low = max(0, left - windows[0]), max(0, top - windows[0])
     inside = (slice(low[1], top + height + windows[0]), slice(low[0], left + width + windows[0]))
@@ -58,14 +61,14 @@ def soft_colors(
         if number == 0:
             person.reshape(-1, 3)[place] = colors
             background.reshape(-1, 3)[place] = _rounded(near_background + (1 - share) * rest)
-    soft = weight < FOOTAGE.foreground_solid
+    soft = weight < _FOREGROUND_SOLID
     row, column = np.divmod(place[soft], filmed.shape[1])
     return ((row + low[1]) * image.shape[1] + column + low[0]).astype(np.int32), colors[soft]
 
 
 def soft_pixels(matte: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Return the pixels whose colours `foreground_colors` estimates: neither empty nor solid."""
-    return (matte > 0) & (matte < FOOTAGE.foreground_solid)
+    return (matte > 0) & (matte < _FOREGROUND_SOLID)
 
 
 def _mean(

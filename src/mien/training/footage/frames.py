@@ -14,10 +14,22 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien.errors import UserError
-from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import Split, TrainSettings, check_held_out
 from mien.training.splits.own import OWN_SPLIT, read_own_split
+
+_EXTENT_MARGIN = 1.1
+"""Factor on the largest distance of a camera from the mean of all. Of 3D Gaussian Splatting's published code."""
+LEAST_EXTENT = 0.5
+"""Least extent of the training cameras, in metres. A single fixed camera has an extent of 0: centres would not move,
+and every Gaussian would be too large. Geometry: half a metre is less than a ring of cameras around a head, and more
+than the head. One metre would be above the rig of GaussianAvatars' paper."""
+_MIXED_SHARE = 0.1
+"""Share of the steps in which a mixed background has a random colour. Measured on wojtek, 12,000 steps with alpha
+compared at full weight (log, 11-28): 0.1 has 30.4 dB of the head over white and 29.2 over dark blue, 0 has 30.4 and
+28.7, and d3 has pale specks on the cheeks from the side; 0.3 with a fifth of the weight has 30.0 and 28.8."""
+_RARITY_LIMIT = 2.0  # largest factor by which rare frames are drawn more often, and common ones less
+_RARITY_MOST_NEIGHBORS = 100  # largest number of neighbours in which a frame's rarity is measured
 
 Item = TypeVar("Item")
 _ORDER, _BACKGROUND, _DENSITY, _CROP, _COVER, _ASIDE = range(6)
@@ -120,7 +132,7 @@ def camera_extent(sequences: Items[Sequence], frames: Items[Frame]) -> float:
     seen = sorted({(frame.sequence, frame.camera) for frame in frames})
     centers = torch.stack([sequences[index].tracking.cameras[camera].position for index, camera in seen]).double()
     distances = (centers - centers.mean(0)).norm(dim=-1)
-    return max(FOOTAGE.least_extent, FOOTAGE.extent_margin * float(distances.max()))
+    return max(LEAST_EXTENT, _EXTENT_MARGIN * float(distances.max()))
 
 
 def evenly_spread(items: Items[Item], max_count: int) -> list[Item]:
@@ -144,13 +156,13 @@ def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float
     """
     timesteps = sorted({(frame.sequence, frame.timestep) for frame in frames})
     expressions = torch.stack([sequences[s].tracking.face.expression[t] for s, t in timesteps]).double()
-    neighbor = min(max(1, round(len(timesteps) ** 0.5)), FOOTAGE.rarity_most_neighbors, len(timesteps) - 1)
+    neighbor = min(max(1, round(len(timesteps) ** 0.5)), _RARITY_MOST_NEIGHBORS, len(timesteps) - 1)
     # In rows of bounded memory. Without matrix products, equal expressions are exactly 0 apart.
     rows = (
         torch.cdist(some, expressions, compute_mode="donot_use_mm_for_euclid_dist") for some in expressions.split(512)
     )
     distances = torch.cat([row.kthvalue(neighbor + 1, dim=1).values for row in rows])
-    rarity = (distances / distances.median().clamp_min(1e-9)).clamp(1 / FOOTAGE.rarity_limit, FOOTAGE.rarity_limit)
+    rarity = (distances / distances.median().clamp_min(1e-9)).clamp(1 / _RARITY_LIMIT, _RARITY_LIMIT)
     index = {timestep: number for number, timestep in enumerate(timesteps)}
     return rarity[[index[frame.sequence, frame.timestep] for frame in frames]]
 
@@ -201,7 +213,7 @@ def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]
     generator = random_at(settings.seed, _BACKGROUND, step)
     color = torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)
     drawn = settings.background == "random" or (
-        settings.background == "mixed" and float(torch.rand((), generator=generator)) < FOOTAGE.mixed_share
+        settings.background == "mixed" and float(torch.rand((), generator=generator)) < _MIXED_SHARE
     )
     return color if drawn else np.full(3, 255, dtype=np.uint8)
 

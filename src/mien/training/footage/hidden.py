@@ -9,7 +9,11 @@ from mien.camera import Camera
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.render.mesh import rasterize_mesh
-from mien.training.footage.constants import FOOTAGE
+
+_HIDDEN_SIZE = 256  # longer side in pixels of the depth pictures of skin, lids and lips
+_HIDDEN_SLACK = 1
+"""Pixels of such a picture by which gaps between lids and lips are wider than those of the mesh, because the tracking
+is not exact. Measured: 0 blurs irises and takes highlights from the eyes of d3 (log, 11-26)."""
 
 _SAMPLES = ((1, 1, 1), (4, 1, 1), (1, 4, 1), (1, 1, 4), (1, 4, 4), (4, 1, 4), (4, 4, 1))
 """Points of a triangle that are looked for, as weights of its corners before they are normalised."""
@@ -36,10 +40,10 @@ def hidden_triangles(
         inside: The triangles inside the head. Others are never returned.
         camera: The camera that sees them.
     """
-    scale = FOOTAGE.hidden_size / max(camera.width, camera.height)
+    scale = _HIDDEN_SIZE / max(camera.width, camera.height)
     small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     outside = rasterize_mesh(vertices, face_model.faces[~inside], small).depth.nan_to_num(posinf=1e3)
-    furthest = max_pool2d(outside[None], 2 * FOOTAGE.hidden_slack + 1, 1, FOOTAGE.hidden_slack)[0]
+    furthest = max_pool2d(outside[None], 2 * _HIDDEN_SLACK + 1, 1, _HIDDEN_SLACK)[0]
     weights = vertices.new_tensor(_SAMPLES)
     points = torch.einsum("sk,fkc->fsc", weights / weights.sum(1, keepdim=True), vertices[face_model.faces[inside]])
     pixels, depth = small.project(points.reshape(-1, 3))

@@ -12,9 +12,12 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
-from mien.training.footage.constants import FOOTAGE
 from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.sequence import Sequence, composite
+
+DEPTH_TOLERANCE = 0.004  # depth in metres behind the nearest surface up to which something counts as visible
+_COLOR_FRAMES = 60  # number of evenly spread frames for the mean vertex colours. More make no visible difference
+_COLOR_SPREAD_ROUNDS = 200  # number of times that unknown colours are averaged over neighbours
 
 
 @torch.no_grad()
@@ -44,7 +47,7 @@ def vertex_colors(
         vertices = face_model(faces[frame.sequence][frame.timestep])[0]
         return _seen_colors(sequences[frame.sequence], frame, vertices, face_model.faces)
 
-    for seen, weight in stream_in_threads(seen_in, spread_frames(frames, FOOTAGE.color_frames), threads):
+    for seen, weight in stream_in_threads(seen_in, spread_frames(frames, _COLOR_FRAMES), threads):
         colors += weight[:, None] * seen
         weights += weight
     known = weights > 1e-3
@@ -72,7 +75,7 @@ def _seen_colors(
     to_camera = normalize(camera.position - vertices, dim=-1)
     facing = (vertex_normals(vertices, faces) * to_camera).sum(-1).clamp_min(0)
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
-    seen = inside & (depth < front + FOOTAGE.depth_tolerance) & (alpha[:, 0] > 0.9)
+    seen = inside & (depth < front + DEPTH_TOLERANCE) & (alpha[:, 0] > 0.9)
     return colors, torch.where(seen, facing**2, torch.zeros_like(facing))
 
 
@@ -91,7 +94,7 @@ def _spread(colors: Float[Tensor, "v 3"], known: Tensor, faces: Int[Tensor, "f 3
     degree = torch.zeros(len(colors)).index_add(0, edges[:, 0], torch.ones(len(edges))).clamp_min(1)
     unknown = torch.zeros(len(colors), dtype=torch.bool)
     unknown[edges[:, 0]] = True
-    for _ in range(FOOTAGE.color_spread_rounds):
+    for _ in range(_COLOR_SPREAD_ROUNDS):
         means = torch.zeros_like(colors).index_add(0, edges[:, 0], colors[edges[:, 1]]) / degree[:, None]
         colors = torch.where(unknown[:, None], means, colors)
     return colors

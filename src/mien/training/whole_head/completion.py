@@ -14,8 +14,16 @@ from mien.face.head_parts import HeadParts, head_parts, mouth_colors
 from mien.face.mirror import mirror_triangles, triangle_geometry
 from mien.face.model import FaceModel
 from mien.render.mesh import shade
-from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.spreading import Surface
+
+_COLOR_SPREAD = 0.12  # distance between colours (0..1) over which a colour stops counting as skin or as hair
+_TINT_SPREAD = 0.06  # the same for colours of equal brightness. Chosen with the rule (log, 11-22) alone
+_LIGHT_SPREAD = 0.25  # the same for the logarithm of their brightness beyond half or twice. Chosen with the rule alone
+_DIFFERENT_COLORS = 0.10  # distance between the medians of skin and hair from which their colours can be told apart
+_LARGEST_OFFSET = 0.25
+"""Largest difference of brightness between a triangle and its mirror image that counts as light, and between a triangle
+and its neighbours that counts as texture."""
+_LEAST_LIGHT = 0.1  # least light by which colours are divided
 
 
 def complete_colors(
@@ -86,7 +94,7 @@ def _shading(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], light: Float[Tensor, "9 3"]
 ) -> Float[Tensor, "f 3"]:
     normals = triangle_geometry(vertices, faces)[2]
-    shading = shade(normals, light.detach().to(vertices)).clamp_min(WHOLE_HEAD.least_light)
+    shading = shade(normals, light.detach().to(vertices)).clamp_min(_LEAST_LIGHT)
     return torch.where(shading.isfinite(), shading, 1.0)
 
 
@@ -112,22 +120,22 @@ def _trust(
     skin_like = _close_but_for_light(colors, skin)
     trust = torch.where(parts.skin, skin_like, trust)
     trust = torch.where(parts.neck, skin_like if hair is None else torch.maximum(skin_like, hair_like), trust)
-    if hair is not None and float((skin - hair).norm()) > WHOLE_HEAD.different_colors:
+    if hair is not None and float((skin - hair).norm()) > _DIFFERENT_COLORS:
         trust = torch.where(parts.scalp, hair_like / (hair_like + _close(colors, skin) + 1e-3), trust)
     return trust
 
 
 def _close(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
     """Return how close colours are to one colour, 0..1."""
-    return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / WHOLE_HEAD.color_spread**2)
+    return torch.exp(-0.5 * ((colors - color) ** 2).sum(1) / _COLOR_SPREAD**2)
 
 
 def _close_but_for_light(colors: Float[Tensor, "f 3"], color: Float[Tensor, " 3"]) -> Float[Tensor, " f"]:
     """Return how close colours are to one colour in half to twice the light, 0..1."""
     light = (colors @ color) / (color @ color).clamp_min(1e-6)
-    tint = ((colors - light[:, None] * color) ** 2).sum(1) / WHOLE_HEAD.tint_spread**2
+    tint = ((colors - light[:, None] * color) ** 2).sum(1) / _TINT_SPREAD**2
     beyond = (light.clamp_min(1e-3).log().abs() - math.log(2)).clamp_min(0)
-    return torch.exp(-0.5 * (tint + (beyond / WHOLE_HEAD.light_spread) ** 2))
+    return torch.exp(-0.5 * (tint + (beyond / _LIGHT_SPREAD) ** 2))
 
 
 def _spread_by_part(
@@ -156,7 +164,7 @@ def _mirrored(
     images = mirror_triangles(face_model)
     has, image = images >= 0, images.clamp_min(0)
     both = torch.where(has, known * known[image], 0.0)
-    offset = (albedo - albedo[image]).clamp(-WHOLE_HEAD.largest_offset, WHOLE_HEAD.largest_offset)
+    offset = (albedo - albedo[image]).clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
     offset = torch.where((both > 0.05)[:, None], offset, 0.0)
     return albedo[image] + mesh.spread(offset, both, torch.ones_like(has)), torch.where(has, seen[image], 0.0)
 
@@ -165,7 +173,7 @@ def _noise(
     parts: HeadParts, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
 ) -> Float[Tensor, "f 3"]:
     """Return the seen triangles' differences from their neighbours, dealt out to all triangles of their part."""
-    noise, most = torch.zeros_like(albedo), WHOLE_HEAD.largest_offset
+    noise, most = torch.zeros_like(albedo), _LARGEST_OFFSET
     random = torch.Generator().manual_seed(0)
     for part in (parts.scalp, parts.skin | parts.neck):
         sources = (part & (known > 0.8)).nonzero()[:, 0]

@@ -19,7 +19,17 @@ from mien.avatar.avatar import Avatar
 from mien.avatar.bound_surface import BoundSurface, SurfacePrior
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
-from mien.training.whole_head.constants import WHOLE_HEAD
+
+_HAIR_BEGIN = 0.03  # time of the first correction, as a fraction of the run
+_HAIR_END = 0.6  # time of the last correction, as a fraction of the run. Their size falls to 0 until then
+_HAIR_REACH = 0.012
+"""Distance in metres over which gradients are smoothed (standard deviation of a Gaussian). Measured: 0.1 dB more at 30
+to 60 degrees than 20 mm with smaller corrections, which does not decide anything (log, 11-24)."""
+_HAIR_SAME_SIDE = 0.3  # cosine between two normals from which triangles belong to the same side of a fold
+_HAIR_FIRST_DECAY = 0.9  # decay of the running mean of the gradient. Of the paper (Adam, Kingma and Ba 2015)
+_HAIR_SECOND_DECAY = 0.98  # decay of the running mean of its square
+_HAIR_LOWEST_SHIFT = -0.004  # how far hair may sink below the scalp, in metres
+_HAIR_FURTHEST_SHIFT = 0.03  # how far it may move at all, in metres
 
 _EPSILON = 1e-12
 
@@ -49,7 +59,7 @@ class HairSurface:
             surface: The surface of the avatar.
             fraction: How far the run was before the step, 0..1.
         """
-        gradient = surface.height_gradient() if fraction < WHOLE_HEAD.hair_end else None
+        gradient = surface.height_gradient() if fraction < _HAIR_END else None
         if gradient is not None:
             self.state["gradient"] += gradient[self.scalp].to(self.kernel) * self.shown
 
@@ -61,12 +71,12 @@ class HairSurface:
             fraction: How far the run is, 0..1.
             rate: Size of a first correction in metres, where all gradients agree.
         """
-        begin, end, furthest = WHOLE_HEAD.hair_begin, WHOLE_HEAD.hair_end, WHOLE_HEAD.hair_furthest_shift
+        begin, end, furthest = _HAIR_BEGIN, _HAIR_END, _HAIR_FURTHEST_SHIFT
         moves = rate > 0 and begin <= fraction < end
         if moves:
             step = self._step() * rate * (end - fraction) / (end - begin)
             before = self.state["shift"].clone()
-            lowest = WHOLE_HEAD.hair_lowest_shift - self.start.hair[self.scalp]
+            lowest = _HAIR_LOWEST_SHIFT - self.start.hair[self.scalp]
             self.state["shift"] = (before - step).clamp(-furthest, furthest).maximum(lowest)
             surface.raise_by(self._on_all(self.state["shift"] - before))
         self.state["gradient"] = torch.zeros_like(self.state["gradient"])
@@ -89,10 +99,10 @@ class HairSurface:
         """Adam's step for the smoothed gradient, at most about 1. Neighbours share the second moment."""
         gradient, state = self.kernel @ self.state["gradient"], self.state
         state["count"] = state["count"] + 1
-        state["first"] = torch.lerp(gradient, state["first"], WHOLE_HEAD.hair_first_decay)
-        state["second"] = torch.lerp(gradient.square(), state["second"], WHOLE_HEAD.hair_second_decay)
-        first = state["first"] / (1 - WHOLE_HEAD.hair_first_decay ** state["count"])
-        second = self.mean @ state["second"] / (1 - WHOLE_HEAD.hair_second_decay ** state["count"])
+        state["first"] = torch.lerp(gradient, state["first"], _HAIR_FIRST_DECAY)
+        state["second"] = torch.lerp(gradient.square(), state["second"], _HAIR_SECOND_DECAY)
+        first = state["first"] / (1 - _HAIR_FIRST_DECAY ** state["count"])
+        second = self.mean @ state["second"] / (1 - _HAIR_SECOND_DECAY ** state["count"])
         return first / (second.sqrt() + _EPSILON)
 
     def _on_all(self, values: Float[Tensor, " k"]) -> Float[Tensor, " f"]:
@@ -113,8 +123,8 @@ def hair_surface(avatar: Avatar, prior: SurfacePrior) -> HairSurface | None:
         return None
     geometry = triangle_geometry(vertices.cpu().float(), avatar.face_model.faces.cpu())
     middles, areas, normals = (values[scalp] for values in geometry)
-    apart = torch.cdist(middles, middles, compute_mode="donot_use_mm_for_euclid_dist") / WHOLE_HEAD.hair_reach
-    kernel = torch.exp(-0.5 * apart.square()) * (apart < 3) * (normals @ normals.T > WHOLE_HEAD.hair_same_side)
+    apart = torch.cdist(middles, middles, compute_mode="donot_use_mm_for_euclid_dist") / _HAIR_REACH
+    kernel = torch.exp(-0.5 * apart.square()) * (apart < 3) * (normals @ normals.T > _HAIR_SAME_SIDE)
     mean = kernel * areas
     mean = mean / mean.sum(1, keepdim=True)
     scalp = scalp.to(prior.hair.device)

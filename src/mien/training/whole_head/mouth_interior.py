@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from mien.avatar.avatar import Avatar, Posed
 from mien.avatar.bound_surface import BoundSurface
-from mien.avatar.constants import AVATAR
+from mien.avatar.gaussian_avatars.surface import FILL_OPACITY
 from mien.face.head_parts import head_parts
 from mien.gaussians import sh_from_rgb
 from mien.training.footage.coverage import Coverage
@@ -22,7 +22,11 @@ from mien.training.footage.frames import cover_random
 from mien.training.footage.hidden import inside_triangles
 from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
 from mien.training.whole_head.completion import complete_colors
-from mien.training.whole_head.constants import WHOLE_HEAD
+
+_MOUTH_CLOSED_AT = 0.5
+"""Time at which an open surface inside the mouth is closed, as a fraction of the run. It is after the last opacity
+reset of the presets, from which surface that is hardly ever seen does not recover. Measured against the first step only
+(log, "Mouth")."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +40,8 @@ class Inside:
 
     def fill_interior(self, surface: BoundSurface, step: int, steps: int) -> None:
         """Close the surface where it is open, if this is a step of a run of `steps` at which this is due."""
-        if step == round(WHOLE_HEAD.mouth_closed_at * steps):
-            surface.fill_interior(self.triangles, AVATAR.fill_opacity, self.colors)
+        if step == round(_MOUTH_CLOSED_AT * steps):
+            surface.fill_interior(self.triangles, FILL_OPACITY, self.colors)
 
     def to(self, like: Tensor) -> "Inside":
         """The same on the device of `like`, with colours of its dtype."""

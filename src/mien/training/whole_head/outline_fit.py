@@ -26,8 +26,27 @@ from mien.machine.threads import one_torch_thread
 from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings
-from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import fills_sides
+
+_OUTLINE_FRAMES = 48  # largest number of frames whose outlines are looked at
+_OUTLINE_FRAMES_AT_ONCE = 6  # number of frames in one round of the descent
+_OUTLINE_ROUNDS = 160  # number of rounds. Measured: 240 leave as much of the mesh outside (log, 11-26)
+_OUTLINE_RATE = 0.0012  # first step of the descent in metres. It falls to 0. Chosen with the number of rounds
+_OUTLINE_FREE = 1.0  # distance in pixels from the matte up to which a vertex counts as inside
+_OUTLINE_ROBUST = 0.003  # distance in metres beyond which the pull on a vertex grows no more
+_OUTLINE_REACH = 0.014  # distance in metres over which the mesh moves together (standard deviation of a Gaussian)
+_OUTLINE_SPACING = 0.012  # distance in metres between the points that are moved
+_OUTLINE_SHIFT_WEIGHT = 0.5
+"""Weight of the mean square of all shifts in metres, against the mean pull. It makes the smallest change win. Measured:
+2 leaves 0.2 to 0.5 % of the mesh outside on s18, d14 and d6, 0.5 leaves 0.1 to 0.3 %, 0.1 leaves 0.02 to 0.1 % and
+moves an ear by 12 mm (log, 11-26)."""
+_OUTLINE_BEND_WEIGHT = 4.0
+"""Weight of the mean square of how far a point of the scalp moves from what is around it, in metres. Measured on s18,
+where a crown of 12 mm was cut flat: 2 leaves it a little flat, 8 leaves 0.05 instead of 0.01 % of the mesh outside. The
+other six clips do not change (log, 11-27)."""
+_OUTLINE_SCALP_REACH = 0.04
+"""Distance in metres over which points of the scalp count as around each other (standard deviation of a Gaussian)."""
+_OUTLINE_SCALP_HELD = 0.1  # share of `outline_shift_weight` that holds the scalp
 
 _FIRST, _SECOND = 0.8, 0.95
 """Decay of the running means of the gradient and of its square (Adam; Kingma and Ba 2015)."""
@@ -54,8 +73,8 @@ class _View:
         # What the picture cuts off may be anywhere.
         framed = (grid.detach().abs() < 1).all(-1) & (depth.detach() > 0)
         distance = grid_sample(self.outside, grid[None, None], padding_mode="border", align_corners=False)[0, 0, 0]
-        metres = (distance - WHOLE_HEAD.outline_free).clamp_min(0) * framed * depth.detach() / self.camera.K[0, 0]
-        return (metres.square() / (metres + WHOLE_HEAD.outline_robust)).mean()
+        metres = (distance - _OUTLINE_FREE).clamp_min(0) * framed * depth.detach() / self.camera.K[0, 0]
+        return (metres.square() / (metres + _OUTLINE_ROBUST)).mean()
 
 
 def fitted_faces(
@@ -96,8 +115,8 @@ def fit_to_outlines(
     given = faces[0].vertex_offsets
     start = torch.zeros_like(face_model.template) if given is None else given.detach()
     rest = face_model.rest_vertices(faces[0]).detach()
-    chosen = spread_points(rest, WHOLE_HEAD.outline_spacing)
-    weights = smooth_weights(rest, rest[chosen], WHOLE_HEAD.outline_reach)
+    chosen = spread_points(rest, _OUTLINE_SPACING)
+    weights = smooth_weights(rest, rest[chosen], _OUTLINE_REACH)
     scalp = _Scalp.of(face_model, rest, chosen)
     outer = _outer_vertices(face_model)
     own = weights[outer]
@@ -112,20 +131,20 @@ def fit_to_outlines(
         return bool((sequences[frame.sequence].capture.mattes[frame[1:]] >= _OPAQUE).any())
 
     # Without an opaque pixel, all distances are infinite.
-    looked = [frame for frame in spread_frames(frames, WHOLE_HEAD.outline_frames) if shows_person(frame)]
+    looked = [frame for frame in spread_frames(frames, _OUTLINE_FRAMES) if shows_person(frame)]
     views = list(stream_in_threads(view, looked, threads))
-    rounds = WHOLE_HEAD.outline_rounds if views else 0
+    rounds = _OUTLINE_ROUNDS if views else 0
     shifts, first, second = (torch.zeros(weights.shape[1], 3) for _ in range(3))
     random = torch.Generator().manual_seed(0)
     for number in range(1, rounds + 1):
-        drawn = torch.randperm(len(views), generator=random)[: WHOLE_HEAD.outline_frames_at_once].tolist()
+        drawn = torch.randperm(len(views), generator=random)[:_OUTLINE_FRAMES_AT_ONCE].tolist()
         shifts = shifts.detach().requires_grad_()
         moved = own @ shifts
         pulls = torch.stack([views[one].pull(moved) for one in drawn])
         (gradient,) = torch.autograd.grad(scalp.cost(shifts) + pulls.mean(), shifts)
         first, second = torch.lerp(gradient, first, _FIRST), torch.lerp(gradient.square(), second, _SECOND)
         scale = (second / (1 - _SECOND**number)).sqrt() + 1e-12
-        rate = WHOLE_HEAD.outline_rate * (1 - number / rounds) / (1 - _FIRST**number)
+        rate = _OUTLINE_RATE * (1 - number / rounds) / (1 - _FIRST**number)
         shifts = shifts.detach() - rate * first / scale
     return start + weights @ shifts
 
@@ -145,16 +164,16 @@ class _Scalp:
         inside = torch.ones(len(vertices), dtype=torch.bool)
         inside[face_model.faces[~head_parts(face_model).scalp].long().flatten()] = False
         points = vertices[chosen]
-        around = _gaussians(points, points, WHOLE_HEAD.outline_scalp_reach).fill_diagonal_(0)
+        around = _gaussians(points, points, _OUTLINE_SCALP_REACH).fill_diagonal_(0)
         return _Scalp(inside[chosen].to(vertices), around / around.sum(1, keepdim=True))
 
     def cost(self, shifts: Float[Tensor, "a 3"]) -> Float[Tensor, ""]:
         """The cost of shifts in metres. The scalp follows what is around it, and does not pull at it."""
         near = torch.where(self.inside[:, None] > 0, shifts, shifts.detach())
         bent = (self.inside * (shifts - self.around @ near).square().sum(1)).mean()
-        held = 1 - (1 - WHOLE_HEAD.outline_scalp_held) * self.inside
+        held = 1 - (1 - _OUTLINE_SCALP_HELD) * self.inside
         moved = (held * shifts.square().sum(1)).mean()
-        return WHOLE_HEAD.outline_shift_weight * moved + WHOLE_HEAD.outline_bend_weight * bent
+        return _OUTLINE_SHIFT_WEIGHT * moved + _OUTLINE_BEND_WEIGHT * bent
 
 
 def spread_points(vertices: Float[Tensor, "v 3"], spacing: float) -> list[int]:

@@ -14,11 +14,12 @@ from mien.training.footage.filmed import with_shown_angles
 from mien.training.footage.frames import resolved, side_random
 from mien.training.parts import Preparation, Step, TrainingPart
 from mien.training.settings import TrainSettings
-from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.contribution import prune_hidden
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.side_views import SideView, SideViews, side_views_of
 from mien.training.whole_head.unseen import Unseen, fills_sides, moved, spare_fills, unseen_of
+
+_HAIR_EVERY = 8  # number of training frames from one correction of the hair's surface to the next
 
 
 class WholeHead:
@@ -92,7 +93,7 @@ class WholeHead:
             self._surface.keep_to(self.unseen.prior)
 
     def _after_step(self, step: Step) -> None:
-        hair, surface = self.hair if step.reaches(WHOLE_HEAD.hair_every) else None, self._surface
+        hair, surface = self.hair if step.reaches(_HAIR_EVERY) else None, self._surface
         if hair and surface and hair.correct(surface, step.fraction_done, step.settings.hair_rate):
             self.follow_hair()
         self._prune_hidden(step)

@@ -11,7 +11,23 @@ from mien.avatar.avatar import Avatar
 from mien.gaussians import world_means
 from mien.runtime.baked import PortableAvatar
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
-from mien.training.whole_head.constants import WHOLE_HEAD
+
+SOFT_CUT_WIDTH = 0.03
+"""Distance from the neck cut over which opacity fades where a head is shown, in metres. 2 to 4 cm were looked at on
+four clips; with 2 cm, the end of a bare neck is tufted."""
+_SOFT_CUT_POWER = 1.5
+"""Power of the fading share. Gaussians lie over each other, and together hide more than each alone: with 1, the end of
+the neck is jagged over dark backgrounds; with 3, half of the neck goes. Looked at on seven clips."""
+SOFT_CUT_OFF_SKIN = (0.005, 0.012)
+"""Distances from the mesh up to which nothing stands off the skin, and from which on what does so is not shown just
+above the cut, in metres. With 3 to 8 mm, necks themselves thin out. Looked at on seven clips."""
+SOFT_CUT_COLLAR = (0.025, 0.05)
+"""Heights above the cut below which what stands off the skin goes, and from which on it stays, in metres. With 5 to 8
+cm, long hair (d3, s18) is bitten off beside the neck."""
+SOFT_CUT_HEAD = (0.008, 0.02)
+"""Distances from the vertices of the head without its neck up to which nothing is cut off, and from which on the cut
+counts alone, in metres. A chin may reach below the cut. Set by eye."""
+SOFT_CUT_LEAST = 1e-4  # least opacity after the soft cut
 
 _PART = 4096
 """Gaussians whose distances are computed at once."""
@@ -35,7 +51,7 @@ def with_soft_cut(portable: PortableAvatar, avatar: Avatar) -> PortableAvatar:
         return portable
     shares = shares_left(avatar).double().cpu().numpy()
     opacities = shares / (1 + np.exp(-attributes.opacity_logits.astype(np.float64)))
-    opacities = opacities.clip(WHOLE_HEAD.soft_cut_least, 1 - WHOLE_HEAD.soft_cut_least)
+    opacities = opacities.clip(SOFT_CUT_LEAST, 1 - SOFT_CUT_LEAST)
     logits = np.log(opacities / (1 - opacities)).astype(np.float32)
     kept = np.where(shares < 1, logits, attributes.opacity_logits)
     return replace(portable, baked=replace(portable.baked, attributes=replace(attributes, opacity_logits=kept)))
@@ -70,13 +86,13 @@ def opacity_shares(
         head: Vertices of the head without its neck, in the world. What is close to them is not cut off.
         skin: Points of the mesh, in the world.
     """
-    shares = _smoothstep(cut.margins(centers) / WHOLE_HEAD.soft_cut_width) ** WHOLE_HEAD.soft_cut_power
-    low, high = WHOLE_HEAD.soft_cut_collar
+    shares = _smoothstep(cut.margins(centers) / SOFT_CUT_WIDTH) ** _SOFT_CUT_POWER
+    low, high = SOFT_CUT_COLLAR
     above = _smoothstep((cut.heights(centers) - low) / (high - low))
     near = (shares < 1) | (above < 1)  # distances take time, and most Gaussians are far above
-    close, off = WHOLE_HEAD.soft_cut_off_skin
+    close, off = SOFT_CUT_OFF_SKIN
     on_skin = _smoothstep((off - _distances(centers[near], skin)) / (off - close))
-    first, last = WHOLE_HEAD.soft_cut_head
+    first, last = SOFT_CUT_HEAD
     on_head = _smoothstep((last - _distances(centers[near], head)) / (last - first))
     shares[near] = torch.maximum(shares[near] * torch.maximum(on_skin, above[near]), on_head)
     return shares

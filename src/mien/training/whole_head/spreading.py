@@ -7,7 +7,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.face.mirror import triangle_geometry
-from mien.training.whole_head.constants import WHOLE_HEAD
+
+_SPREAD_NEAREST = 24  # number of known triangles that a value spreads from before it is smoothed
+_SPREAD_SOFTNESS = 0.004  # distance in metres within which known triangles count alike
+_SPREAD_OWN = 0.7  # knowledge (0..1) from which smoothing begins with a triangle's own value
+_SPREAD_ROUNDS = 80  # number of times that values are averaged over neighbours
+_SPREAD_HOLD = 4.0  # weight of a known value against the mean of its neighbours while values spread
 
 _CHUNK = 512
 
@@ -42,15 +47,15 @@ class Surface:
         if not len(sources):
             return values
         begun = values.clone()
-        targets = (among & (known < WHOLE_HEAD.spread_own)).nonzero()[:, 0]
+        targets = (among & (known < _SPREAD_OWN)).nonzero()[:, 0]
         for part in targets.split(_CHUNK):
             distance, index = torch.cdist(self.middles[part], self.middles[sources]).topk(
-                min(WHOLE_HEAD.spread_nearest, len(sources)), largest=False
+                min(_SPREAD_NEAREST, len(sources)), largest=False
             )
-            weight = known[sources[index]] / (distance**2 + WHOLE_HEAD.spread_softness**2)
+            weight = known[sources[index]] / (distance**2 + _SPREAD_SOFTNESS**2)
             begun[part] = (weight[..., None] * values[sources[index]]).sum(1) / weight.sum(1, keepdim=True)
-        held, inside = WHOLE_HEAD.spread_hold * (known * among)[:, None], among.to(values)
+        held, inside = _SPREAD_HOLD * (known * among)[:, None], among.to(values)
         smooth = begun
-        for _ in range(WHOLE_HEAD.spread_rounds):
+        for _ in range(_SPREAD_ROUNDS):
             smooth = (held * values + self.around(smooth, inside)) / (held + 1)
         return torch.where(among[:, None], smooth, values)

@@ -34,9 +34,37 @@ from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.completion import complete_colors, vertex_means
-from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
 from mien.training.whole_head.spreading import Surface
+
+UNSEEN_CONFIDENCE = 0.02
+"""Confidence below which a triangle is made up. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to 90
+degrees; 0.02 was chosen between them (11-23)."""
+_OUTLINE_BAND = 0.025
+"""Distance in metres from what pictures show up to which unseen triangles are trained. Hair above them is on the
+outline. Measured (1,600 steps): without a band, the heads of d3, d9 and wojtek have 0.7, 0.3 and 0.1 dB less; with 50
+mm, or with no fills at all, d3 has 0.1 dB more (log, 11-26)."""
+_HEIGHT_FRAMES = 48
+"""Largest number of frames in which the mesh is drawn as high as its hair, to find what they show of hair."""
+_MOUTH_FRAMES = 240  # number of frames in which the inside of the mouth is looked for
+_MOUTH_SHOWN_SHARE = 0.02  # share of these frames that have to show a triangle of it
+_MOVING_WIDENING = 3.0
+"""Factor on the limits to the surface at regions that move most, and inside the mouth. The tracked mesh is millimetres
+off there, and its folds are not those of the skin. Measured on wojtek (256 px, 11-23): 2.5 and 3 have the same mouth, 4
+has 0.15 dB more there, and 0.1 dB less in all."""
+_MOVING_NEAR = (0.008, 0.024)
+"""Distances in metres from these regions between which the factor falls to 1. Measured on wojtek (256 px, 11-23): the
+mouth has 0.25 dB more than with a factor in the regions alone."""
+_STRANDS_LEAST_HEIGHT = 0.003  # height of hair in metres from which made-up hair has strands
+_FILL_CONTRADICTION = 1e-6
+"""Gradient of a centre, in triangle units, from which pictures contradict the height of a fill. A little light shines
+through every avatar, so smaller gradients reach what is hidden. Chosen instead of 3e-6 together with other changes
+(11-23) alone."""
+_FILL_ALPHA_WEIGHT = 1.0
+"""Least weight of the loss of alpha. Without it, white Gaussians hide fills that stand out beyond the outline, and
+white shines through hair. Measured on wojtek's head, 12,000 steps over white: 0.2, 0.5 and 1 have 30.3 to 30.4 dB over
+white, and 26.4, 27.9 and 28.7 over dark blue. Growth at half the gradient, used with 1 alone, is 0.3 of it at most
+(log, 11-28)."""
 
 _MOVING = ("lips", "eyelids", "eyes", "irises")
 """Regions that move most."""
@@ -59,7 +87,7 @@ class Unseen:
         """The weights of the losses, with a loss of alpha if anything is filled."""
         if not self.fills:
             return weights
-        return replace(weights, alpha_weight=max(weights.alpha_weight, WHOLE_HEAD.fill_alpha_weight))
+        return replace(weights, alpha_weight=max(weights.alpha_weight, _FILL_ALPHA_WEIGHT))
 
     def filled_in(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
@@ -79,7 +107,7 @@ class Unseen:
         gradients += [rows for own in factored for rows, _ in own.terms]
         # The second axis of a triangle's frame is its normal.
         places = store["means"].grad
-        strong = None if places is None else softshrink(places[:, 1], WHOLE_HEAD.fill_contradiction)
+        strong = None if places is None else softshrink(places[:, 1], _FILL_CONTRADICTION)
         clear_rows(filled_in, gradients)
         if places is not None and strong is not None:
             places[:, 1] = torch.where(filled_in, strong, places[:, 1])
@@ -130,7 +158,7 @@ def unseen_of(
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
     if avatar.surface() is None:
         return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
-    filled_in = (shown < WHOLE_HEAD.unseen_confidence) & (found.above > 0.5)
+    filled_in = (shown < UNSEEN_CONFIDENCE) & (found.above > 0.5)
     outside = (found.above > 0.5) & ~parts.interior
     behind_head = back_hair(model, neutral, hair, hanging)
     drawn = drawn_at_height(model, torch.maximum(hair, behind_head), sequences, faces, frames)
@@ -140,7 +168,7 @@ def unseen_of(
     behind = filled_in & (behind_head > hair)
     colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
     hair, hanging = torch.where(behind, behind_head, hair), torch.maximum(hanging, behind_head)
-    strands = filled_in & (parts.scalp | behind) & (hair > WHOLE_HEAD.strands_least_height)
+    strands = filled_in & (parts.scalp | behind) & (hair > _STRANDS_LEAST_HEIGHT)
     return Unseen(
         found, SurfacePrior(hair, hanging, colors, doubt, filled_in, filled_in | parts.interior, strands, widening)
     )
@@ -174,7 +202,7 @@ def drawn_at_height(
         return drawn
 
     result = torch.zeros(len(face_model.faces), dtype=torch.bool)
-    for drawn in stream_in_threads(drawn_in, spread_frames(frames, WHOLE_HEAD.height_frames)):
+    for drawn in stream_in_threads(drawn_in, spread_frames(frames, _HEIGHT_FRAMES)):
         result |= drawn
     return result
 
@@ -193,7 +221,7 @@ def beside_shown(
         return torch.zeros_like(shown)
     middles = vertices[face_model.faces.long()].mean(1)
     apart = torch.cdist(middles, middles[shown], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
-    return apart < WHOLE_HEAD.outline_band
+    return apart < _OUTLINE_BAND
 
 
 def _hair_colors(
@@ -219,11 +247,11 @@ def wider_where_faces_move(
     """
     middles, moving = vertices[face_model.faces.long()].mean(1), face_model.region_mask(*_MOVING)
     if not bool(moving.any()):
-        return torch.where(interior, WHOLE_HEAD.moving_widening, 1.0)
+        return torch.where(interior, _MOVING_WIDENING, 1.0)
     distances = torch.cdist(middles, middles[moving], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
-    close, far = WHOLE_HEAD.moving_near
+    close, far = _MOVING_NEAR
     near = smoothstep((far - distances) / (far - close))
-    return 1 + (WHOLE_HEAD.moving_widening - 1) * torch.where(interior, 1.0, near)
+    return 1 + (_MOVING_WIDENING - 1) * torch.where(interior, 1.0, near)
 
 
 def hidden_inside(
@@ -240,11 +268,11 @@ def hidden_inside(
         camera = sequences[frame.sequence].tracking.cameras[frame.camera]
         return interior & ~hidden_triangles(vertices, face_model, interior, camera)
 
-    looked = spread_frames(frames, WHOLE_HEAD.mouth_frames)
+    looked = spread_frames(frames, _MOUTH_FRAMES)
     sights = torch.zeros(len(interior))
     for shown in stream_in_threads(shown_in, looked):
         sights += shown
-    return interior & (sights < WHOLE_HEAD.mouth_shown_share * len(looked))
+    return interior & (sights < _MOUTH_SHOWN_SHARE * len(looked))
 
 
 def moved(unseen: Unseen, like: Tensor) -> Unseen:
