@@ -217,11 +217,7 @@ def _for_all_rows(name: str, rest: list[str]) -> tuple[list[str], dict[str, list
 
 
 def _check_instruction_set() -> None:
-    """Check that this machine has the instruction set that MIEN_ISA asks for.
-
-    Raises:
-        UserError: it does not.
-    """
+    """Check that this machine has the instruction set that MIEN_ISA asks for."""
     from mien import _native
 
     try:

@@ -39,44 +39,28 @@ def is_plain_name(name: object) -> bool:
 
 
 def inside(folder: Path, name: object) -> Path:
-    """The path of `name` in a folder.
-
-    Raises:
-        UserError: `name` is not a plain name, so it may lead out of the folder.
-    """
+    """The path of `name` in a folder."""
     if not is_plain_name(name):
         raise UserError(f"{folder}: {name!r:.100} cannot be the name of a file or folder in it; give a plain name")
     return folder / str(name)
 
 
 def check_unlinked(*paths: Path) -> None:
-    """Check that no path is a link. Paths may be missing.
-
-    Raises:
-        UserError: one is.
-    """
+    """Check that no path is a link. Paths may be missing."""
     for path in paths:
         if path.is_symlink():
             raise UserError(_refusal(path, True))
 
 
 def check_tree(folder: Path) -> None:
-    """Check that only files and folders are below a folder. The folder itself may be a link, or missing.
-
-    Raises:
-        UserError: something below is a link, a pipe, a device or a socket, or cannot be checked.
-    """
+    """Check that only files and folders are below a folder. The folder itself may be a link, or missing."""
     for entry in _entries(folder):
         if not entry.is_file(follow_symlinks=False):
             raise UserError(_refusal(Path(entry.path), entry.is_symlink()))
 
 
 def check_subtrees(folder: Path, *names: str) -> None:
-    """Run `check_tree` on some entries of a folder. The entries may be missing, but must not be links themselves.
-
-    Raises:
-        UserError: an entry is not a folder, or something below it is not a file or folder.
-    """
+    """Run `check_tree` on some entries of a folder. The entries may be missing, but must not be links themselves."""
     for name in names:
         path = folder / name
         if path.is_symlink() or (path.exists() and not path.is_dir()):

@@ -31,10 +31,6 @@ def plugin(group: str, name: str, kind: type[_T]) -> _T | None:
         group: Group of entry points, such as "mien.formats".
         name: Name of the entry point.
         kind: Class of the object that the entry point names.
-
-    Raises:
-        UserError: the entry point cannot be imported, or is something else, or two packages use the name. It names the
-            package.
     """
     loaded = _loaded(group, name, kind)
     if isinstance(loaded, UserError):

@@ -95,9 +95,6 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
         settings: A dataclass.
         option: Turns the dotted name of a field into the option that sets it: `density.rounds` ->
             "--method.density.rounds".
-
-    Raises:
-        UserError: a value is out of range. The message names the first such option, its value and the range.
     """
     hints = get_type_hints(type(settings), include_extras=True)
     for field in fields(settings):
@@ -118,11 +115,7 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
 
 
 def check_range(value: Any, allowed: Range, option: str) -> None:
-    """Check one value.
-
-    Raises:
-        UserError: it is out of range. The message names `option`, the value and the range.
-    """
+    """Check one value."""
     if not allowed.holds(value):
         asked = allowed.asked("numbers" if isinstance(value, tuple) else "a number")
         raise UserError(f"{option} {shown(value)}: give {asked}")

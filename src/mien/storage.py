@@ -44,9 +44,5 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def read_tensors(path: Path, stage: str = "the stage that writes it", remedy: str | None = None) -> dict[str, Tensor]:
-    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or else name `stage`.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or else name `stage`."""
     return read_safetensors(path, safetensors.torch.load_file, stage, remedy)

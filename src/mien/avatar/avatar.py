@@ -163,11 +163,7 @@ class Avatar(nn.Module, ABC):
 
     @abstractmethod
     def bake(self) -> BakedAvatar:
-        """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines.
-
-        Raises:
-            UserError: there is no such record (`Extras.unbaked`).
-        """
+        """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines."""
 
     @final
     def surface(self) -> BoundSurface | None:

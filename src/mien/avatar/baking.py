@@ -53,9 +53,6 @@ def make_portable(avatar: Avatar, camera: Camera, name: str, to_share: bool = Tr
         camera: A good first view, such as the one that the avatar was trained with.
         name: The subject's name.
         to_share: Whether the result leaves this machine, as a file does.
-
-    Raises:
-        UserError: it is to be shared, and the licence of its face model does not allow passing it on.
     """
     model, subject = avatar.face_model, avatar.subject
     if to_share and not model.shareable:

@@ -128,11 +128,7 @@ def _filmed(tensors: dict[str, Tensor], avatar: Avatar, folder: Path) -> Filmed 
 
 @torch.no_grad()
 def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: Path) -> None:
-    """Replace every tensor of an avatar. The number of Gaussians may change.
-
-    Raises:
-        UserError: `state`, which was read from `source`, does not belong to this method and config, or cannot be posed.
-    """
+    """Replace every tensor of an avatar. The number of Gaussians may change."""
     misfit = _misfit(avatar.state_dict(), state, gaussians)
     if misfit is not None:
         raise UserError(f"{source}: does not fit its settings ({misfit}); train it again")

@@ -109,11 +109,7 @@ def has_method(name: str) -> bool:
 
 
 def method_named(name: str) -> Method:
-    """The method of a name. Other packages are asked only if it is none of mien's own.
-
-    Raises:
-        UserError: there is no method of that name, or that of another package cannot be imported.
-    """
+    """The method of a name. Other packages are asked only if it is none of mien's own."""
     method = METHODS.get(name) or plugin(_GROUP, name, Method)
     if method is None:
         names = ", ".join(method_names())

@@ -216,9 +216,5 @@ class MethodConfig:
 
     @final
     def check(self) -> None:
-        """Check that all numbers are in their ranges.
-
-        Raises:
-            UserError: a number is out of range. The message names the first such option, its value and the range.
-        """
+        """Check that all numbers are in their ranges."""
         check_ranges(self, lambda name: f"--method.{name.replace('_', '-')}")

@@ -20,11 +20,7 @@ from mien.machine.terminal import counted
 
 
 def shard_of(rows: Sequence[Row], text: str) -> list[Row]:
-    """The rows of shard I of N, with I from 1: every N-th row.
-
-    Raises:
-        UserError: the text is not I/N.
-    """
+    """The rows of shard I of N, with I from 1: every N-th row."""
     first, _, last = text.partition("/")
     if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
         raise UserError(f"--shard {text}: give I/N with I from 1 to N, such as 3/20")

@@ -91,11 +91,7 @@ class Batch:
         return self.place("rows", name)
 
     def place(self, *names: str) -> Path:
-        """The path of a folder of the batch, or of something in it. Somebody else may have filled it.
-
-        Raises:
-            UserError: the name leads out of the folder, or the folder or what is there is a link.
-        """
+        """The path of a folder of the batch, or of something in it. Somebody else may have filled it."""
         path = self.root
         for name in names:
             path = inside(path, name)
@@ -103,11 +99,7 @@ class Batch:
         return path
 
     def read_plan(self) -> list[Row]:
-        """The rows.
-
-        Raises:
-            UserError: there is no plan, or it is damaged.
-        """
+        """The rows."""
         path = self.root / "plan.json"
         try:
             content = parse_json(read_bytes(path, _MAX_PLAN_BYTES).decode())

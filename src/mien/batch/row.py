@@ -54,9 +54,6 @@ def run_row(batch: Batch, row: Row, do: Do, patience: float = 0.0) -> State | No
         row: The row.
         do: Runs its steps.
         patience: Seconds to wait for the claim.
-
-    Raises:
-        KeyboardInterrupt, SystemExit: the process is to stop. The row then counts as interrupted.
     """
     until = time.monotonic() + patience
     while True:

@@ -24,11 +24,7 @@ def is_url(word: str) -> bool:
 
 
 def store_of(url: str) -> tuple[Any, str]:
-    """The file system of a URL, and the path in it.
-
-    Raises:
-        UserError: nothing that is installed can read such a URL.
-    """
+    """The file system of a URL, and the path in it."""
     import fsspec  # pyright: ignore[reportMissingImports]
 
     try:

@@ -36,11 +36,7 @@ def stamp_cache(layout: FrameLayout, capture_hash: str) -> None:
 
 
 def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return memory maps of all frames [t, c, h, w, 3] and mattes [t, c, h, w]. A stale cache is rebuilt first.
-
-    Raises:
-        UserError: a frame or matte is missing or damaged.
-    """
+    """Return memory maps of all frames [t, c, h, w, 3] and mattes [t, c, h, w]. A stale cache is rebuilt first."""
     _check_present(layout)
     found = layout if _is_valid(layout, capture_hash) else _rebuild(layout, capture_hash, digests)
     images, mattes = (map_pictures(found.raw(kind), found.shape(kind)) for kind in (FRAMES, MATTES))
@@ -131,11 +127,7 @@ def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
 
 
 def _read_first(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
-    """Check the first frame and matte, so that a wrong size in `capture.json` fails before disk space is allocated.
-
-    Raises:
-        UserError: the first frame or matte is damaged or of another size.
-    """
+    """Check the first frame and matte, so that a wrong size in `capture.json` fails before disk space is allocated."""
     for kind in (FRAMES, MATTES):
         read_png(layout.png(kind, 0, 0), layout.shape(kind)[2:], int(digests[kind][0, 0]))
 

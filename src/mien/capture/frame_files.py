@@ -161,11 +161,7 @@ def picture_digest(picture: UInt8[np.ndarray, "..."]) -> int:
 
 
 def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[np.ndarray, "..."]:
-    """Read one picture and check its pixels.
-
-    Raises:
-        UserError: it is missing, damaged, or not what was written.
-    """
+    """Read one picture and check its pixels."""
     picture = decode_png(path, shape, REMEDY)
     if picture_digest(picture) != expected_digest:
         raise UserError(f"{path}: its pixels have changed since it was captured; {REMEDY}")

@@ -89,10 +89,6 @@ def capture_cameras(
         settings: settings of the capture. Mattes, landmarks and clean plates are folders with a file or folder for each
             camera, named by its id. Cuts are not searched.
         replace_others: whether a capture of other sources may be replaced.
-
-    Raises:
-        UserError: the calibration is damaged or does not fit the videos, their lengths or rates differ, no face is
-            seen, or a folder cannot be written, is damaged or being written.
     """
     settings = settings or CaptureSettings()
     cameras = read_calibration(calibration)
@@ -129,11 +125,7 @@ def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, r
 
 
 def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
-    """Check the first picture of a camera, before faces are searched in any.
-
-    Raises:
-        UserError: the video has no frame after the camera's offset, or pictures of another shape.
-    """
+    """Check the first picture of a camera, before faces are searched in any."""
     if camera.offset and camera.offset >= job.frames.count():
         raise UserError(
             f"camera {camera.camera_id}: its offset of {camera.offset} leaves no frame of {job.frames.path}; give the "
@@ -147,9 +139,6 @@ def _check_lengths(jobs: list[CaptureJob], cameras: list[CalibratedCamera]) -> N
     """Check the numbers of frames before faces are searched, without decoding any.
 
     Times decide which frames are taken if there is a --capture.start or --capture.end; the survey finds those.
-
-    Raises:
-        UserError: the numbers differ.
     """
     selections = [job.frames.selection for job in jobs]
     if any(selection.start or selection.end for selection in selections):
@@ -200,11 +189,7 @@ def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, 
 
 
 def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
-    """Find the faces in all videos.
-
-    Raises:
-        UserError: pictures do not fit their camera, or numbers of frames differ.
-    """
+    """Find the faces in all videos."""
     views = []
     for job, camera in zip(jobs, cameras, strict=True):
         landmarks = read_given(job.settings, job.frames).landmarks

@@ -130,9 +130,6 @@ def capture_video_parts(
 
     Returns:
         The captures in the video's order. The `name` of each is the name of its folder.
-
-    Raises:
-        UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
     """
     job = open_job(source, settings or CaptureSettings(), name, replace)
     finished = _read_finished_parts(sequences, job, tell=False)
@@ -162,11 +159,7 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
 
 
 def _capture_one_person(sequences: Path, job: CaptureJob, parts: list[Part], given: GivenInputs) -> list[Part]:
-    """Capture the parts that show the person of the settings, and return them under their final names.
-
-    Raises:
-        UserError: the workspace's other captures show another person, or there is no such person.
-    """
+    """Capture the parts that show the person of the settings, and return them under their final names."""
     reel, drafts = Reel(job.frames), []
     for number, part in enumerate(parts, 1):
         out = _capture_dir(sequences, part.name)
@@ -208,11 +201,7 @@ def _kept(sequences: Path, job: CaptureJob, drafts: list[Draft]) -> list[Part]:
 
 
 def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> CaptureJob:
-    """Open a source and compute the key of its capture. Its frames are not read.
-
-    Raises:
-        UserError: a setting is not allowed, or a file is missing or damaged.
-    """
+    """Open a source and compute the key of its capture. Its frames are not read."""
     settings.check()
     selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
     turns = settings.turn // 90
@@ -265,11 +254,7 @@ def _read_finished_parts(sequences: Path, job: CaptureJob, tell: bool = True) ->
 
 
 def check_place(out: Path, job: CaptureJob) -> None:
-    """Refuse to replace anything but a capture of the same source, or of any source if the user allows it.
-
-    Raises:
-        UserError: the folder holds something else, or a capture of another source.
-    """
+    """Refuse to replace anything but a capture of the same source, or of any source if the user allows it."""
     try:
         check_replaceable(out)
     except OSError as error:

@@ -39,11 +39,7 @@ class Origin:
 def finish_part(
     layout: FrameLayout, out: Path, chunks: list[Chunk], part: Part, origin: Origin, scaffolding: tuple[str, ...]
 ) -> None:
-    """Write the files beside the frames, remove `scaffolding` (names in the folder) and rename the folder to `out`.
-
-    Raises:
-        UserError: no face was found in any frame.
-    """
+    """Write the files beside the frames, remove `scaffolding` (names in the folder) and rename the folder to `out`."""
     landmarks = np.concatenate([chunk.landmarks for chunk in chunks])
     valid = np.concatenate([chunk.valid for chunk in chunks])
     if not valid.any():

@@ -49,11 +49,7 @@ class Part:
 
 
 def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str) -> Part:
-    """Return the whole video as one part. Report its cuts, unless the settings turn that off.
-
-    Raises:
-        UserError: no face was found.
-    """
+    """Return the whole video as one part. Report its cuts, unless the settings turn that off."""
     for turn in survey.changes_of_shape():
         raise UserError(
             f"{path}: {_change_of_size(survey, turn)}; capture it with `mien capture`, which makes a part of each shape"
@@ -72,9 +68,6 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     """Return a part for each shot that is long enough and shows a face. A change of the picture's shape ends a shot.
 
     A single part is called `name`, several are called `name`-1, `name`-2, ...
-
-    Raises:
-        UserError: there is no such shot.
     """
     cuts = find_cuts(survey.thumbnails, survey.boxes) if settings.cuts else []
     turns = survey.changes_of_shape()
@@ -109,11 +102,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
 
 
 def check_one_size(survey: Survey, path: Path) -> None:
-    """Refuse a video whose pictures change their size, for what needs one size: given inputs, calibrated cameras.
-
-    Raises:
-        UserError: the size changes. The message names the second.
-    """
+    """Refuse a video whose pictures change their size, for what needs one size: given inputs, calibrated cameras."""
     changes = np.flatnonzero((survey.sizes[1:] != survey.sizes[:-1]).any(axis=1)) + 1
     if len(changes):
         raise UserError(

@@ -212,11 +212,7 @@ class PartProcessor:
 
 
 def _read(path: Path) -> Chunk:
-    """Read a chunk that an interrupted call saved.
-
-    Raises:
-        UserError: it is damaged, or no chunk.
-    """
+    """Read a chunk that an interrupted call saved."""
     arrays = read_arrays(path)
     with expect_whole(path, "delete its folder and run `mien capture` again"):
         t = len(arrays["landmarks"])

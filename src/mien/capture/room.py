@@ -26,9 +26,6 @@ def check_room(layout: FrameLayout, name: str, out: Path) -> None:
         layout: the frames to come, in the folder for unfinished work.
         name: name of the sequence.
         out: the capture's folder, for the message.
-
-    Raises:
-        UserError: the volume has less room.
     """
     cameras, size = len(layout.camera_ids), f"{layout.width}x{layout.height}"
     what = f"{counted(layout.timesteps, 'frame')} of {size}" + (f" by {cameras} cameras" if cameras > 1 else "")

@@ -119,11 +119,7 @@ def _read_capture(path: Path) -> Capture:
 
 
 def read_capture_hash(path: Path) -> str:
-    """Return the hash over pixels, mattes, landmarks, times and cameras of a capture, without reading them.
-
-    Raises:
-        UserError: there is no capture, or one of another version.
-    """
+    """Return the hash over pixels, mattes, landmarks, times and cameras of a capture, without reading them."""
     return str(read_json(path / JSON_NAME, FORMAT, VERSION, STAGE).get("capture_hash"))
 
 
@@ -136,11 +132,7 @@ def partial_folder(path: Path) -> Path:
 
 
 def check_replaceable(path: Path) -> None:
-    """Refuse to overwrite anything but an empty folder or a capture.
-
-    Raises:
-        UserError: something else is there.
-    """
+    """Refuse to overwrite anything but an empty folder or a capture."""
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: is a file; choose a folder for the capture")
     foreign = sorted(entry.name for entry in path.iterdir() if entry.name not in _OWN_NAMES) if path.is_dir() else []

@@ -99,9 +99,6 @@ def read_table(path: Path, for_all: Mapping[str, Sequence[str]] | None = None) -
     Args:
         path: A csv, a json, or a folder of videos.
         for_all: Options of all rows, as `for_all_rows` returns them. A cell of the table goes first.
-
-    Raises:
-        UserError: the table cannot be read, or a row names a file that is missing, or options that do not exist.
     """
     entries = list(_entries(path))
     if not entries:

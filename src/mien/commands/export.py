@@ -297,11 +297,7 @@ class Command:
         return kind is not None and kind.reads_avatars and not self.workspace.is_dir()
 
     def _kind(self) -> Format:
-        """The format that is written.
-
-        Raises:
-            UserError: there is none of this name or ending, or name and ending do not go together.
-        """
+        """The format that is written."""
         if self.format is None:
             kind = format_of(self.out)
             if kind is None:

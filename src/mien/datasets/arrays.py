@@ -22,9 +22,6 @@ def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -
         axes: A letter for each axis of each array, such as "tyx3". Axes of one letter are equally long, and a digit is
             a length.
         sizes: Lengths that are known, by letter.
-
-    Raises:
-        UserError: the file is missing, damaged or too large, or an array is missing, is of another shape, or is empty.
     """
     try:
         arrays = read_npz(path, tuple(axes))[1]
@@ -47,11 +44,7 @@ def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Return the array of an .npy file of plain numbers.
-
-    Raises:
-        UserError: the file is damaged or too large, or holds anything but plain numbers.
-    """
+    """Return the array of an .npy file of plain numbers."""
     try:
         return parse_npy(read_bytes(path, _MAX_NPY_BYTES))
     except Exception as error:  # a damaged header may fail in any way
@@ -60,11 +53,7 @@ def read_npy(path: Path) -> np.ndarray:
 
 
 def read_some_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Return those of the named arrays of an .npz that it has, as float64, after a check of their numbers.
-
-    Raises:
-        UserError: the file is missing, damaged or too large, or holds NaN or large numbers.
-    """
+    """Return those of the named arrays of an .npz that it has, as float64, after a check of their numbers."""
     try:
         arrays = read_npz(path, names)[1]
     except Exception as error:  # a damaged archive may fail in any way

@@ -61,9 +61,6 @@ def with_coefficients(
         sequence: A sequence of one camera, with `expression` and `head_to_camera` among its foreign arrays.
         face_model: The face model `coefficients-N`, with as many coefficients as the sequence has.
         place: The place of the head (`head_place`). None finds it.
-
-    Raises:
-        UserError: the numbers differ, or the poses do not fit the landmarks.
     """
     capture, coefficients = sequence.capture, sequence.foreign["expression"]
     poses = sequence.foreign["head_to_camera"].astype(np.float64)

@@ -34,11 +34,7 @@ def sniff(path: Path) -> bytes:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """Read a json object. Its numbers may be NaN, because those that are used are checked by `numbers`.
-
-    Raises:
-        UserError: the file is missing, too large, no json, or no object.
-    """
+    """Read a json object. Its numbers may be NaN, because those that are used are checked by `numbers`."""
     try:
         content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"), constants=True)
     except FileNotFoundError:
@@ -52,11 +48,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def frames_of(path: Path, content: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the list `frames` of a json file.
-
-    Raises:
-        UserError: it is missing or empty, or an entry is no object.
-    """
+    """Return the list `frames` of a json file."""
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: has no list 'frames' with an entry for each frame; {REMEDY}")
@@ -74,9 +66,6 @@ def numbers(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int 
         content: The object.
         name: The entry's name.
         shape: Its shape. None stands for any length above 0, and () for a single number.
-
-    Raises:
-        UserError: it is missing, has another shape, or holds anything but finite numbers of moderate size.
     """
     if name not in content:
         raise UserError(f"{path}: has no {name!r}; {REMEDY}")
@@ -95,11 +84,7 @@ def numbers(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int 
 
 
 def rotation_part(path: Path, name: str, matrix: np.ndarray) -> np.ndarray:
-    """Return the matrix after a check that its first three columns and rows are orthonormal, up to a reflection.
-
-    Raises:
-        UserError: they are not.
-    """
+    """Return the matrix after a check that its first three columns and rows are orthonormal, up to a reflection."""
     rotation = matrix[:3, :3]
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3:
         raise UserError(f"{path}: the rotation in {name!r} is not orthonormal; {REMEDY}")
@@ -114,9 +99,6 @@ def inner(path: Path, root: Path, name: object, endings: Sequence[str] = ("",)) 
         root: The folder that the named file must be in.
         name: The name.
         endings: Endings that the name may lack; the first one whose file exists is added.
-
-    Raises:
-        UserError: the name is no text, leads out of the folder, also through a link, or the file is missing.
     """
     if not is_one_line(name) or not 0 < len(str(name)) <= _MAX_NAME or Path(str(name)).is_absolute():
         raise UserError(f"{path}: {str(name)[:_MAX_SHOWN]!r} is not the name of a file in the dataset; {REMEDY}")
@@ -129,11 +111,7 @@ def inner(path: Path, root: Path, name: object, endings: Sequence[str] = ("",)) 
 
 
 def is_file_inside(root: Path, place: Path) -> bool:
-    """Whether a file is there.
-
-    Raises:
-        UserError: it is outside of the folder `root`, perhaps through a link.
-    """
+    """Whether a file is there."""
     try:
         whole = place.resolve()
         if not whole.is_relative_to(root.resolve()):
@@ -152,11 +130,7 @@ def png_has_opacity(path: Path) -> bool:
 
 
 def check_file_inside(root: Path, place: Path) -> None:
-    """Check that a file is there.
-
-    Raises:
-        UserError: it is missing, or outside of the folder `root`, perhaps through a link.
-    """
+    """Check that a file is there."""
     if not is_file_inside(root, place):
         raise UserError(f"{place}: is missing, or no file; {REMEDY}")
 

@@ -28,9 +28,6 @@ def needed_flame(path: Path, face_model: FaceModel | None, version: str) -> Face
         path: The dataset, for messages.
         face_model: The face model, or None.
         version: The version of FLAME that the dataset's tracking belongs to.
-
-    Raises:
-        UserError: none was named, or it is not in FLAME's schema.
     """
     if face_model is None:
         raise UserError(
@@ -52,9 +49,6 @@ def face_of_flame(path: Path, face_model: FaceModel, arrays: Mapping[str, np.nda
         path: The dataset, for messages.
         face_model: A face model in FLAME's schema.
         arrays: `shape` [n] and `expr` [t, e], and perhaps others (`mien.export.face_of_flame_params`).
-
-    Raises:
-        UserError: an array has another shape, or belongs to another model.
     """
     t = len(arrays["expr"])
     rest = {name: np.zeros((t, 3)) for name in ("rotation", "translation", "neck_pose", "jaw_pose")}

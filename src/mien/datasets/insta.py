@@ -172,9 +172,6 @@ def scaled_to_pictures(
         K: Intrinsics for the pictures that were tracked.
         tracked: Width and height of these pictures. None stands for `size`.
         size: Width and height of the pictures.
-
-    Raises:
-        UserError: the factor is no whole number, or not that of the other side.
     """
     import numpy as np
 

@@ -60,20 +60,12 @@ class TrackerFrames:
 
 
 def read_tracker_camera(paths: Sequence[Path]) -> TrackerCamera:
-    """Read the camera of a sequence's checkpoints.
-
-    Raises:
-        UserError: as for `read_tracker_frames`.
-    """
+    """Read the camera of a sequence's checkpoints."""
     return _camera(paths[0].parent, _read_arrays(paths))
 
 
 def read_tracker_frames(paths: Sequence[Path], face_model: FaceModel) -> TrackerFrames:
-    """Read the checkpoints of a sequence, in order.
-
-    Raises:
-        UserError: one is damaged or has impossible numbers, or the focal length or the size of the pictures changes.
-    """
+    """Read the checkpoints of a sequence, in order."""
     place, arrays = paths[0].parent, _read_arrays(paths)
     camera = _camera(place, arrays)
     eyes = matrices_from_rows_6d(arrays["flame.eyes"][:, 0].reshape(-1, 2, 6))

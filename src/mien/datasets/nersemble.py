@@ -68,9 +68,6 @@ def read_cameras(file: Path, size: tuple[int, int]) -> "dict[str, Camera]":
 
     World-to-camera matrices are OpenCV's, in metres. Intrinsics are one matrix for all cameras, or one for each. Files
     that `mien export` wrote name the `image_size` that they are for; for others it is found by the principal point.
-
-    Raises:
-        UserError: the file is damaged, or a camera is impossible.
     """
     import numpy as np
 
@@ -158,11 +155,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
 
 
 def _corrections(path: Path, serials: tuple[str, ...]) -> "dict[str, np.ndarray]":
-    """Return the corrections of these cameras.
-
-    Raises:
-        UserError: one is missing, or is no matrix of a polynomial that mien knows.
-    """
+    """Return the corrections of these cameras."""
     from mien.media.color_correction import color_correction
 
     file = _color_calibration(path)

@@ -72,9 +72,6 @@ def flame_from_benchmark(file: Path) -> "tuple[dict[str, np.ndarray], np.ndarray
     """Read a tracking: FLAME's arrays with the root at rest, then rotations, translations and scale of the model.
 
     Rotations are those of `rotation_matrices`. The Euler angles of `rotation` must say the same.
-
-    Raises:
-        UserError: the file is damaged, or its two forms of rotations differ.
     """
     import numpy as np
 

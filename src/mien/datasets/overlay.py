@@ -76,11 +76,7 @@ def measure_overlay(sequence: TrackedSequence) -> Overlay:
 
 
 def check_overlay(path: Path, sequence: TrackedSequence, version: str) -> TrackedSequence:
-    """Return the sequence, after a check that its tracking fits its pictures, and its face model its tracking.
-
-    Raises:
-        UserError: it does not, as with another version of FLAME.
-    """
+    """Return the sequence, after a check that its tracking fits its pictures, and its face model its tracking."""
     overlay, name = measure_overlay(sequence), sequence.capture.name
     if overlay.inside < _MIN_INSIDE:
         raise UserError(
@@ -99,11 +95,7 @@ def check_overlay(path: Path, sequence: TrackedSequence, version: str) -> Tracke
 
 
 def check_version(path: Path, sequence: TrackedSequence, version: str) -> None:
-    """Check that coefficients of the tracking move the face model as the face in the pictures moves.
-
-    Raises:
-        UserError: the mesh holds to the skin worse with them than without them.
-    """
+    """Check that coefficients of the tracking move the face model as the face in the pictures moves."""
     steadiness = measure_steadiness(sequence)
     for spread, what in ((steadiness.identity, "identity"), (steadiness.expression, "expressions")):
         if spread is not None and spread > _MAX_SPREAD:

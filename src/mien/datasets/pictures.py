@@ -21,11 +21,7 @@ ReadFrame = Callable[[int, int], tuple[Pixels, Matte]]
 
 
 def read_picture(path: Path, size: tuple[int, int] | None = None) -> tuple[Pixels, Matte | None]:
-    """Read the colours of an 8-bit picture, and its opacity if it has a fourth channel.
-
-    Raises:
-        UserError: it is missing, damaged, no 8-bit picture, or not of the width and height `size`.
-    """
+    """Read the colours of an 8-bit picture, and its opacity if it has a fourth channel."""
     pixels = decode_picture(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
         raise UserError(f"{path}: cannot be read as a picture of 8 bits a channel; {REMEDY}")
@@ -37,11 +33,7 @@ def read_picture(path: Path, size: tuple[int, int] | None = None) -> tuple[Pixel
 
 
 def read_matte(path: Path, size: tuple[int, int]) -> Matte:
-    """Read a grey picture of opacities. Of a coloured one, the first channel counts.
-
-    Raises:
-        UserError: as for `read_picture`.
-    """
+    """Read a grey picture of opacities. Of a coloured one, the first channel counts."""
     return np.ascontiguousarray(read_picture(path, size)[0][..., 0])
 
 
@@ -62,9 +54,6 @@ def collect(
         size: Width and height of all pictures.
         read: The function that reads one picture.
         title: Title of the progress bar.
-
-    Raises:
-        UserError: a picture cannot be read, or the disk is full.
     """
     shape = (timesteps, cameras, size[1], size[0])
     images, mattes = _on_disk((*shape, 3)), _on_disk(shape)

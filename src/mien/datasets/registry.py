@@ -37,11 +37,7 @@ def datasets() -> list[Dataset]:
 
 
 def find_dataset(name: str) -> Dataset:
-    """Return a dataset by its name.
-
-    Raises:
-        UserError: there is none of this name, or that of another package cannot be imported.
-    """
+    """Return a dataset by its name."""
     if all(each.name != name for each in _OWN):
         plugin(_GROUP, name, Dataset)
     found = next((each for each in datasets() if each.name == name), None)
@@ -51,11 +47,7 @@ def find_dataset(name: str) -> Dataset:
 
 
 def recognised(path: Path) -> tuple[Dataset, str]:
-    """Return the dataset whose files are at a path, and what it found there.
-
-    Raises:
-        UserError: no dataset recognises the path, or several do.
-    """
+    """Return the dataset whose files are at a path, and what it found there."""
     found = [(each, told) for each in datasets() if (told := _told(each, path)) is not None]
     if not found:
         people = _people(path)

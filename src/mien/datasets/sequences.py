@@ -52,10 +52,6 @@ def tracked_sequence(
         face_model: The face model of the parameters. It needs the landmarks of mien's detector.
         face: The person at the t timesteps, in the cameras' world.
         fps: Frames per second.
-
-    Raises:
-        UserError: a number is NaN or infinite or out of range, or belongs to another face model, or the head is behind
-            all cameras, as with the axes of another convention. It names the path.
     """
     views = tuple(cameras.values())
     _check_places(path, cameras, face_model, face)
@@ -106,9 +102,6 @@ def filmed_sequence(
         cameras: Each camera by its id, in the order of the axis c, in one world, for pictures of this size.
         fps: Frames per second.
         landmarks: The 478 points of mien's detector in pixels, or None to detect them. A face with NaN is not valid.
-
-    Raises:
-        UserError: a camera is not valid, the frame rate is impossible, or no face is found in any picture.
     """
     _check_cameras(path, cameras)
     _check_fps(path, fps)

@@ -49,9 +49,6 @@ def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) ->
         path: The person's folder.
         face_model: The avatar's face model.
         size: Width and height of the pictures that the avatar was trained on.
-
-    Raises:
-        UserError: a file is missing or damaged, or the face model is not FLAME.
     """
     file = path / "calibration" / "camera_params.json"
     check_file_inside(path, file)
@@ -82,9 +79,6 @@ def view_task(path: Path, sequence: str, face: FaceParams, trained: dict[str, Ca
         sequence: Name of the sequence.
         face: The person at all timesteps, in the world of the trained cameras.
         trained: The cameras that the avatar was trained with, by their ids.
-
-    Raises:
-        UserError: the calibration is missing or damaged, or has not the same cameras.
     """
     file = path / "calibration" / "camera_params.json"
     check_file_inside(path, file)

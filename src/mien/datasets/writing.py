@@ -37,9 +37,6 @@ def write_sequence(folder: Path, sequence: TrackedSequence | FilmedSequence, dat
         sequence: The sequence.
         dataset: The dataset that it comes from.
         source: The place that it was read from.
-
-    Raises:
-        UserError: numbers of the dataset cannot be used, or a file cannot be written. Nothing is left then.
     """
     aside = folder.with_name(f".{folder.name}.partial")
     partial = aside / folder.name  # one level deeper than sequences, so that a killed import leaves none

@@ -27,12 +27,7 @@ def encode(value: Any) -> Any:
 
 
 def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make it again") -> Any:
-    """Decode what `encode` encoded into the type `hint`. Every field is there, also one with a default.
-
-    Raises:
-        UserError: a field is unknown or missing, has a value of another type, or is out of its range. The message ends
-            with `remedy`.
-    """
+    """Decode what `encode` encoded into the type `hint`. Every field is there, also one with a default."""
     try:
         return _decode(hint, value, where)
     except UserError as error:
@@ -47,9 +42,6 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
         changes: Field name -> value. As in the output of `encode`, a `kind` is allowed.
         where: The place that messages name, followed by the field: "config.json: method".
         owner: Whose settings these are, for a message about an unknown setting.
-
-    Raises:
-        UserError: a field is unknown, of another type, or out of its range.
     """
     if not isinstance(changes, dict):
         raise UserError(f"{where} {_in_short(changes)}: give an object of settings, {{...}}")

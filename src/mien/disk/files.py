@@ -49,10 +49,6 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
     """Check before any long work that `path` can be written as a file (or, with `folder`, as a folder).
 
     Missing parent folders are fine, because `write_atomically` makes them. The check leaves nothing behind.
-
-    Raises:
-        UserError: `path` is a folder instead of a file (or a file instead of a folder), a device or a pipe; a parent is
-            a file; or the folder that would hold it is not writable.
     """
     try:
         there = path.exists()
@@ -151,11 +147,7 @@ def cannot_write(path: Path, error: OSError) -> CannotWriteError:
 
 @contextmanager
 def expect_whole(path: Path, remedy: str) -> Iterator[None]:
-    """Report errors in the content read from `path` in one line: missing entries, wrong types or sizes.
-
-    Raises:
-        UserError: such an error occurred inside the context.
-    """
+    """Report errors in the content read from `path` in one line: missing entries, wrong types or sizes."""
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
@@ -177,9 +169,6 @@ def read_json(
 
     `remedy` replaces that advice if the file's folder holds more than the stage can make again in a moment. A missing
     file still asks for its stage, if there is one.
-
-    Raises:
-        UserError: the file is missing, is not json, has another format or version, or was changed after it was written.
     """
     try:
         content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"))
@@ -245,11 +234,7 @@ def write_safetensors(path: Path, data: bytes, metadata: Mapping[str, str] | Non
 
 
 def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
-    """Read safetensors as numpy arrays; error messages name the command `stage` as the remedy.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """Read safetensors as numpy arrays; error messages name the command `stage` as the remedy."""
     return read_safetensors(path, safetensors.numpy.load_file, stage)
 
 
@@ -259,9 +244,6 @@ def read_safetensors(
     """Read a safetensors file by `load`; a missing or damaged file is reported in one line.
 
     `remedy` replaces "run `stage` again" in the message.
-
-    Raises:
-        UserError: the file is missing or damaged.
     """
     if not path.is_file():
         raise UserError(f"{path}: missing; {remedy or f'run {stage} again'}")

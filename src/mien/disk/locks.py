@@ -290,11 +290,7 @@ def _warn_of_no_locks(file: Path) -> None:
 
 
 def _sign(handle: int, file: Path) -> None:
-    """Write into an open lock file that this process holds it, with pid, host, time and command line.
-
-    Raises:
-        UserError: the file is not a lock file of mien. It stays as it is.
-    """
+    """Write into an open lock file that this process holds it, with pid, host, time and command line."""
     found = read_at(handle, len(_BEGINNING), SIGNATURE_AT)
     if found != _BEGINNING[: len(found)]:
         raise UserError(f"{file}: has the name of a lock file, but mien did not write it; move it away")

@@ -20,19 +20,11 @@ class Workspace:
     root: Path
 
     def sequence_dir(self, name: str) -> Path:
-        """The folder of a sequence.
-
-        Raises:
-            UserError: the name leads out of the workspace.
-        """
+        """The folder of a sequence."""
         return inside(self.root / "sequences", name)
 
     def run_dir(self, name: str) -> Path:
-        """The folder of a training run.
-
-        Raises:
-            UserError: the name leads out of the workspace.
-        """
+        """The folder of a training run."""
         return inside(self.root / "runs", name)
 
     def sequence_names(self) -> list[str]:
@@ -46,11 +38,7 @@ class Workspace:
         ]
 
     def pick_tracked(self, names: Sequence[str], held_out: Sequence[str]) -> list[str]:
-        """All tracked sequences, or, if names are given, these and the held-out ones.
-
-        Raises:
-            UserError: nothing is tracked, or there is no sequence of a name.
-        """
+        """All tracked sequences, or, if names are given, these and the held-out ones."""
         if names:
             return [self.pick_sequence(name) for name in dict.fromkeys((*names, *held_out))]
         tracked = self.tracked_names()
@@ -63,11 +51,7 @@ class Workspace:
         return sorted(p.parent.name for p in self.root.glob("runs/*/config.json"))
 
     def pick_sequence(self, name: str | None) -> str:
-        """`name`, or the only sequence if no name is given.
-
-        Raises:
-            UserError: there is no sequence, none of that name, or several and no name is given.
-        """
+        """`name`, or the only sequence if no name is given."""
         return _pick("sequence", name, self.sequence_names(), self.root, "--sequence")
 
     def pick_run(self, name: str | None) -> str:
@@ -75,9 +59,6 @@ class Workspace:
 
         Runs without an avatar then count only if no run has one, and those of `mien bench compare` only if there is no
         other.
-
-        Raises:
-            UserError: there is no run, none of that name, or several and no name is given.
         """
         names = self.run_names()
         trained = [run for run in names if (self.run_dir(run) / "avatar").is_dir()]
@@ -93,11 +74,7 @@ def is_workspace(folder: Path) -> bool:
 
 
 def check_no_workspace(folder: Path) -> None:
-    """Check that a folder of which pictures or videos are wanted is no workspace, whose films show an avatar.
-
-    Raises:
-        UserError: it is one.
-    """
+    """Check that a folder of which pictures or videos are wanted is no workspace, whose films show an avatar."""
     if is_workspace(folder):
         raise UserError(
             f"{folder}: is a workspace, and not a folder of pictures or videos; give the video that it was made from, "
@@ -106,11 +83,7 @@ def check_no_workspace(folder: Path) -> None:
 
 
 def open_workspace(root: Path) -> Workspace:
-    """Open an existing workspace, and check that nothing in it leads out of it.
-
-    Raises:
-        UserError: the folder is missing, holds no sequences and no runs, or holds links (`mien.inside`).
-    """
+    """Open an existing workspace, and check that nothing in it leads out of it."""
     workspace = Workspace(root)
     if root.is_file():
         raise UserError(f"{root}: is a file; give the folder of a workspace (`mien create` makes one from a video)")
@@ -149,11 +122,7 @@ def _check_first_captures(workspace: Workspace) -> None:
 
 
 def check_new_workspace(root: Path) -> None:
-    """Check that a workspace can be made or continued here.
-
-    Raises:
-        UserError: the folder cannot be written, belongs to another workspace, or holds links (`mien.inside`).
-    """
+    """Check that a workspace can be made or continued here."""
     from mien.disk.files import check_writable  # imports numpy
 
     check_writable(root, folder=True)

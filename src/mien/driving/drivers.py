@@ -61,9 +61,6 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
         path: The file. Its ending decides its format.
         face_model: The avatar's face model.
         fps: Frame rate of the timecode in a csv.
-
-    Raises:
-        UserError: the file is damaged, or the face model has none of ARKit's expressions.
     """
     suffix = path.suffix.lower()
     is_voice = suffix in SOUND_ENDINGS
@@ -88,10 +85,6 @@ def read_tracked_driver(folders: Items[Path], face_model: FaceModel | None = Non
         folders: Folders of the sequences.
         face_model: The avatar's face model, in whose terms the motion is returned (`fit_expression_map`). None leaves
             it as it was tracked.
-
-    Raises:
-        UserError: no frame was tracked, the sequences were tracked with several face models or with one that is not
-            installed, a file is damaged, or a pause in a video is too long.
     """
     sequences = [read_sequence(folder) for folder in folders]
     shapes = {(one.tracking.face.expression.shape[1], one.tracking.face.joints.shape[1]) for one in sequences}

@@ -76,11 +76,7 @@ class ExpressionMap:
 
 
 def fit_expression_map(source: FaceModel, target: FaceModel) -> ExpressionMap:
-    """Fit the map between two face models.
-
-    Raises:
-        UserError: one of them has no landmarks, by which faces are registered.
-    """
+    """Fit the map between two face models."""
     shared = set(source.expression_names) & set(target.expression_names) & set(ARKIT_NAMES)
     if len(shared) >= _LEAST_COMMON and not any(_JAW in model.free_joint_names for model in (source, target)):
         by_name = torch.zeros(len(source.expression_names), len(target.expression_names), dtype=torch.float64)

@@ -124,9 +124,6 @@ def evenly_timed(
         seconds: The time of each row.
         rows: The rows.
         found: Whether each row has a face. At least one has.
-
-    Raises:
-        UserError: Times go back, have another unit, or leave a gap that is too long (`check_times`).
     """
     kept, notes = without_repeats(seconds, times)
     if times.units is not None:
@@ -189,9 +186,6 @@ def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -
     Args:
         seconds: The times, which increase strictly.
         where: Returns the name of a row's place in its file.
-
-    Raises:
-        UserError: A gap is longer than `MAX_GAP_SECONDS`, or there would be more than `MAX_MOMENTS`.
     """
     steps = np.diff(seconds)
     longest = int(np.argmax(steps)) if len(steps) else 0
@@ -213,9 +207,6 @@ def without_repeats(seconds: Float[np.ndarray, " r"], times: Times) -> tuple[np.
 
     Returns:
         the indices of these rows, and a line for the user if others are left out.
-
-    Raises:
-        UserError: A time goes back, or all are the same.
     """
     latest = np.maximum.accumulate(seconds)
     late = np.concatenate([[False], seconds[1:] <= latest[:-1]])

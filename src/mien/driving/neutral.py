@@ -27,9 +27,6 @@ def with_neutral(
         neutral: first, calm, model, a file, or None for the default: `driver.at_rest` within `rest_of`'s limits.
         who: What messages call the driver.
         other: The driver of the file, if `neutral` is a file.
-
-    Raises:
-        UserError: the file was tracked with another face model.
     """
     seen, moved = driver.seen, ()
     if neutral is None:

@@ -91,9 +91,6 @@ def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FacePa
     can follow (`within_lids`). At rest, which is one timestep,
     all coefficients are zero, as in ARKit and MediaPipe, and the head has its median pose. A model without ARKit's
     names gets the motion of the default model by `fit_expression_map`.
-
-    Raises:
-        UserError: the face model has neither ARKit's expressions nor landmarks.
     """
     known = [(ours, ARKIT_NAMES.index(name)) for ours, name in enumerate(model.expression_names) if name in ARKIT_NAMES]
     if not known:

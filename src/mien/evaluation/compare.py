@@ -99,11 +99,7 @@ class Comparison:
 
 
 def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
-    """Read the figures of some runs, by label, and sort them into tables of comparable runs.
-
-    Raises:
-        UserError: none of them was evaluated, or a metrics.json is damaged or of another version.
-    """
+    """Read the figures of some runs, by label, and sort them into tables of comparable runs."""
     runs, warnings = [], []
     for label, run_dir in run_dirs.items():
         if not (run_dir / "metrics.json").is_file():

@@ -65,11 +65,7 @@ class Driven:
 
 
 def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
-    """A run's avatar, driven by another sequence, and seen by the most frontal camera of `sequence_dir`.
-
-    Raises:
-        UserError: the driver was tracked with another face model, or has no tracked frame.
-    """
+    """A run's avatar, driven by another sequence, and seen by the most frontal camera of `sequence_dir`."""
     avatar, tracking = load_avatar(run_dir), read_tracking(driver_dir / "tracking")
     if tracking.face_model_hash != avatar.face_model.content_hash:
         raise UserError(
@@ -117,9 +113,6 @@ def cross_reenactment(
         sequence_dir: A sequence that the run was trained on. Its camera sees the avatar.
         driver_dirs: Folders of tracked sequences.
         video_frames: Largest number of frames per video, or 0 for no videos.
-
-    Raises:
-        UserError: a driver does not fit, or no face is found in its pictures.
     """
     entries, videos = [], []
     for folder in driver_dirs:
@@ -137,11 +130,7 @@ def cross_reenactment(
 
 
 def measure(driven: Driven, name: str) -> dict[str, Any]:
-    """Figures of evenly spread frames of one driver. They are None if no face is found in the avatar's pictures.
-
-    Raises:
-        UserError: no face is found in the driver's pictures.
-    """
+    """Figures of evenly spread frames of one driver. They are None if no face is found in the avatar's pictures."""
     frames = evenly_spread(sorted(driven.by_rest), _MAX_FRAMES)
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     found_driver = found_avatar = 0

@@ -55,11 +55,7 @@ def dataset_protocol(name: str) -> DatasetProtocol:
 
 
 def check_lpips(protocol: DatasetProtocol, settings: ScoreSettings) -> None:
-    """Check that exact LPIPS, if it is asked for, is that of the protocol.
-
-    Raises:
-        UserError: the weights are those of another network than papers on this data use.
-    """
+    """Check that exact LPIPS, if it is asked for, is that of the protocol."""
     metric = lpips_metric(settings)
     if metric is not None and metric.backbone not in protocol.lpips:
         raise UserError(
@@ -76,9 +72,6 @@ def scores_whole_mattes(protocol: DatasetProtocol, run_dir: Path, folders: Mappi
         run_dir: The run, for messages.
         folders: The folders of the run's sequences, with their scoring masks.
         split: The split of the run.
-
-    Raises:
-        UserError: a sequence is of another dataset, the run has another split, or masks have another cut.
     """
     found = {folder: imported_from(folder) for folder in folders}
     for folder, dataset in found.items():

@@ -113,11 +113,7 @@ def _evaluate(
 
 
 def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: EvaluationSettings | None = None) -> bool:
-    """Whether metrics.json holds the figures that `evaluate` would write, or more: same avatar, data and settings.
-
-    Raises:
-        UserError: the run is not finished, or the sequences are not those of the run.
-    """
+    """Whether metrics.json holds the figures that `evaluate` would write, or more: same avatar, data and settings."""
     settings = settings or EvaluationSettings()
     try:
         known = read_metrics(run_dir).get("fingerprints")

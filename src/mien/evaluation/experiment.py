@@ -151,9 +151,6 @@ def avatar_image(
         frame: The frame.
         face: Face parameters that pose the avatar instead of the experiment's.
         background: The colour, 0 to 255.
-
-    Raises:
-        UserError: the avatar or the face parameters give Gaussians that are not finite.
     """
     return drawn_image(experiment, frame, posed_avatar(experiment, frame, face), background)
 
@@ -168,11 +165,7 @@ def posed_avatar(experiment: Experiment, frame: Frame, face: FaceParams | None =
 def drawn_image(
     experiment: Experiment, frame: Frame, gaussians: Gaussians, background: tuple[int, int, int] = WHITE
 ) -> Float[Tensor, "h w 3"]:
-    """Gaussians of `posed_avatar` seen as in a frame, over a colour, clamped to 0..1.
-
-    Raises:
-        UserError: they are not finite.
-    """
+    """Gaussians of `posed_avatar` seen as in a frame, over a colour, clamped to 0..1."""
     color = (torch.tensor(background) / 255).to(gaussians.means)
     with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
         drawn = rasterize(gaussians, experiment.camera(frame), color)

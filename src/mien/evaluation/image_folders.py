@@ -74,9 +74,6 @@ def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) 
     Returns:
         The content that `write_scores` writes: mean `psnr, ssim, l1, perceptual`, the same on the `head` crop (None if
         no crop is known), how they were computed, and `per_frame` figures.
-
-    Raises:
-        UserError: names, numbers or sizes do not match, or a picture cannot be read.
     """
     settings = settings or ScoreSettings()
     pairs = _Pairs(folders)
@@ -119,11 +116,7 @@ def write_crops(path: Path, crops: dict[str, Box]) -> None:
 
 
 def read_crops(path: Path) -> dict[str, Box]:
-    """Read what `write_crops` wrote.
-
-    Raises:
-        UserError: it is missing or damaged.
-    """
+    """Read what `write_crops` wrote."""
     try:
         crops = read_json(path, CROPS_FORMAT, CROPS_VERSION).get("crops")
     except UserError as error:
@@ -161,11 +154,7 @@ class _Pairs:
         self.crop_source = known if crops_path is None else "frozen head box of each frame"
 
     def read(self) -> Any:
-        """Yield (index, pair) for every picture.
-
-        Raises:
-            UserError: a picture cannot be read, or has another size than its truth.
-        """
+        """Yield (index, pair) for every picture."""
         color = np.full(3, _COLORS[self._folders.background], np.uint8)
         images = self._images.read(self.names)
         truths = self._truth.read(self.names)
@@ -201,11 +190,7 @@ class _Pairs:
 
 
 def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
-    """The names to score, in order. They are the names of the truth.
-
-    Raises:
-        UserError: a picture is missing, or a video has another number of frames.
-    """
+    """The names to score, in order. They are the names of the truth."""
     if truth.names is None or images.names is None:
         # Frames of a video have no names, so they match by order.
         if truth.count != images.count:

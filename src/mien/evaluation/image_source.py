@@ -30,11 +30,7 @@ class PictureSource:
     """Files by name. Empty for a video."""
 
     def read(self, names: Sequence[str]) -> Iterator[UInt8[np.ndarray, "h w _"]]:
-        """Yield the pictures of these names, with 3 or 4 channels. A video's pictures come in order.
-
-        Raises:
-            UserError: a picture cannot be read.
-        """
+        """Yield the pictures of these names, with 3 or 4 channels. A video's pictures come in order."""
         if self.names is None:
             yield from itertools.islice((picture for _, picture in read_video_frames(self.path)), len(names))
             return
@@ -44,11 +40,7 @@ class PictureSource:
 
 
 def open_pictures(path: Path) -> PictureSource:
-    """Open the pictures at a path.
-
-    Raises:
-        UserError: the path is missing, holds no picture, or holds two pictures of the same name.
-    """
+    """Open the pictures at a path."""
     if path.is_file():
         count = sum(1 for _ in read_video_frames(path))
         say(f"warning: {path}: video compression changes pixels; png pictures give more accurate figures")
@@ -70,11 +62,7 @@ def open_pictures(path: Path) -> PictureSource:
 
 
 def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
-    """A picture of 8 bits per channel as RGB or RGBA. Grey becomes RGB.
-
-    Raises:
-        UserError: it is not a picture, is truncated, is too large, or has more than 8 bits.
-    """
+    """A picture of 8 bits per channel as RGB or RGBA. Grey becomes RGB."""
     try:
         # libpng would return the upper half of a truncated file.
         cut = path.suffix.lower() == ".png" and _end_of(path) != b"IEND\xaeB`\x82"

@@ -68,11 +68,7 @@ def living(avatar: Avatar, camera: Camera, name: str, coverage: Coverage | None)
 
 
 def write_film(path: Path, alive: Living) -> None:
-    """Write the film: 512x512, five seconds, over white. Its end leads to its begin.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
+    """Write the film: 512x512, five seconds, over white. Its end leads to its begin."""
     write_video(path, pictures_of(alive), FPS)
 
 

@@ -36,10 +36,6 @@ def load_experiments(
 
     The first two include all cameras, also held-out ones. `edges` says what the truth is at soft edges.
     With the name of a dataset's `protocol`, the pixels and frames of its authors are scored.
-
-    Raises:
-        UserError: the run is not finished, the sequences are not those that it was trained on, or they are not of the
-            protocol's dataset, or the run was not trained with its split.
     """
     config = read_run_config(run_dir)
     settings = decode(TrainSettings, config["settings"], str(run_dir / "config.json"), "train it again")

@@ -37,11 +37,7 @@ _MAX_FIGURE = 1e12
 
 
 def read_metrics(run_dir: Path) -> dict[str, Any]:
-    """Read what `evaluate` wrote.
-
-    Raises:
-        UserError: the run was not evaluated, or the file is damaged.
-    """
+    """Read what `evaluate` wrote."""
     path = run_dir / "metrics.json"
     content = read_json(path, FORMAT, VERSION, "`mien evaluate`", _REMEDY)
     with expect_whole(path, _REMEDY):
@@ -56,11 +52,7 @@ def protocol_means(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_figures(run_dir: Path) -> dict[str, Any]:
-    """`read_metrics`, with a check of every figure that tables, pages and lines show.
-
-    Raises:
-        UserError: as for `read_metrics`; or a figure is missing or of another type, for example after an edit.
-    """
+    """`read_metrics`, with a check of every figure that tables, pages and lines show."""
     content, path = read_metrics(run_dir), run_dir / "metrics.json"
     with expect_whole(path, _REMEDY):
         for name, entry in content["protocols"].items():

@@ -67,11 +67,7 @@ def perceptual_metric(settings: ScoreSettings) -> PerceptualDistance | None:
 
 
 def lpips_metric(settings: ScoreSettings) -> Lpips | None:
-    """Exact LPIPS, or None if no file of weights is given.
-
-    Raises:
-        UserError: the file is not one that torchvision published.
-    """
+    """Exact LPIPS, or None if no file of weights is given."""
     return None if settings.lpips_weights is None else load_lpips(settings.lpips_weights)
 
 
@@ -150,11 +146,7 @@ def enlarged(image: Float[Tensor, "h w 3"], least: int) -> Float[Tensor, "y x 3"
 
 
 def worker_threads(threads: int) -> int:
-    """The number of frames to score at a time.
-
-    Raises:
-        UserError: MIEN_THREADS is not a number of threads.
-    """
+    """The number of frames to score at a time."""
     if threads > 0:
         return threads
     return asked_threads() or min(_MAX_THREADS, os.cpu_count() or 1)

@@ -58,10 +58,6 @@ def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams
         folder: The folder. It is made if it is missing, and files of the same names are replaced.
         avatar: An avatar of GaussianAvatars.
         face: The subject at any number of timesteps.
-
-    Raises:
-        UserError: the avatar's Gaussians are not bound to triangles, or change with the expression, a value is NaN or
-            infinite, or a file cannot be written. Earlier files are then kept.
     """
     baked = avatar.bake()
     if not isinstance(baked, MeshBound):
@@ -88,10 +84,6 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
     Args:
         folder: The folder with point_cloud.ply and flame_param.npz.
         face_model: The face model that the avatar was made with, if it is not in the folder.
-
-    Raises:
-        UserError: a file is missing, damaged, a link or too large, or the files do not belong together; or the face
-            model is neither in the folder nor given.
     """
     path = folder / POINTS
     if not folder.is_dir():
@@ -134,11 +126,7 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
 
 @contextmanager
 def _replaced_together(folder: Path) -> Iterator[Path]:
-    """A hidden folder for new files, which replace those of an earlier export when all of them are written.
-
-    Raises:
-        UserError: a file cannot be written. The earlier files are kept.
-    """
+    """A hidden folder for new files, which replace those of an earlier export when all of them are written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".partial-") as name:
@@ -224,11 +212,7 @@ def _face_model_of(folder: Path) -> FaceModel | None:
 
 
 def _refuse_links(path: Path) -> None:
-    """Check that a file of the folder is an ordinary file.
-
-    Raises:
-        UserError: it is a link, a folder, a pipe or a device, or cannot be opened.
-    """
+    """Check that a file of the folder is an ordinary file."""
     try:
         open_to_read(path).close()
     except FileNotFoundError:

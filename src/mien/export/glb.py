@@ -69,11 +69,7 @@ class MeshModel:
 
 
 def write_glb(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int = TEXTURE_SIZE) -> WrittenGlb:
-    """Write an avatar as one .glb file, in the head frame, in metres. The same input gives the same bytes.
-
-    Raises:
-        UserError: the path cannot be written, or an array holds NaN or infinity.
-    """
+    """Write an avatar as one .glb file, in the head frame, in metres. The same input gives the same bytes."""
     head = head_of(path, avatar, model, texture_size)
     writer, content = head.writer, head.content
     _add_splats(writer, content, avatar, head.gaussians)
@@ -101,21 +97,13 @@ class Head:
     """The Gaussians of the person at rest, in the head frame."""
 
     def write(self, path: Path) -> WrittenGlb:
-        """Write the file with what `content` holds by now.
-
-        Raises:
-            UserError: the path cannot be written.
-        """
+        """Write the file with what `content` holds by now."""
         missing = tuple(name for name in ARKIT_NAMES if name not in self.targets)
         return WrittenGlb(self.writer.write(path, self.content), self.targets, missing)
 
 
 def head_of(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int) -> Head:
-    """The mesh of the person at rest with morph targets, skin and texture, in the head frame, in metres.
-
-    Raises:
-        UserError: the path cannot be written, or an array holds NaN or infinity.
-    """
+    """The mesh of the person at rest with morph targets, skin and texture, in the head frame, in metres."""
     check_writable(path)
     face = _at_rest(avatar)
     vertices = rig_points(model.rig, face)

@@ -19,11 +19,7 @@ _REMEDY = "write it again with `mien export DIR --out me.glb`"
 
 
 def avatar_extension(path: Path, writer: GlbWriter, avatar: PortableAvatar) -> dict[str, Any]:
-    """Add the arrays of an avatar to a file, and return the extension that refers to them.
-
-    Raises:
-        UserError: an array holds NaN or infinity. The message names `path`.
-    """
+    """Add the arrays of an avatar to a file, and return the extension that refers to them."""
     header, arrays = to_arrays(path, avatar)
     tensors = {}
     for name, array in sorted(arrays.items()):
@@ -35,11 +31,7 @@ def avatar_extension(path: Path, writer: GlbWriter, avatar: PortableAvatar) -> d
 
 
 def read_glb_avatar(path: Path) -> PortableAvatar:
-    """Read the avatar in a .glb file: equal to that of the .mien file, array by array.
-
-    Raises:
-        UserError: the file is missing, damaged, of another version, or has no avatar of mien.
-    """
+    """Read the avatar in a .glb file: equal to that of the .mien file, array by array."""
     glb = read_glb(path)
     extensions = glb.content.get("extensions")
     found = extensions.get(EXTENSION) if isinstance(extensions, dict) else None

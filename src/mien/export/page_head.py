@@ -34,11 +34,7 @@ class Described:
 
 
 def check_address(address: str) -> None:
-    """Refuse what is no address of a page.
-
-    Raises:
-        UserError: it does not begin with http:// or https://, or names no host.
-    """
+    """Refuse what is no address of a page."""
     parts = urlsplit(address)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise UserError(f"--address {address}: is no address; give one such as https://example.org/me.html")
@@ -71,11 +67,7 @@ def head_part(avatar: runtime.Avatar, described: Described, poster: Path | None)
 
 
 def write_poster(path: Path, avatar: runtime.Avatar) -> None:
-    """Write the picture that messengers show: the person at rest before a soft light, 1200x630. This needs OpenCV.
-
-    Raises:
-        UserError: the path cannot be written.
-    """
+    """Write the picture that messengers show: the person at rest before a soft light, 1200x630. This needs OpenCV."""
     import cv2
 
     from mien.media.picture_files import encode_picture

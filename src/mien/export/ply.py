@@ -118,9 +118,6 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     """The columns of a 3D Gaussian .ply by name, and the lines of its header.
 
     Columns have the types of the file.
-
-    Raises:
-        UserError: the file is missing, truncated, not a ply, ASCII or big-endian, or holds no 3D Gaussians.
     """
     try:
         with open_ordinary(path) as file:
@@ -146,11 +143,7 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
 
 
 def stacked(columns: dict[str, np.ndarray], names: list[str], path: Path) -> Tensor:
-    """Some columns side by side, [n, len(names)] float32.
-
-    Raises:
-        UserError: one is missing. The message names the file, `path`.
-    """
+    """Some columns side by side, [n, len(names)] float32."""
     missing = [name for name in names if name not in columns]
     if missing:
         raise UserError(f"{path}: lacks {missing[0]}; give a .ply with 3D Gaussians")
@@ -159,11 +152,7 @@ def stacked(columns: dict[str, np.ndarray], names: list[str], path: Path) -> Ten
 
 
 def stacked_sh(columns: dict[str, np.ndarray], path: Path) -> Tensor:
-    """The spherical harmonics, [n, k, 3].
-
-    Raises:
-        UserError: a coefficient is missing, or they are of no degree from 0 to 3.
-    """
+    """The spherical harmonics, [n, k, 3]."""
     rest = sum(name.startswith("f_rest_") for name in columns)
     if rest not in _REST_COEFFICIENTS:
         raise UserError(
@@ -179,11 +168,7 @@ def stacked_sh(columns: dict[str, np.ndarray], path: Path) -> Tensor:
 
 
 def _read_header(path: Path, file: IO[bytes]) -> list[str]:
-    """The lines before the vertices; the file is left at the first vertex.
-
-    Raises:
-        UserError: it is no .ply.
-    """
+    """The lines before the vertices; the file is left at the first vertex."""
     content = file.read(_MAX_HEADER_BYTES)
     # Vertices may begin with any byte, so the first line decides how lines end.
     first = _FIRST_LINE.match(content)

@@ -54,9 +54,6 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
     opacities steps of 1/255, and rotations 8 bits for each of the three smallest components. SH coefficients of higher
     degrees have the nearest of 256 values; with more than 65,536 Gaussians, similar ones share them. The same Gaussians
     give the same bytes.
-
-    Raises:
-        UserError: a value is NaN or infinite.
     """
     assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
     assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
@@ -91,11 +88,7 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_sog(path: Path) -> Gaussians:
-    """Read a .sog file of version 2.
-
-    Raises:
-        UserError: the file is missing, damaged, of another version, or too large.
-    """
+    """Read a .sog file of version 2."""
     try:
         with open_ordinary(path) as file, open_archive(file) as members:
             meta = parse_json(_member(members, "meta.json", _MAX_META).decode())

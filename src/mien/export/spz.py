@@ -57,9 +57,6 @@ def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> 
         path: The file.
         gaussians: The Gaussians.
         version: Version of the format, 3 or 4.
-
-    Raises:
-        UserError: a value is NaN or infinite, or a position is too far away.
     """
     assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
     assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
@@ -87,11 +84,7 @@ def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> 
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read a .spz file of version 2, 3 or 4.
-
-    Raises:
-        UserError: the file is missing, damaged, of another version, or too large.
-    """
+    """Read a .spz file of version 2, 3 or 4."""
     try:
         packed = read_bytes(path, _MAX_BYTES)
         read = _read_version_4 if packed[:4] == struct.pack("<I", _MAGIC) else _read_gzip

@@ -33,9 +33,6 @@ def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) 
 
     Values are float32 and not compressed with loss. With `fps`, each pose is a time sample (0, 1, 2, ...); without it,
     there is one pose and no time. The ending of `path` chooses the container (`USD_ENDINGS`).
-
-    Raises:
-        UserError: usd-core is missing or too old, a value is NaN or infinite, or the file cannot be written.
     """
     check_usd(path)
     Usd, UsdVol = _pxr("Usd", "UsdVol")
@@ -63,12 +60,7 @@ def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) 
 
 
 def read_usd(path: Path, time: float | None = None) -> Gaussians:
-    """Read the Gaussians of a USD file at a time sample (default: without time).
-
-    Raises:
-        UserError: usd-core is missing, or the file is missing, damaged, or without Gaussians, refers to other files, or
-            holds NaN or infinity.
-    """
+    """Read the Gaussians of a USD file at a time sample (default: without time)."""
     check_usd(path)
     Tf, Usd, UsdVol = _pxr("Tf", "Usd", "UsdVol")
 
@@ -125,11 +117,7 @@ def _check_file(path: Path) -> None:
 
 
 def _layer_alone(path: Path) -> Any:
-    """The layer of a file, if it refers to no other file. A stranger's file could name any on this machine.
-
-    Raises:
-        UserError: it refers to another file.
-    """
+    """The layer of a file, if it refers to no other file. A stranger's file could name any on this machine."""
     (Sdf,) = _pxr("Sdf")
 
     layer = Sdf.Layer.FindOrOpen(str(path.absolute()))

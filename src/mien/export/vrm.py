@@ -66,11 +66,7 @@ _LOOKS = {
 
 
 def write_vrm(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int = TEXTURE_SIZE) -> WrittenGlb:
-    """Write an avatar as one .vrm file of VRM 1.0, which faces +z, in metres. The same input gives the same bytes.
-
-    Raises:
-        UserError: the path cannot be written, or an array holds NaN or infinity.
-    """
+    """Write an avatar as one .vrm file of VRM 1.0, which faces +z, in metres. The same input gives the same bytes."""
     head = head_of(path, avatar, model, texture_size)
     about, content = avatar.about, head.content
     bones = _add_body(content)

@@ -69,10 +69,6 @@ def write_page(
             written beside the page, with its name and the ending .jpg.
         microphone: Whether a button lets the lips follow a voice.
         largest: Largest size of the page in bytes, for which Gaussians that add least are left out. None for all.
-
-    Raises:
-        UserError: pages cannot draw the avatar's colours, a file cannot be read, `largest` is too small for any page,
-            or the path cannot be written.
     """
     check_writable(path)
     described = described or Described(avatar.about.name)
@@ -117,9 +113,6 @@ def write_packed(
     """Write the packed form alone, for pages of one's own (`<mien-avatar src=...>`, docs/publishing.md).
 
     With `largest`, Gaussians that add least are left out until it has at most so many bytes.
-
-    Raises:
-        UserError: pages cannot draw the avatar's colours, `largest` is too small, or the path cannot be written.
     """
     check_writable(path)
     shown = avatar if largest is None else fitted(path, avatar, motion, largest, len)

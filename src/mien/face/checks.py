@@ -30,9 +30,6 @@ def check_face_model(model: FaceModel, where: str, remedy: str) -> None:
         model: face model; its landmarks are not checked.
         where: where it was read from, for messages.
         remedy: what the user can do about an error.
-
-    Raises:
-        UserError: a check fails.
     """
     for fault in _faults(model):
         raise UserError(f"{where}: {fault}; {remedy}")
@@ -46,9 +43,6 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
         face: face parameters at any number of timesteps.
         where: where they were read from, for messages.
         remedy: what the user can do about an error.
-
-    Raises:
-        UserError: a check fails.
     """
     b, v = len(face), len(model.template)
     shapes = {

@@ -107,11 +107,7 @@ def write_face_model(stem: Path, model: FaceModel) -> None:
 
 
 def read_face_model(stem: Path, remedy: str = "delete it and load the model again") -> FaceModel:
-    """Read what `write_face_model` wrote, without landmarks. Messages of errors end with `remedy`.
-
-    Raises:
-        UserError: a file is missing, damaged or of another version, or its arrays do not fit each other.
-    """
+    """Read what `write_face_model` wrote, without landmarks. Messages of errors end with `remedy`."""
     content = read_json(json_file(stem), FORMAT, VERSION, remedy=remedy)
     tensors = read_tensors(_tensor_file(stem), remedy=remedy)
     try:
@@ -136,11 +132,7 @@ def face_model_edition(model: FaceModel) -> str:
 
 
 def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
-    """Return the landmark sets of a face model: those that ship with mien, or those placed when the user added it.
-
-    Raises:
-        UserError: the landmarks were made for another mesh, or the name contains a path.
-    """
+    """Return the landmark sets of a face model: those that ship with mien, or those placed when the user added it."""
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
     name = name if coefficient_count(name) is None else BASE

@@ -44,11 +44,7 @@ def format_of(path: Path) -> Format | None:
 
 
 def find_format(name: str) -> Format | None:
-    """Return a format by its name, or by an ending without its dot; None if there is none.
-
-    Raises:
-        UserError: a package adds a format of that name, and it cannot be imported.
-    """
+    """Return a format by its name, or by an ending without its dot; None if there is none."""
     if all(each.name != name for each in _OWN):
         plugin(_GROUP, name, Format)
     return _first(lambda each: each.name == name or f".{name}" in each.endings)

@@ -16,11 +16,7 @@ _OR_CPU = "or leave --device cuda out to use the processor"
 
 
 def check_device(name: DeviceName) -> None:
-    """Check a device name as far as that is possible without torch.
-
-    Raises:
-        UserError: CUDA is asked for but gsplat is not installed.
-    """
+    """Check a device name as far as that is possible without torch."""
     if name == "cuda" and find_spec("gsplat") is None:
         raise UserError(
             "--device cuda: needs a CUDA GPU and gsplat, which is not installed; if there is such a GPU, install "
@@ -30,11 +26,7 @@ def check_device(name: DeviceName) -> None:
 
 
 def choose_device(name: DeviceName) -> "torch.device":
-    """The device for a name. Prints a message if it is a GPU, or if `auto` finds none.
-
-    Raises:
-        UserError: CUDA is asked for, but torch finds no GPU or gsplat is not installed.
-    """
+    """The device for a name. Prints a message if it is a GPU, or if `auto` finds none."""
     import torch
 
     if name == "cpu":

@@ -16,11 +16,7 @@ MAX_THREADS = 1024
 
 
 def asked_threads() -> int | None:
-    """The number of threads that MIEN_THREADS asks for, or None if it is not set.
-
-    Raises:
-        UserError: it is not a number from 1 to `MAX_THREADS`.
-    """
+    """The number of threads that MIEN_THREADS asks for, or None if it is not set."""
     text = os.environ.get(VARIABLE, "").strip()
     if not text:
         return None
@@ -33,11 +29,7 @@ def asked_threads() -> int | None:
 
 
 def thread_count() -> int:
-    """The number of threads that MIEN_THREADS asks for, or else the number of cores.
-
-    Raises:
-        UserError: MIEN_THREADS is not a number from 1 to `MAX_THREADS`.
-    """
+    """The number of threads that MIEN_THREADS asks for, or else the number of cores."""
     return asked_threads() or os.cpu_count() or 1
 
 

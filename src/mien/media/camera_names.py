@@ -53,9 +53,6 @@ def camera_named(by: str, camera_format: CameraFormat | None) -> CameraName:
     Args:
         by: `camera`, or `camera:` with a device, a file or an address.
         camera_format: What reads devices (default: by platform).
-
-    Raises:
-        UserError: there is no name after the colon, the device is a folder, or it does not exist.
     """
     chosen = camera_format or _FORMATS.get(sys.platform, "v4l2")
     device = by[len(_PREFIX) + 1 :] if ":" in by else _first_device(chosen)

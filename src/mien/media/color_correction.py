@@ -62,11 +62,7 @@ class ColorCorrection:
 
 
 def color_correction(matrix: Float[np.ndarray, "3 n"], where: str) -> ColorCorrection:
-    """Return the correction with these coefficients; `where` begins the message.
-
-    Raises:
-        UserError: no polynomial has so many terms.
-    """
+    """Return the correction with these coefficients; `where` begins the message."""
     if matrix.shape[1] not in _TERMS:
         raise UserError(
             f"{where}: has {matrix.shape[1]} terms for each channel; polynomials of Cheung 2004 have "
@@ -76,11 +72,7 @@ def color_correction(matrix: Float[np.ndarray, "3 n"], where: str) -> ColorCorre
 
 
 def correction_of_entry(entry: dict[str, Any], where: str) -> ColorCorrection | None:
-    """Return the correction in a camera's entry of a calibration file, or None if it has none.
-
-    Raises:
-        UserError: it is no matrix of three rows of numbers, or no polynomial has so many terms.
-    """
+    """Return the correction in a camera's entry of a calibration file, or None if it has none."""
     given = entry.get(NAME)
     if given is None:
         return None

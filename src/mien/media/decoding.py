@@ -31,11 +31,7 @@ _TIFF_WIDTHS, _TIFF_HEIGHTS = (256, 322), (257, 323)
 
 
 def decode_picture(path: Path, flags: int) -> np.ndarray | None:
-    """Decode a picture file with OpenCV's `flags`. None if it is no picture, or a damaged one.
-
-    Raises:
-        UserError: it has more pixels than `MAX_PICTURE_PIXELS`, or its file is larger than that of any such picture.
-    """
+    """Decode a picture file with OpenCV's `flags`. None if it is no picture, or a damaged one."""
     try:
         size = path.stat().st_size
         if size > _MAX_FILE_BYTES:

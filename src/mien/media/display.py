@@ -43,20 +43,12 @@ class Display:
         self._matrix: list[int] | None = None
 
     def size_of(self, frame: av.VideoFrame) -> tuple[int, int]:
-        """Return the width and height in pixels in which the frame is shown if it is not shrunk.
-
-        Raises:
-            UserError: these are too many pixels.
-        """
+        """Return the width and height in pixels in which the frame is shown if it is not shrunk."""
         width, height = self._shown_size(frame, 0)
         return (height, width) if _swaps_sides(self._display_matrix(frame)) else (width, height)
 
     def show(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the frame as an sRGB picture.
-
-        Raises:
-            UserError: the converted frame has too many pixels.
-        """
+        """Return the frame as an sRGB picture."""
         if _has_alpha(frame):
             return self._show_over_ground(frame)
         return self._turned(frame, self._converted(frame, *self._shown_size(frame, self._longest_side)))

@@ -64,11 +64,7 @@ class Lens:
 
 
 def lens_of_entry(entry: dict[str, Any], camera: Camera, where: str) -> Lens | None:
-    """Return the lens of a camera's entry in a calibration file, or None if it does not distort.
-
-    Raises:
-        UserError: the entry describes a distortion in another way, or coefficients that no picture can have.
-    """
+    """Return the lens of a camera's entry in a calibration file, or None if it does not distort."""
     others = [name for name in names_of_distortion(entry) if name != NAME]
     if others:
         raise UserError(

@@ -86,11 +86,7 @@ class LiveCamera:
         self._thread = threading.Thread(target=self._run, name="mien-camera", daemon=True)
 
     def __enter__(self) -> "LiveCamera":
-        """Open the camera.
-
-        Raises:
-            UserError: it cannot be opened. The message names the cameras that exist.
-        """
+        """Open the camera."""
         self._opened = self._open()
         return self
 

@@ -29,12 +29,7 @@ class Output:
 
 
 def plan_output(path: Path, frames: int, transparent: bool = False) -> Output:
-    """The output for the ending of `path`, checked before any work.
-
-    Raises:
-        UserError: the ending is not one of `ENDINGS`, or does not suit the number of frames or transparency; the place
-            cannot be written to, or already holds pictures of a longer sequence.
-    """
+    """The output for the ending of `path`, checked before any work."""
     ending = path.suffix.lower()
     if ending == ".png" and _NUMBER.search(path.name):
         output = Output(path, "sequence", transparent)

@@ -154,9 +154,6 @@ def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndar
         path: the file, which must not be a link.
         shape: the shape that the picture must have.
         remedy: advice for the message if the picture is missing or damaged.
-
-    Raises:
-        UserError: it is missing, damaged, or of another shape.
     """
     try:
         with open_to_read(path) as file:

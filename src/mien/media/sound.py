@@ -25,11 +25,7 @@ _WRITTEN_BITS = 160_000
 
 
 def read_sound(path: Path) -> Float32[np.ndarray, " n"]:
-    """The sound of a file as one channel, -1..1, with `RATE` samples a second.
-
-    Raises:
-        UserError: the file is missing, has no sound, is damaged from its beginning, or is longer than an hour.
-    """
+    """The sound of a file as one channel, -1..1, with `RATE` samples a second."""
     # FFmpeg would make one channel of two louder than each.
     parts = [frame.to_ndarray().mean(0) for frame in _resampled(path, "fltp", None, RATE)]
     return np.nan_to_num(np.concatenate(parts).astype(np.float32))
@@ -86,11 +82,7 @@ def _decoded(container: InputContainer, stream: av.AudioStream) -> Iterator[av.A
 def _converted(
     path: Path, frames: Iterator[av.AudioFrame], sample: str, layout: str | None, rate: int
 ) -> Iterator[av.AudioFrame]:
-    """The frames in another format. The first one whose rate or channels differ from those before begins anew.
-
-    Raises:
-        UserError: the rate is one that no sound has, or the frames cannot be converted.
-    """
+    """The frames in another format. The first one whose rate or channels differ from those before begins anew."""
     resampler, kind = None, None
     try:
         for frame in frames:

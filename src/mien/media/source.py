@@ -91,11 +91,7 @@ class FrameSource:
     """Correction of the pictures' colours. None for colours as filmed."""
 
     def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
-        """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0.
-
-        Raises:
-            UserError: a frame cannot be decoded, or the selection leaves no frame.
-        """
+        """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0."""
         if self.path.is_dir():
             everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
         else:
@@ -136,11 +132,7 @@ class FrameSource:
         return self.calibrated(picture())
 
     def count(self) -> int:
-        """Count the frames in the source, with those that the selection leaves out.
-
-        Raises:
-            UserError: the source is damaged.
-        """
+        """Count the frames in the source, with those that the selection leaves out."""
         return len(list_images(self.path)) if self.path.is_dir() else count_frames(self.path, self.stream)
 
 
@@ -161,9 +153,6 @@ def open_source(
         quarter_turns: number of quarter turns clockwise.
         deinterlace: which frames of a video are deinterlaced.
         stream: index of a video's stream; by default that of `mien.media.video_file.find_streams`.
-
-    Raises:
-        UserError: the source is missing, is no video, lacks the stream, or holds no images.
     """
     info = None
     if path.is_dir():
@@ -206,11 +195,7 @@ def _swapped(size: Callable[[], tuple[int, int]]) -> tuple[int, int]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List the images in a folder, `2.png` before `10.png`.
-
-    Raises:
-        UserError: there are no images.
-    """
+    """List the images in a folder, `2.png` before `10.png`."""
     entries = listed(folder)
     images = [path for path in entries if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     if not images:
@@ -228,11 +213,7 @@ def _parts(name: str) -> list[str]:
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read an 8-bit sRGB picture, turned by its EXIF orientation.
-
-    Raises:
-        UserError: it is missing, damaged or too large.
-    """
+    """Read an 8-bit sRGB picture, turned by its EXIF orientation."""
     image = decode_picture(path, cv2.IMREAD_COLOR_RGB)
     if image is None:
         raise UserError(f"{path}: cannot be read as an image; remove or replace it")

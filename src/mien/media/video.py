@@ -77,9 +77,6 @@ def probe_video(path: Path, wanted: int | None = None) -> VideoInfo:
     Args:
         path: path of the video.
         wanted: index of the stream that is read; by default that of `find_streams`.
-
-    Raises:
-        UserError: the file is missing, is no video, or lacks the stream.
     """
     with open_video(path, wanted) as (container, stream):
         fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
@@ -115,11 +112,7 @@ def _first_frame(container: InputContainer, stream: VideoStream) -> av.VideoFram
 
 
 def count_frames(path: Path, wanted: int | None = None) -> int:
-    """Count the frames in a video's stream (`probe_video`) by reading its packets without decoding them.
-
-    Raises:
-        UserError: the file is missing or is no video.
-    """
+    """Count the frames in a video's stream (`probe_video`) by reading its packets without decoding them."""
     with open_video(path, wanted) as (container, stream):
         try:
             # An edit list discards frames that others need for decoding.
@@ -140,9 +133,6 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
     Args:
         path: path of the video.
         longest_side: side in pixels to which larger pictures are shrunk (area-averaged). 0 keeps the size.
-
-    Raises:
-        UserError: the file is missing, is no video, or no frame of it can be decoded.
     """
     first: tuple[int, int] | None = None
     for frame in read_lazily(path, longest_side):
@@ -203,9 +193,6 @@ def write_video(
         crf: x264's constant rate factor: 0 is lossless, 18 looks lossless, 51 is worst.
         preset: x264's preset. `veryfast` takes a third of the time and compresses somewhat worse.
         sound: a file with sound for the video, and the video's length in seconds.
-
-    Raises:
-        UserError: `frames` is empty, or the file cannot be written.
     """
     iterator = iter(frames)
     first = next(iterator, None)

@@ -75,10 +75,6 @@ def open_video(path: Path, wanted: int | None = None) -> Iterator[tuple[InputCon
     Args:
         path: path of the file.
         wanted: index of the stream. By default it is the first one that `find_streams` returns.
-
-    Raises:
-        UserError: the file is missing, is no video, has a container or codec that is not supported, lacks the wanted
-            stream, or has pictures of more than `MAX_FRAME_PIXELS` pixels.
     """
     with _open_container(path, "video") as container:
         stream = _moving_pictures(path, container, wanted)
@@ -92,9 +88,6 @@ def find_streams(path: Path) -> list[int]:
 
     Covers, thumbnails, streams of one packet and streams of more than 1,000 frames a second come last. Of the others,
     streams that the file marks as default come first, then those with more pixels.
-
-    Raises:
-        UserError: as `open_video` does.
     """
     with _open_container(path, "video") as container:
         return [stream.index for stream in _rank(path, _known_pictures(path, container))]
@@ -104,9 +97,6 @@ def read_container_tags(path: Path, index: int) -> tuple[Colors, int]:
     """Return the colours of a stream and the order of its fields (FFmpeg's code) as its container states them.
 
     FFmpeg replaces them by what the first pictures say as soon as it may decode them, so it may not here.
-
-    Raises:
-        UserError: as `open_video` does.
     """
     with _open_container(path, "video", {"codec_whitelist": "none"}) as container:
         context = _moving_pictures(path, container, index).codec_context
@@ -115,11 +105,7 @@ def read_container_tags(path: Path, index: int) -> tuple[Colors, int]:
 
 @contextmanager
 def open_sound(path: Path) -> Iterator[tuple[InputContainer, AudioStream]]:
-    """Open a file and its stream of sound, chosen by the rule of `find_streams`, ready to be decoded.
-
-    Raises:
-        UserError: the file is missing, is neither sound nor video, or has no sound that can be decoded.
-    """
+    """Open a file and its stream of sound, chosen by the rule of `find_streams`, ready to be decoded."""
     with _open_container(path, "sound") as container:
         streams = [stream for stream in container.streams.audio if stream.codec_context is not None]
         if not streams:

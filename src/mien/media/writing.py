@@ -36,9 +36,6 @@ def write_pictures(
     """Write pictures (RGB, or RGBA if `output.transparent`), all of one size. Each file is written atomically.
 
     An .mp4 may have the sound of a file, for a length in seconds.
-
-    Raises:
-        UserError: there are no pictures, or they cannot be written.
     """
     try:
         if output.kind == "mp4":

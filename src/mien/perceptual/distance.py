@@ -109,9 +109,5 @@ def _pool(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
 
 @lru_cache(maxsize=1)
 def load_perceptual(backbone: Backbone = "st-lpips-alex") -> PerceptualDistance:
-    """The trained distance, ready for use on the CPU (10 MB).
-
-    Raises:
-        UserError: the package with the weights is not installed, or its file is missing or damaged.
-    """
+    """The trained distance, ready for use on the CPU (10 MB)."""
     return build_from_weights(backbone, PerceptualDistance).eval().requires_grad_(False)

@@ -79,10 +79,6 @@ def _pool(values: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c y x"]:
 def load_training_features(
     device: str = "cpu", dtype: torch.dtype = torch.float32, blocks: int = 2
 ) -> TrainingFeatures:
-    """The features, ready for use on a device.
-
-    Raises:
-        UserError: the package with the weights is not installed, or its file is missing or damaged.
-    """
+    """The features, ready for use on a device."""
     built = build_from_weights("st-lpips-vgg", lambda state: TrainingFeatures(state, blocks))
     return built.eval().requires_grad_(False).to(device, dtype)

@@ -94,12 +94,7 @@ class Lpips:
 
 @lru_cache(maxsize=1)
 def load_lpips(path: Path) -> Lpips:
-    """LPIPS by the trunk in torchvision's file.
-
-    Raises:
-        UserError: the file is another one than torchvision published, so that figures would not be those of papers, or
-            the package with the factors is not installed.
-    """
+    """LPIPS by the trunk in torchvision's file."""
     known = " or ".join(trunk.file for trunk in TRUNKS)
     if not path.is_file():
         raise UserError(f"--lpips-weights {path}: no such file; give torchvision's {known}")
@@ -111,11 +106,7 @@ def load_lpips(path: Path) -> Lpips:
 
 
 def build_lpips(trunk: _Trunk, path: Path, heads: Path) -> Lpips:
-    """LPIPS from two files.
-
-    Raises:
-        UserError: one of them is damaged.
-    """
+    """LPIPS from two files."""
     try:
         loaded = [
             torch.load(io.BytesIO(read_bytes(file, _MAX_BYTES)), map_location="cpu", weights_only=True)

@@ -23,11 +23,7 @@ Built = TypeVar("Built")
 
 
 def build_from_weights(name: str, build: Callable[[dict[str, Tensor]], Built]) -> Built:
-    """Call `build` with the trained tensors of a backbone, by name.
-
-    Raises:
-        UserError: the package with the weights is not installed, or its file is missing or damaged.
-    """
+    """Call `build` with the trained tensors of a backbone, by name."""
     path = weights_path(name)
     try:
         return build(torch.load(path, map_location="cpu", weights_only=True))
@@ -39,11 +35,7 @@ def build_from_weights(name: str, build: Callable[[dict[str, Tensor]], Built]) -
 
 
 def weights_path(name: str) -> Path:
-    """The path of a backbone's weights in the installed package, which is found without importing it.
-
-    Raises:
-        UserError: the package is not installed.
-    """
+    """The path of a backbone's weights in the installed package, which is found without importing it."""
     spec = importlib.util.find_spec(PACKAGE)
     folders = spec.submodule_search_locations if spec is not None else None
     if not folders:

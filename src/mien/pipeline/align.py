@@ -111,11 +111,7 @@ def _folder(sequence: Sequence) -> Path:
 
 
 def _before(sequence: Sequence) -> Tracking:
-    """The tracking before any alignment.
-
-    Raises:
-        UserError: the file that holds it is missing or damaged.
-    """
+    """The tracking before any alignment."""
     tracking = sequence.tracking
     if not _aligned(tracking):
         return tracking

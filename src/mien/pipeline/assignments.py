@@ -49,9 +49,6 @@ def assign(
 
     Names of gaze turn the eyes from where they look. A preset face is added to `expression`, so that it starts from the
     person at rest. Of two names that set the same expression, the last one counts.
-
-    Raises:
-        UserError: an assignment is not NAME=NUMBER, the face has no such name, or the number is out of its range.
     """
     set_to, turned, look = expression.copy(), joints.copy(), dict[str, float]()
     angles = turned.reshape(*turned.shape[:-2], -1)

@@ -19,11 +19,7 @@ from mien.storage import check_writable
 def run_capture_stage(
     workspace: Workspace, video: Path, name: str | None, settings: CaptureSettings, replace: bool = False
 ) -> list[str]:
-    """Capture a video into the workspace; return the names of its sequences, one for each part.
-
-    Raises:
-        UserError: the video is bad, or without `replace` a sequence of that name was made from another source.
-    """
+    """Capture a video into the workspace; return the names of its sequences, one for each part."""
     name = sequence_name(video, name)
     check_writable(workspace.root, folder=True)
     captures = capture_video_parts(video, workspace.root / "sequences", settings, name, replace)
@@ -40,11 +36,7 @@ def run_calibrated_capture_stage(
     settings: CaptureSettings,
     replace: bool = False,
 ) -> list[str]:
-    """Capture what several calibrated cameras filmed as one sequence, and return its name in a list.
-
-    Raises:
-        UserError: the calibration or a video is bad, or without `replace` a sequence of that name has other sources.
-    """
+    """Capture what several calibrated cameras filmed as one sequence, and return its name in a list."""
     name = rig_name(sources, calibration, names)
     check_writable(workspace.root, folder=True)
     out = workspace.sequence_dir(name) / "capture"
@@ -53,11 +45,7 @@ def run_calibrated_capture_stage(
 
 
 def check_camera_ids(calibration: Path, ids: Sequence[str]) -> None:
-    """Check that the cameras to hold out are in the calibration, before any work.
-
-    Raises:
-        UserError: one is not, or the calibration is damaged.
-    """
+    """Check that the cameras to hold out are in the calibration, before any work."""
     known = [camera.camera_id for camera in read_calibration(calibration)]
     for camera_id in ids:
         if camera_id not in known:

@@ -94,9 +94,6 @@ def run_compare_stage(
         captures: Names of reference captures, which are drawn, captured and tracked first.
         settings: Methods and budget.
         as_json: Whether the result is printed as json.
-
-    Raises:
-        UserError: a capture cannot be read or trained on, or another process is comparing in the same folder.
     """
     references = [reference_named(name) for name in captures]
     with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):

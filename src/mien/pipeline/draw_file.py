@@ -23,11 +23,7 @@ CameraPath = Callable[[runtime.Camera, np.ndarray], Sequence[runtime.Camera]]
 def render_file(
     source: Path, output: Output, options: PictureOptions, assignments: Sequence[str], view: "View", fps: float
 ) -> None:
-    """Draw the avatar in a file along a camera path.
-
-    Raises:
-        UserError: the file is damaged, an expression is unknown, or the pictures cannot be written.
-    """
+    """Draw the avatar in a file along a camera path."""
     avatar = runtime.load(source)
     gaussians = _posed(avatar, assignments)
     cameras = view.cameras(avatar, options)

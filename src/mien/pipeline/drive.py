@@ -48,9 +48,6 @@ def open_driver(
         face_model: The avatar's face model.
         fps: Frame rate of the timecode in a csv.
         neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.with_neutral`).
-
-    Raises:
-        UserError: `by` or `neutral` is none of these, or a stage fails.
     """
     check_driver(by, sequence, fps)
     check_neutral(neutral)

@@ -52,9 +52,6 @@ class RunContent:
             run: Name of the run.
             expression: Settings of the face, NAME=VALUE, on top of the person's neutral and of the series.
             series: The motion, if there is one.
-
-        Raises:
-            UserError: the run has no avatar, or it is damaged.
         """
         self._workspace, self._run_dir = workspace, workspace.run_dir(run)
         self._expression, self._series = expression, series
@@ -132,11 +129,7 @@ class RunContent:
 
 
 def export(content: RunContent, out: Path, kind: Format, options: Options) -> None:
-    """Write the avatar of a run in a format, and report it. A motion becomes numbered files if a file holds one pose.
-
-    Raises:
-        UserError: the avatar cannot be written so, or a file cannot be written.
-    """
+    """Write the avatar of a run in a format, and report it. A motion becomes numbered files if a file holds one pose."""
     moving = content.poses() if kind.holds == "pose" else None
     if moving is None:
         say(f"{out}: reads the run and writes the file, which takes up to half a minute")

@@ -17,11 +17,7 @@ from mien.training.splits.own import OWN_SPLIT, read_own_split
 
 
 def settings_of(workspace: Workspace, sequence: str, run: str | None, split: Split | None) -> TrainSettings:
-    """Return what is held out: as a run holds it out, or by a split, or by the split of the dataset or the default.
-
-    Raises:
-        UserError: the run was not trained on the sequence, or the sequence has no such split.
-    """
+    """Return what is held out: as a run holds it out, or by a split, or by the split of the dataset or the default."""
     if run is not None:
         folder = workspace.run_dir(run)
         config = read_run_config(folder)
@@ -44,11 +40,7 @@ def settings_of(workspace: Workspace, sequence: str, run: str | None, split: Spl
 def export_capture(
     workspace: Workspace, sequence: str, layout: Layout, out: Path, settings: TrainSettings, mattes: MatteKind
 ) -> None:
-    """Write a tracked sequence into a new folder, and report it.
-
-    Raises:
-        UserError: it cannot be read, does not fit the layout, or a file cannot be written.
-    """
+    """Write a tracked sequence into a new folder, and report it."""
     (read,), face_model = read_together(workspace, [sequence])
     filmed = filmed_frames(read, face_model, settings, mattes)
     say(f"{out}: {write_layout(out, filmed, layout)}")

@@ -13,12 +13,7 @@ from mien.runtime.named import is_gaze, parts_of
 
 
 def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, ...]) -> FaceParams:
-    """`face` with expressions and joint angles set by name at every timestep (`mien.pipeline.assignments.assign`).
-
-    Raises:
-        UserError: an assignment is not NAME=NUMBER, the face model has no such expression or joint, or the number is
-            out of its range.
-    """
+    """`face` with expressions and joint angles set by name at every timestep (`mien.pipeline.assignments.assign`)."""
     if not assignments:
         return face
     before = (face.expression.detach().cpu().numpy(), face.joints.detach().cpu().numpy())

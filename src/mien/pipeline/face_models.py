@@ -24,11 +24,7 @@ number in `EmbeddingSettings`."""
 
 
 def face_model_of(choice: str) -> FaceModel:
-    """The face model of a name or a file. A file is added at its first use.
-
-    Raises:
-        UserError: there is no such model, or the file is not a face model.
-    """
+    """The face model of a name or a file. A file is added at its first use."""
     path = Path(choice).expanduser()
     if path.suffix.lower() in SUFFIXES or is_ict_folder(path):
         return add_face_model_file(path)
@@ -45,9 +41,6 @@ def add_face_model_file(path: Path, name: str | None = None, shareable: bool = F
 
     The default name is the file's; ICT-FaceKit is `ict`. Landmarks are placed by running the landmark detector on
     pictures of the model (some minutes, once). With `teeth`, FLAME gets those of GaussianAvatars.
-
-    Raises:
-        UserError: the file is missing, damaged or in another schema, or the name is taken.
     """
     name = name or default_name(path)
     if not name.replace("-", "").replace("_", "").isalnum():

@@ -53,11 +53,7 @@ class CameraOptions:
 
 
 def run_following_stage(avatar: Path, run: str | None, name: CameraName, options: CameraOptions) -> None:
-    """Show an avatar that follows a camera, until Ctrl-C; with a recording of a file, until the file ends.
-
-    Raises:
-        UserError: the camera cannot be opened, or the recording cannot be written.
-    """
+    """Show an avatar that follows a camera, until Ctrl-C; with a recording of a file, until the file ends."""
     viewed = open_viewed(avatar, run)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh)
     switch = switch_of(session, viewed, name, options.follow, again=options.out is None)

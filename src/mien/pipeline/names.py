@@ -13,11 +13,7 @@ from mien.machine.terminal import plain_name
 
 
 def sequence_name(video: Path, name: str | None) -> str:
-    """`name`, or the video's name without its ending (with "_" for control characters), if a folder can have it.
-
-    Raises:
-        UserError: the name is empty, too long, or holds path separators or control characters.
-    """
+    """`name`, or the video's name without its ending (with "_" for control characters), if a folder can have it."""
     name = plain_name(video.stem) if name is None else name
     if not is_plain_name(name):
         raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
@@ -25,41 +21,24 @@ def sequence_name(video: Path, name: str | None) -> str:
 
 
 def check_new_run(run_dir: Path) -> None:
-    """Check that there is no run of this name yet.
-
-    Raises:
-        UserError: there is one.
-    """
+    """Check that there is no run of this name yet."""
     if run_dir.exists():
         raise UserError(f"{run_dir}: is there already; give the imported run another name (--run NAME)")
 
 
 def check_new_sequence(folder: Path) -> None:
-    """Check that there is no sequence of this name yet.
-
-    Raises:
-        UserError: there is one.
-    """
+    """Check that there is no sequence of this name yet."""
     if folder.exists():
         raise UserError(f"{folder}: is there already; delete it to import it again, or import into another workspace")
 
 
 def run_name(name: str) -> str:
-    """`name`, if a folder can have it.
-
-    Raises:
-        UserError: the name is empty, too long, or holds path separators or control characters.
-    """
+    """`name`, if a folder can have it."""
     return sequence_name(Path(name), name)
 
 
 def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
-    """A name for each video: the given names, or else the names of the videos.
-
-    Raises:
-        UserError: there is no video, a video is missing, the number of names is wrong, two names are equal, or no
-            folder can have a name.
-    """
+    """A name for each video: the given names, or else the names of the videos."""
     if not videos:
         raise UserError("no video given; write mien create VIDEO [VIDEO ...] --out DIR")
     for video in videos:
@@ -76,11 +55,7 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
 
 
 def check_videos(videos: Sequence[Path]) -> None:
-    """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture.
-
-    Raises:
-        UserError: a file is no video, or one that cannot be opened, or a picture; or a folder is a workspace.
-    """
+    """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture."""
     for video in videos:
         check_no_workspace(video)
         if video.is_file() and is_picture(video):
@@ -88,11 +63,7 @@ def check_videos(videos: Sequence[Path]) -> None:
 
 
 def is_picture(file: Path) -> bool:
-    """Whether a file is a single picture.
-
-    Raises:
-        UserError: it is neither a picture nor a video, or cannot be opened.
-    """
+    """Whether a file is a single picture."""
     from mien.media.video_file import open_video
 
     with open_video(file) as (container, _):
@@ -100,11 +71,7 @@ def is_picture(file: Path) -> bool:
 
 
 def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
-    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder.
-
-    Raises:
-        UserError: a file is missing, more than one name is given, or there is neither a name nor a folder.
-    """
+    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder."""
     if calibration.is_dir():
         raise UserError(f"--calibration {calibration}: is a folder; give the json file of its cameras (docs/using.md)")
     if not calibration.is_file():

@@ -31,11 +31,7 @@ class PictureOptions:
     colours)."""
 
     def plan(self, out: Path, frames: int) -> "mien.media.output.Output":
-        """The output of the pictures, checked before any work.
-
-        Raises:
-            UserError: a size, the background or the output is not possible.
-        """
+        """The output of the pictures, checked before any work."""
         from mien.media.output import plan_output
 
         wide, high = self.shape()
@@ -55,11 +51,7 @@ class PictureOptions:
         return wide, high
 
     def color(self) -> tuple[float, float, float]:
-        """The background's colour. It is black for transparent pictures.
-
-        Raises:
-            UserError: it is not a colour.
-        """
+        """The background's colour. It is black for transparent pictures."""
         if self.background == "transparent":
             return _NAMED["black"]
         if self.background in _NAMED:

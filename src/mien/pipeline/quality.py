@@ -65,11 +65,7 @@ _UNSEEN = ScoreSettings(perceptual_frames=2)
 def run_quality_stage(
     out: Path, captures: tuple[str, ...], method: str, steps: int, *, aligned: bool, as_json: bool
 ) -> None:
-    """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png.
-
-    Raises:
-        UserError: a capture or the method is unknown, or another process is running them in the same folder.
-    """
+    """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png."""
     references = [reference_named(name) for name in captures or _default_captures()]
     method_named(method)
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):

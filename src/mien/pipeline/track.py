@@ -113,11 +113,7 @@ def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overla
 
 
 def check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
-    """Check that the sequences to track apart exist, and that others remain.
-
-    Raises:
-        UserError: one does not exist, or none remains.
-    """
+    """Check that the sequences to track apart exist, and that others remain."""
     unknown = [name for name in hold_out if name not in names]
     if unknown:
         raise UserError(f"--hold-out {unknown[0]}: no such sequence; there are: {', '.join(names)}")

@@ -21,12 +21,7 @@ from mien.training.trainer import check_trackings, train
 
 
 def fill_in_named_split(workspace: Workspace, settings: TrainSettings, split: NamedSplit) -> TrainSettings:
-    """The settings with what a named split holds out, after a message that says so.
-
-    Raises:
-        UserError: the settings hold out something else, a sequence lacks the camera of novel views, or a capture cannot
-            be read.
-    """
+    """The settings with what a named split holds out, after a message that says so."""
     cameras = {name: read_capture(workspace.sequence_dir(name) / "capture").camera_ids for name in split.sequences}
     settings = with_named_split(settings, split, cameras)
     left_out = f"; not used: {', '.join(split.left_out)}" if split.left_out else ""
@@ -38,11 +33,7 @@ def fill_in_named_split(workspace: Workspace, settings: TrainSettings, split: Na
 
 
 def fill_in_benchmark_split(workspace: Workspace, settings: TrainSettings, names: list[str]) -> TrainSettings:
-    """The settings with what the NeRSemble benchmark holds out, after a message that says so.
-
-    Raises:
-        UserError: nothing of it is there, or the settings hold out something else.
-    """
+    """The settings with what the NeRSemble benchmark holds out, after a message that says so."""
     cameras = {name: read_capture(workspace.sequence_dir(name) / "capture").camera_ids for name in names}
     settings = with_benchmark_split(settings, names, cameras)
     parts = {"sequences": settings.held_out_sequences, "cameras": settings.held_out_cameras}
@@ -52,11 +43,7 @@ def fill_in_benchmark_split(workspace: Workspace, settings: TrainSettings, names
 
 
 def fill_in_own_split(workspace: Workspace, settings: TrainSettings, names: list[str]) -> TrainSettings:
-    """The settings with the sequences and cameras that the dataset's authors held out, after a message that says so.
-
-    Raises:
-        UserError: a sequence has no split, or the settings hold out something else.
-    """
+    """The settings with the sequences and cameras that the dataset's authors held out, after a message that says so."""
     splits = {name: read_own_split(workspace.sequence_dir(name)) for name in names}
     timesteps = {name: read_capture(workspace.sequence_dir(name) / "capture").timesteps for name in names}
     settings = with_own_split(settings, splits, timesteps)
@@ -71,11 +58,7 @@ def fill_in_own_split(workspace: Workspace, settings: TrainSettings, names: list
 
 
 def read_together(workspace: Workspace, names: list[str]) -> tuple[list[Sequence], FaceModel]:
-    """Read sequences that were tracked together, and the face model that fits them.
-
-    Raises:
-        UserError: a part is missing, damaged or being written, or they were tracked apart.
-    """
+    """Read sequences that were tracked together, and the face model that fits them."""
     folders = [workspace.sequence_dir(name) for name in names]
 
     def read() -> tuple[list[Sequence], FaceModel]:

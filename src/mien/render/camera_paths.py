@@ -100,9 +100,6 @@ def read_cameras(path: Path) -> list[Camera]:
 
     {"format": "mien.cameras", "version": 1, "cameras": [{"K": 3x3, "viewmat": 4x4, "width": .., "height": ..}, ...]}
     Intrinsics are in pixels. World-to-camera matrices have OpenCV axes and metres (docs/conventions.md).
-
-    Raises:
-        UserError: the file is missing or damaged, or a camera is incomplete, not finite, or not a rigid view.
     """
     entries = read_camera_entries(path, "give one camera for every frame")
     for index, entry in enumerate(entries):
@@ -115,11 +112,7 @@ def read_cameras(path: Path) -> list[Camera]:
 
 
 def read_camera_entries(path: Path, remedy: str) -> list[Any]:
-    """Read the entries of a json file of cameras, of which `camera_of_entry` makes cameras.
-
-    Raises:
-        UserError: the file is missing or damaged, or has no entry. The message then ends with `remedy`.
-    """
+    """Read the entries of a json file of cameras, of which `camera_of_entry` makes cameras."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a json file of cameras (docs/using.md)")
     try:
@@ -174,11 +167,7 @@ def _is_nothing(value: Any) -> bool:
 
 
 def camera_of_entry(entry: Any, where: str) -> Camera:
-    """Make a camera from its entry in a json file; `where` begins the messages.
-
-    Raises:
-        UserError: the camera is incomplete, not finite, or not a rigid view.
-    """
+    """Make a camera from its entry in a json file; `where` begins the messages."""
     missing = [name for name in ("K", "viewmat", "width", "height") if not isinstance(entry, dict) or name not in entry]
     if missing:
         raise UserError(f"{where}: has no {', '.join(missing)}; give K [3][3], viewmat [4][4], width and height")

@@ -64,9 +64,6 @@ def drawable(what: str, remedy: str) -> Iterator[None]:
     Args:
         what: What cannot be drawn, for the start of the message.
         remedy: What to do about it, for the end of the message.
-
-    Raises:
-        UserError: A rasterizer found NaN or infinity, or Gaussians on more tiles than it can count.
     """
     try:
         yield

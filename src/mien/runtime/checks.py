@@ -36,11 +36,7 @@ _MAX_LOG_SCALE = 30
 
 
 def check(avatar: PortableAvatar, where: str) -> None:
-    """Check that numbers are moderate, indices are within their arrays, and there are as many names as rows.
-
-    Raises:
-        UserError: a check fails. `where` names the file in the message.
-    """
+    """Check that numbers are moderate, indices are within their arrays, and there are as many names as rows."""
     for reason in _faults(avatar):
         raise UserError(f"{where}: {reason}; export it again with `mien export`")
 

@@ -63,11 +63,7 @@ def read_portable(path: Path) -> PortableAvatar:
 
 
 def to_arrays(path: Path, avatar: PortableAvatar) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header of the metadata, and the arrays by name, as the .mien file of an avatar has them.
-
-    Raises:
-        UserError: an array holds NaN or infinity. The message names `path`.
-    """
+    """The header of the metadata, and the arrays by name, as the .mien file of an avatar has them."""
     check(avatar, str(path))
     arrays: dict[str, np.ndarray] = {}
     content = _tree(avatar, "", arrays)
@@ -76,11 +72,7 @@ def to_arrays(path: Path, avatar: PortableAvatar) -> tuple[dict[str, Any], dict[
 
 
 def from_arrays(path: Path, header: Any, arrays: dict[str, np.ndarray]) -> PortableAvatar:
-    """The avatar of a header and arrays as `to_arrays` returns them. All of its content is checked.
-
-    Raises:
-        UserError: they are damaged, of another version, or not of a .mien file. The message names `path`.
-    """
+    """The avatar of a header and arrays as `to_arrays` returns them. All of its content is checked."""
     try:
         found = (header.get("format"), header.get("version"))
         if found == (None, None):

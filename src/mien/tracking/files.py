@@ -97,11 +97,7 @@ def _read_tracking(path: Path) -> Tracking:
 
 
 def check_tracking_of(capture: Capture, tracking: Tracking, where: Path) -> None:
-    """Check that a tracking has the timesteps, cameras and picture sizes of a capture.
-
-    Raises:
-        UserError: It has not. The message names `where`, the tracking's folder.
-    """
+    """Check that a tracking has the timesteps, cameras and picture sizes of a capture."""
     sizes = {(camera.width, camera.height) for camera in tracking.cameras}
     found = (len(tracking.face), len(tracking.cameras), sizes)
     if found != (capture.timesteps, len(capture.camera_ids), {(capture.width, capture.height)}):

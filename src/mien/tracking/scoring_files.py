@@ -37,9 +37,6 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str) -> None:
         path: The folder.
         scoring: The scoring.
         capture_hash: Hash of the capture that it belongs to.
-
-    Raises:
-        UserError: There is a scoring that cannot be read.
     """
     if scoring_exists(path, capture_hash):
         return
@@ -55,11 +52,7 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str) -> None:
 
 
 def check_scoring_cut(path: Path, settings: ScoringSettings, capture_hash: str) -> None:
-    """Check that the masks in the folder `path`, if there are any of this capture, have the cut of the settings.
-
-    Raises:
-        UserError: They have another cut. Masks are written once, because scores of other masks do not compare.
-    """
+    """Check that the masks in the folder `path`, if there are any of this capture, have the cut of the settings."""
     if not scoring_exists(path, capture_hash):
         return
     cut = _cut_of(path, read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE))
@@ -77,9 +70,6 @@ def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
     Args:
         path: The folder.
         capture_hash: Hash of the capture that it must belong to; None for any.
-
-    Raises:
-        UserError: A file is missing, damaged, changed, of another capture, being written, or a link.
     """
     return read_beside_writers(lambda: _read_scoring(path, capture_hash), [path], [path.parent])
 
@@ -124,11 +114,7 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
 
 
 def read_scoring_hash(path: Path) -> str:
-    """The hash of masks and crops of a scoring on disk, without reading them.
-
-    Raises:
-        UserError: There is no scoring, or it has another version.
-    """
+    """The hash of masks and crops of a scoring on disk, without reading them."""
     return str(read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE).get("sha256"))
 
 

@@ -95,9 +95,6 @@ def align(
 
     Returns:
         The face parameters of each sequence.
-
-    Raises:
-        UserError: as `mien.training.trainer.train`.
     """
     config = overlay(
         PRESETS["draft"].config(DEFAULT_METHOD),

@@ -28,9 +28,5 @@ class AlignmentSettings:
     metres, joint angles by 3 times and expression coefficients by 10 times as much."""
 
     def check(self) -> None:
-        """Check that all numbers are in their ranges.
-
-        Raises:
-            UserError: a number is out of range. The message names the option, its value and the range.
-        """
+        """Check that all numbers are in their ranges."""
         check_ranges(self, lambda name: f"--alignment.{name.replace('_', '-')}")

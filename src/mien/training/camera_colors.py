@@ -74,9 +74,6 @@ class CameraColors:
         frames: The frames that are trained on.
         settings: The settings of the run.
         like: The maps have its dtype and its device.
-
-    Raises:
-        UserError: only one camera is trained on.
     """
 
     def __init__(self, sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor):
@@ -107,22 +104,14 @@ class CameraColors:
 def camera_colors(
     sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor
 ) -> CameraColors | None:
-    """The colour transforms of a run, or None if its settings ask for none.
-
-    Raises:
-        UserError: only one camera is trained on.
-    """
+    """The colour transforms of a run, or None if its settings ask for none."""
     return None if settings.camera_colors == "none" else CameraColors(sequences, frames, settings, like)
 
 
 def camera_colors_part(
     sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor
 ) -> TrainingPart | None:
-    """`camera_colors` as a part of a training.
-
-    Raises:
-        UserError: only one camera is trained on.
-    """
+    """`camera_colors` as a part of a training."""
     colors = camera_colors(sequences, frames, settings, like)
     if colors is None:
         return None

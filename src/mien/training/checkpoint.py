@@ -83,9 +83,6 @@ def resume(folder: Path, state: TrainingState, first_record: int) -> None:
     """Restore the newest readable checkpoint into `state`, which is that of the run's start. There may be none.
 
     Reports damaged checkpoints, and where training continues instead. Curves are empty before step `first_record`.
-
-    Raises:
-        UserError: a checkpoint belongs to another method or to other settings.
     """
     damaged = False
     for path in reversed(checkpoint_files(folder)):

@@ -128,9 +128,6 @@ def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]
     Args:
         run_dir: The run's folder.
         lengths: Number of timesteps of each sequence.
-
-    Raises:
-        UserError: they are damaged, or of other sequences.
     """
     path = run_dir / GAINS
     if not path.exists():

@@ -57,11 +57,7 @@ _FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
 
 
 def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodConfig, settings: TrainSettings) -> None:
-    """Write config.json, or check that the existing one asks for the same run.
-
-    Raises:
-        UserError: the folder holds a run with other settings, method or data.
-    """
+    """Write config.json, or check that the existing one asks for the same run."""
     check_tree(run_dir)
     names = [sequence.name for sequence in sequences]
     if check_run(run_dir, method_config, settings, names):
@@ -79,11 +75,7 @@ def claim_run(run_dir: Path, sequences: Items[Sequence], method_config: MethodCo
 def check_run(
     run_dir: Path, method_config: MethodConfig, settings: TrainSettings, names: Items[str] | None = None
 ) -> bool:
-    """Whether the folder already holds a run. If so, check that it has these choices (and sequences).
-
-    Raises:
-        UserError: it holds a different run.
-    """
+    """Whether the folder already holds a run. If so, check that it has these choices (and sequences)."""
     if not (run_dir / "config.json").is_file():
         return False
     found = read_run_config(run_dir)
@@ -104,9 +96,6 @@ def check_videos(run_dir: Path, names: Items[str], known: Items[str]) -> None:
         run_dir: folder of the run, which may be missing.
         names: names of the videos. One with cuts becomes NAME-1, NAME-2, ...
         known: names of the workspace's sequences. Those that are known may be left out of a run.
-
-    Raises:
-        UserError: it was trained on others.
     """
     if not (run_dir / "config.json").is_file():
         return
@@ -126,11 +115,7 @@ def is_part_of(sequence: str, name: str) -> bool:
 
 
 def check_data(run_dir: Path, trackings: Mapping[str, Tracking]) -> None:
-    """Check that sequences were not tracked again since a run was trained on them.
-
-    Raises:
-        UserError: some were tracked again.
-    """
+    """Check that sequences were not tracked again since a run was trained on them."""
     outdated = outdated_sequences(run_dir, trackings)
     if outdated:
         raise UserError(
@@ -147,11 +132,7 @@ def outdated_sequences(run_dir: Path, trackings: Mapping[str, Tracking]) -> list
 
 
 def read_run_config(run_dir: Path) -> dict[str, Any]:
-    """The content of config.json: method, settings, data, mien (version) and command_line.
-
-    Raises:
-        UserError: it is missing or damaged.
-    """
+    """The content of config.json: method, settings, data, mien (version) and command_line."""
     path = run_dir / "config.json"
     content = read_json(path, _FORMAT, _VERSION, remedy=_REMEDY)
     with expect_whole(path, _REMEDY):
@@ -164,11 +145,7 @@ def read_run_config(run_dir: Path) -> dict[str, Any]:
 
 
 def run_camera(run_dir: Path) -> Camera:
-    """The first camera that the run was trained with.
-
-    Raises:
-        UserError: config.json is missing or damaged.
-    """
+    """The first camera that the run was trained with."""
     config = read_run_config(run_dir)
     with expect_whole(run_dir / "config.json", _REMEDY):
         stored = config["data"][0]["camera"]
@@ -180,11 +157,7 @@ def run_camera(run_dir: Path) -> Camera:
 
 
 def read_face_track(run_dir: Path, face_model: FaceModel) -> FaceParams:
-    """The face parameters at the end of training: all timesteps of all sequences, one sequence after the other.
-
-    Raises:
-        UserError: they are missing or damaged, or do not belong to the face model.
-    """
+    """The face parameters at the end of training: all timesteps of all sequences, one sequence after the other."""
     path = run_dir / _TRACK
     tensors = read_tensors(path, "`mien train`")
     with expect_whole(path, "train it again"):
@@ -194,11 +167,7 @@ def read_face_track(run_dir: Path, face_model: FaceModel) -> FaceParams:
 
 
 def filmed_range(run_dir: Path, avatar: Avatar) -> Filmed:
-    """What training saw of the face. For avatars that do not say, all timesteps of the run, seen by its first camera.
-
-    Raises:
-        UserError: a file of the run is missing or damaged, or does not belong to the face model.
-    """
+    """What training saw of the face. For avatars that do not say, all timesteps of the run, seen by its first camera."""
     if avatar.filmed is not None:
         return avatar.filmed
     face = read_face_track(run_dir, avatar.face_model)
@@ -264,11 +233,7 @@ def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> Non
 
 
 def read_training_summary(run_dir: Path) -> dict[str, Any]:
-    """`steps, seconds, gaussians, step_ms_median, peak_memory_mb` of a finished run.
-
-    Raises:
-        UserError: the run was not trained to its end.
-    """
+    """`steps, seconds, gaussians, step_ms_median, peak_memory_mb` of a finished run."""
     if (run_dir / "config.json").is_file() and not is_finished(run_dir):
         raise UserError(
             f"{run_dir}: its training was not finished; run the same `mien train` or `mien create` again, which goes "
@@ -283,11 +248,7 @@ def read_training_summary(run_dir: Path) -> dict[str, Any]:
 
 
 def read_curves(run_dir: Path) -> dict[str, np.ndarray]:
-    """The curves of a finished run, all of one length: step, loss, psnr, gaussians, step_ms, and each loss by name.
-
-    Raises:
-        UserError: they are missing or damaged.
-    """
+    """The curves of a finished run, all of one length: step, loss, psnr, gaussians, step_ms, and each loss by name."""
     path = run_dir / "curves.safetensors"
     curves = {name: curve.numpy() for name, curve in read_tensors(path, remedy=_AGAIN).items()}
     shapes = {curve.shape for curve in curves.values()}

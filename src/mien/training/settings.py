@@ -103,11 +103,7 @@ class TrainSettings:
     """Ids of cameras that are not trained on, in any sequence."""
 
     def check(self) -> None:
-        """Check that all numbers are in their ranges.
-
-        Raises:
-            UserError: a number is out of range. The message names the first such option, its value and the range.
-        """
+        """Check that all numbers are in their ranges."""
         check_ranges(self, lambda name: ("--" if name in MAIN_SETTINGS else "--training.") + name.replace("_", "-"))
 
     @property
@@ -121,11 +117,7 @@ MAIN_SETTINGS = ("steps", "split", "background", "seed", "device", "held_out_seq
 
 
 def check_held_out(names: Sequence[str], settings: TrainSettings) -> None:
-    """Check that the held-out sequences belong to a run, and that others remain.
-
-    Raises:
-        UserError: one does not belong to it, or none remains.
-    """
+    """Check that the held-out sequences belong to a run, and that others remain."""
     unknown = [name for name in settings.held_out_sequences if name not in names]
     if unknown:
         raise UserError(f"--hold-out {unknown[0]}: no such sequence in this run; there are: {', '.join(names)}")
@@ -162,20 +154,12 @@ class Preset:
         return overlay(TrainSettings(), self.changes, f"preset {self.name}: settings", "a run")
 
     def settings_of(self, method: str) -> TrainSettings:
-        """The settings of a method's run.
-
-        Raises:
-            UserError: there is no method of that name, or it does not have this preset.
-        """
+        """The settings of a method's run."""
         own = self._differences(method).get("settings", {})
         return overlay(self.settings, own, f"preset {self.name} of {method}: settings", "a run")
 
     def config(self, method: str) -> MethodConfig:
-        """The settings of a method.
-
-        Raises:
-            UserError: there is no method of that name, or it does not have this preset.
-        """
+        """The settings of a method."""
         own = self._differences(method).get("method", {})
         return overlay(method_named(method).config(), own, f"preset {self.name} of {method}: method", method)
 

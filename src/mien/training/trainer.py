@@ -198,11 +198,7 @@ def pretrain(
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
-    """Check that training has not diverged, before anything is written.
-
-    Raises:
-        UserError: the avatar holds NaN or infinity.
-    """
+    """Check that training has not diverged, before anything is written."""
     for name, tensor in state.avatar.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise _diverged(run_dir, state, f"{name} is not finite")
@@ -216,11 +212,7 @@ def _diverged(run_dir: Path, state: TrainingState, what: str) -> UserError:
 
 
 def check_trackings(sequences: Items[Sequence], face_model: FaceModel) -> None:
-    """Check that the sequences show one person, fitted with this face model.
-
-    Raises:
-        UserError: they were tracked separately, or with another face model.
-    """
+    """Check that the sequences show one person, fitted with this face model."""
     for sequence in sequences:
         place = str(sequence.folder or sequence.name)
         if sequence.tracking.face_model_hash != face_model.content_hash:

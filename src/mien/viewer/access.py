@@ -71,11 +71,7 @@ class Door:
 
     @staticmethod
     def of(host: str, with_token: bool = True) -> "Door":
-        """The door of a host, with a new random token.
-
-        Raises:
-            UserError: there is to be no token, but other machines can reach the host.
-        """
+        """The door of a host, with a new random token."""
         if not with_token and not is_loopback(host):
             raise UserError(f"--no-token: other machines can reach --host {host}; leave --no-token out")
         return Door(host, secrets.token_urlsafe(18) if with_token else None)

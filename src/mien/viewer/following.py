@@ -65,11 +65,7 @@ class CameraSwitch:
         return self._thread is not None
 
     def start(self) -> None:
-        """Open the camera and follow it. If it is on already, nothing changes.
-
-        Raises:
-            UserError: the camera cannot be opened.
-        """
+        """Open the camera and follow it. If it is on already, nothing changes."""
         with self._lock:
             if self._thread is not None:
                 return

@@ -66,9 +66,6 @@ def serve(
         ready: Is called with the address, as soon as browsers can open it.
         camera: What lets the avatar follow a camera, if there is one.
         listener: What `listen` returned for the host and the port, if browsers may wait there already.
-
-    Raises:
-        UserError: the host or the port cannot be used, or the camera fails.
     """
     serving = Serving(session, door, port, title, camera, listener)
     try:
@@ -224,11 +221,7 @@ def is_possible(view: View) -> bool:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Listen at a port, or at a free one if it is 0. Browsers that connect wait until a server takes the socket.
-
-    Raises:
-        UserError: the port is taken or not allowed, or the host is none of this machine.
-    """
+    """Listen at a port, or at a free one if it is 0. Browsers that connect wait until a server takes the socket."""
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)

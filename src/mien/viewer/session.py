@@ -138,11 +138,7 @@ class Session:
             self._change()
 
     def set_expression(self, name: str, value: float) -> None:
-        """Set one expression, within the bounds of the face model. What plays is paused.
-
-        Raises:
-            UserError: the value is not finite.
-        """
+        """Set one expression, within the bounds of the face model. What plays is paused."""
         _check_finite(name, value)
         index = self.avatar.expression_names.index(name)
         low, high = self.avatar.portable.expression_bounds[index]
@@ -152,11 +148,7 @@ class Session:
             self._take(replace(self._face, expression=expression))
 
     def set_joint(self, name: str, axis: int, angle: float) -> None:
-        """Set one component of a joint's axis-angle vector, in radians. What plays is paused.
-
-        Raises:
-            UserError: the angle is not finite.
-        """
+        """Set one component of a joint's axis-angle vector, in radians. What plays is paused."""
         _check_finite(name, angle)
         with self._lock:
             joints = self._face.joints.copy()
@@ -189,11 +181,7 @@ class Session:
         self._take(self.avatar.face(expression))
 
     def choose(self, name: str | None) -> None:
-        """Choose a motion and show its first timestep, or no motion and the person at rest.
-
-        Raises:
-            UserError: the motion cannot be loaded. The one before stays.
-        """
+        """Choose a motion and show its first timestep, or no motion and the person at rest."""
         clip = None
         if name is not None:
             # Loading takes seconds, so nothing waits for it.
@@ -254,11 +242,7 @@ class Session:
         return drawn
 
     def show(self, **changes: Any) -> None:
-        """Change `look` (fields of `Look`), `height`, `side_by_side` or `with_camera`.
-
-        Raises:
-            UserError: there is no such surface or background, or the height is not 1 to 2048.
-        """
+        """Change `look` (fields of `Look`), `height`, `side_by_side` or `with_camera`."""
         _check_look(changes)
         with self._lock:
             self.height = int(changes.pop("height", self.height))

@@ -182,11 +182,7 @@ class HeadGas(Avatar):
         return highest
 
     def bake(self) -> Static:
-        """Static points, with the bases of the features and the network.
-
-        Raises:
-            UserError: the variant cannot be baked.
-        """
+        """Static points, with the bases of the features and the network."""
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         store = {name: as_array(self.store[name]) for name in self.store.names()}

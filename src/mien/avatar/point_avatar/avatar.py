@@ -150,11 +150,7 @@ class PointAvatar(Avatar):
 
     @torch.no_grad()
     def bake(self) -> BlendSkinned:
-        """Points with blend directions, skinning weights and constant colours.
-
-        Raises:
-            UserError: light follows deformed normals.
-        """
+        """Points with blend directions, skinning weights and constant colours."""
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         n, own = len(self.store), self.store["means"]

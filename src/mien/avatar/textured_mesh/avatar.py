@@ -134,11 +134,7 @@ class TexturedMesh(Avatar):
 
     @torch.no_grad()
     def bake(self) -> MeshBound:
-        """The mesh with its offsets, and surfels in constant colours.
-
-        Raises:
-            UserError: the light is in the world.
-        """
+        """The mesh with its offsets, and surfels in constant colours."""
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         rest = self._compute_rest()
@@ -181,11 +177,7 @@ class TexturedMesh(Avatar):
         return _AtRest(offsets, vertex_albedo, albedo, local, colors)
 
     def _surfels(self) -> Surfels:
-        """The places of the surfels of the store.
-
-        Raises:
-            UserError: they are not as this method places them, as in a damaged file.
-        """
+        """The places of the surfels of the store."""
         try:
             return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
         except ValueError as error:

@@ -88,11 +88,7 @@ def engine_names() -> list[str]:
 
 
 def engine_named(name: str) -> Engine:
-    """The engine of a name. Other packages are asked only if it is none of mien's own.
-
-    Raises:
-        UserError: there is no engine of that name, or that of another package cannot be imported.
-    """
+    """The engine of a name. Other packages are asked only if it is none of mien's own."""
     engine = ENGINES.get(name) or plugin(_GROUP, name, Engine)
     if engine is None:
         raise UserError(f"no engine {name!r}; give one of {', '.join(engine_names())}, or install what adds it")

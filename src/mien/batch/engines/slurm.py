@@ -80,11 +80,7 @@ def _by_memory(rows: Sequence[Row]) -> list[list[Row]]:
 
 
 def _submit(work: Work, rows: Sequence[Row], options: EngineOptions, size: int) -> str:
-    """Submit an array with `size` rows in each task, and return its number.
-
-    Raises:
-        UserError: Slurm does not take it.
-    """
+    """Submit an array with `size` rows in each task, and return its number."""
     import submitit  # pyright: ignore[reportMissingImports]
     from submitit.core.utils import FailedJobError, FailedSubmissionError  # pyright: ignore[reportMissingImports]
 

@@ -34,11 +34,7 @@ class CalibratedCamera:
     """Correction of its pictures' colours, or None."""
 
     def for_pictures(self, width: int, height: int) -> Camera:
-        """Return the camera for pictures of another size but the same shape.
-
-        Raises:
-            UserError: the pictures have another shape.
-        """
+        """Return the camera for pictures of another size but the same shape."""
         camera = self.camera
         if (camera.width, camera.height) == (width, height):
             return camera
@@ -60,9 +56,6 @@ def read_calibration(path: Path) -> list[CalibratedCamera]:
     `offset` in frames. Intrinsics are in pixels of the uncut video. World-to-camera matrices have OpenCV axes and
     metres (docs/conventions.md). `distortion` is a list of OpenCV's coefficients, k1 k2 p1 p2 k3 ..., and
     `color_correction` has a row of coefficients for each channel (`mien.media.color_correction`).
-
-    Raises:
-        UserError: the file is missing or damaged, a camera is incomplete or impossible, or two have the same id.
     """
     entries = read_camera_entries(path, "give one entry for every camera")
     found = [_calibrated_camera(entry, f"{path}: camera {index}") for index, entry in enumerate(entries)]
@@ -82,9 +75,6 @@ def match_sources(sources: list[Path], cameras: list[CalibratedCamera], path: Pa
         sources: a video or a folder of pictures for each camera, named by its id; or one folder that holds them.
         cameras: the cameras of the calibration.
         path: the calibration file, for messages.
-
-    Raises:
-        UserError: a source has no camera, a camera has no source, or two sources have the same name.
     """
     if len(sources) == 1 and sources[0].is_dir():
         folder = sources[0]

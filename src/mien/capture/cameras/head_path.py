@@ -49,9 +49,6 @@ def find_head_path(
         boxes: left, top, right, bottom of the face in pixels of each camera's picture. NaN where there is no face.
         cameras: the cameras, for those pictures.
         advise: called if the cameras do not fit. It returns what to correct in all of them, or an empty text.
-
-    Raises:
-        UserError: no two cameras agree at any timestep, or the calibration is not in metres.
     """
     path = consensus(boxes, cameras)
     if not path.known.any():
@@ -99,9 +96,6 @@ def choose_crops(
 
     Returns:
         The crops, and the width and height that all of them have.
-
-    Raises:
-        UserError: whole pictures have different shapes.
     """
     spans = [_span(path, camera) for camera in cameras]
     sides = [max(span[2] - span[0], span[3] - span[1]) for span in spans]

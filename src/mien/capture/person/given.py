@@ -59,18 +59,11 @@ class GivenMattes:
         """Read one matte, to find mistakes before anything that takes long.
 
         Nothing can be read from this object afterwards.
-
-        Raises:
-            UserError: it is missing, damaged or of another size than the picture.
         """
         self.matte(number, whole_picture(*self._size, max(self._size)))
 
     def matte(self, number: int, crop: Crop) -> UInt8[np.ndarray, "h w"]:
-        """Return the matte of the source's frame `number`, cropped like its picture. Numbers must increase.
-
-        Raises:
-            UserError: it is missing, damaged or of another size than the picture.
-        """
+        """Return the matte of the source's frame `number`, cropped like its picture. Numbers must increase."""
         if self._files:
             if number >= len(self._files):
                 raise UserError(f"{self._path}: ends before its frame {number}; give a matte for each frame")
@@ -158,9 +151,6 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
         path: a .safetensors file with `landmarks` [n, 478, 2], or a .csv file with n lines of x0, y0, x1, y1, ... (956
             numbers; empty or nan means no face; a first line of column names is skipped).
         source_frames: the number of frames in the source, n.
-
-    Raises:
-        UserError: the file is missing, damaged or of another shape.
     """
     if path.suffix == ".safetensors":
         _check_size(path, source_frames)
@@ -234,11 +224,7 @@ def _number(path: Path, line: int, cell: str) -> float:
 
 
 def check_mattes(path: Path, source: FrameSource) -> None:
-    """Refuse mattes whose number differs from that of the source's frames.
-
-    Raises:
-        UserError: there are more or fewer.
-    """
+    """Refuse mattes whose number differs from that of the source's frames."""
     found = open_source(path, FrameSelection(), 25.0).count()
     expected = source.count()
     if found != expected:

@@ -103,11 +103,7 @@ def group_people(shapes: Sequence[np.ndarray], frames: Sequence[int]) -> list[li
 
 
 def tell_who(path: Path, parts: Sequence[Part], people: Sequence[Sequence[int]], person: int) -> None:
-    """Say which parts of the video (as indices) show whom, and who is kept, if there are several people.
-
-    Raises:
-        UserError: there is no such person.
-    """
+    """Say which parts of the video (as indices) show whom, and who is kept, if there are several people."""
     if person > len(people):
         shown = "one person" if len(people) == 1 else f"{len(people)} people"
         raise UserError(f"--capture.person {person}: {path} shows {shown}; give a smaller number")
@@ -135,9 +131,6 @@ def check_neighbors(
         path: source of the pictures, for the message.
         pictures: frames of the new capture.
         detector: what runs the networks.
-
-    Raises:
-        UserError: they show somebody else.
     """
     shapes = None
     for json_path in sorted(sequences.glob(f"*/capture/{JSON_NAME}"))[:_IDENTITY_NEIGHBORS]:

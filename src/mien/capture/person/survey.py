@@ -91,9 +91,6 @@ def survey_source(
         landmarks: landmarks for every frame of the source in pixels, NaN for no face. If they are given, faces are not
             searched.
         detector: what runs the networks.
-
-    Raises:
-        UserError: the source cannot be decoded.
     """
     work.mkdir(parents=True, exist_ok=True)
     whole, done = work / "survey.safetensors", []
@@ -121,11 +118,7 @@ def _write(path: Path, survey: Survey) -> None:
 
 
 def _read(path: Path) -> Survey:
-    """Read the saved results of an earlier call.
-
-    Raises:
-        UserError: it is damaged, or no survey.
-    """
+    """Read the saved results of an earlier call."""
     arrays = read_arrays(path)
     t, side, colors = len(arrays.get("numbers", ())), _CUT_THUMBNAIL[::-1], 3 * _PERSON_COLOR_CELLS**2
     kinds = {
@@ -220,9 +213,6 @@ def check_upright(frames: FrameSource, survey: Survey, turned: int, detector: De
         survey: the source's survey.
         turned: degrees by which the pictures have been turned already.
         detector: what runs the networks.
-
-    Raises:
-        UserError: no face was found. The message names the remedy that fits.
     """
     turn = _best_turn(frames, survey, detector)
     option = f"--capture.turn {(turned + turn) % 360}"

@@ -35,11 +35,7 @@ class ConfigFile:
 
 
 def read_config_file(path: Path) -> ConfigFile:
-    """Read the config.json of a run, which may be edited (its checksum is not checked), or one written by hand.
-
-    Raises:
-        UserError: the file is missing, is not json, holds something other than settings, or names an unknown method.
-    """
+    """Read the config.json of a run, which may be edited (its checksum is not checked), or one written by hand."""
     content = _read(path)
     for name in content:
         if name not in _TAKEN + _NOT_TAKEN:

@@ -83,20 +83,12 @@ class TrainOptions:
     """The method's own settings."""
 
     def check(self) -> None:
-        """Check before any work that all settings are valid.
-
-        Raises:
-            UserError: one is out of range, or CUDA is asked for without gsplat.
-        """
+        """Check before any work that all settings are valid."""
         self.settings()
         self.method_config()
 
     def settings(self) -> TrainSettings:
-        """The settings of the run: those of the preset or the file, with these options apply_options.
-
-        Raises:
-            UserError: one is out of range, or CUDA is asked for without gsplat.
-        """
+        """The settings of the run: those of the preset or the file, with these options apply_options."""
         check_device(self.device)
         if self.subject is not None and self.split != NAMED_SPLIT:
             raise UserError(f"--subject {self.subject}: is for --split {NAMED_SPLIT}; give that too, or leave it out")
@@ -117,11 +109,7 @@ class TrainOptions:
         return settings
 
     def method_config(self) -> MethodConfig:
-        """The method's settings: those of the preset or the file, with these options apply_options.
-
-        Raises:
-            UserError: one is out of range.
-        """
+        """The method's settings: those of the preset or the file, with these options apply_options."""
         config = PRESETS[self.preset].config(self.method)
         if self.method_settings is not None:
             config = apply_options(config, self.method_settings)
@@ -156,9 +144,6 @@ def with_settings(command: type, arguments: Sequence[str]) -> type:
     """A command with an option for every setting of the method that its arguments, or their --config, name.
 
     The preset and the file set the defaults, so that options override the file, and the file overrides the preset.
-
-    Raises:
-        UserError: the file cannot be used, or an option is a setting that the method does not have.
     """
     name = training_options(command)
     chosen = _chosen(arguments)
@@ -227,22 +212,14 @@ def _chosen(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def check_method(option: str, name: str) -> None:
-    """Check that there is a method of a name.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Check that there is a method of a name."""
     if not has_method(name):
         names = ", ".join(method_names())
         raise UserError(f"{option}: give one of {names} instead of {name!r}, or install the package that adds it")
 
 
 def check_avatar(avatar: Path, run: str | None) -> None:
-    """Check before any work that there is an avatar: a .mien file, or a run of a workspace.
-
-    Raises:
-        UserError: there is none, or a file is given with a run.
-    """
+    """Check before any work that there is an avatar: a .mien file, or a run of a workspace."""
     if avatar.is_file():
         if run is not None:
             raise UserError(f"--run {run}: a file holds one avatar; leave --run out")
@@ -255,11 +232,7 @@ def check_avatar(avatar: Path, run: str | None) -> None:
 
 
 def check_port(port: int) -> None:
-    """Check the port of a viewer.
-
-    Raises:
-        UserError: it is out of range.
-    """
+    """Check the port of a viewer."""
     if not 0 <= port <= _MAX_PORT:
         raise UserError(f"--port {port}: give a number from 1 to {_MAX_PORT}, or 0 for a free one")
 
@@ -270,11 +243,7 @@ def has_viewer() -> bool:
 
 
 def check_viewer() -> None:
-    """Check that the package of the viewer's page is installed.
-
-    Raises:
-        UserError: it is missing.
-    """
+    """Check that the package of the viewer's page is installed."""
     if not has_viewer():
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
 
@@ -285,11 +254,7 @@ def is_tracked_sequence(folder: Path) -> bool:
 
 
 def check_neutral(neutral: str | None) -> None:
-    """Check before any work that a driver's face at rest is a word of `NEUTRALS`, or a driver.
-
-    Raises:
-        UserError: it is neither.
-    """
+    """Check before any work that a driver's face at rest is a word of `NEUTRALS`, or a driver."""
     if neutral is None or neutral in NEUTRALS:
         return
     if not Path(neutral).exists():
@@ -302,12 +267,7 @@ def check_neutral(neutral: str | None) -> None:
 
 
 def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:
-    """Check before any work that the driver exists: a workspace with that sequence, or a file.
-
-    Raises:
-        UserError: the driver is missing, does not have that sequence, has no sequences, takes no frame rate, or is
-            neither a recording nor a video.
-    """
+    """Check before any work that the driver exists: a workspace with that sequence, or a file."""
     suffix = by.suffix.lower() if by.is_file() else ""
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
         raise UserError(f"--fps {fps:g}: is for the times of a .csv; give a number above 0, at most 1000")

@@ -130,11 +130,7 @@ def apply_options(settings: Settings, options: Any) -> Settings:
 
 
 def check_names(arguments: Sequence[str], prefix: str, listed: Sequence[Leaf], owner: str) -> None:
-    """Check that a command line names no unknown setting.
-
-    Raises:
-        UserError: it names one. The message gives the nearest setting and all settings of its group.
-    """
+    """Check that a command line names no unknown setting."""
     known = [leaf.option(prefix) for leaf in listed]
     for argument in arguments:
         option = argument.split("=", 1)[0].replace("_", "-")

@@ -21,11 +21,7 @@ class FileContent:
     """An avatar that comes from a file, as `mien.formats.Content`. It has no run and no mesh with a texture."""
 
     def __init__(self, source: Path):
-        """Read the file.
-
-        Raises:
-            UserError: it is missing, damaged or foreign.
-        """
+        """Read the file."""
         kind = format_of(source)
         avatar = None if kind is None or kind.read is None else kind.read(source)
         if not isinstance(avatar, PortableAvatar):
@@ -81,11 +77,7 @@ class FileContent:
 
 
 def convert(source: Path, out: Path, kind: Format, options: Options) -> None:
-    """Write the avatar in a file in another format, at rest with the head at the origin, and report it.
-
-    Raises:
-        UserError: the file is missing, damaged or foreign, or the avatar cannot be written so.
-    """
+    """Write the avatar in a file in another format, at rest with the head at the origin, and report it."""
     content = FileContent(source)
     told = kind.write(out, content, options)
     size = f"{out.stat().st_size / 1e6:.1f} MB" if options.largest is None else told

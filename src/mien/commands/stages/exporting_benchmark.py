@@ -48,9 +48,6 @@ def export_submission(workspace: Workspace, run: str, person: Path, out: Path) -
         run: Name of the run.
         person: The person's folder of the benchmark, with calibration and trackings. Its name is a number.
         out: The submission folder. Folders of other people may be in it.
-
-    Raises:
-        UserError: a file is missing or damaged, the run does not fit, or a file cannot be written.
     """
     number, run_dir = person.resolve().name.zfill(3), workspace.run_dir(run)
     avatar = load_avatar(run_dir)

@@ -26,9 +26,6 @@ def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path
         footage: The videos and what is known of them.
         dataset: The dataset that it comes from.
         source: The place that it was read from.
-
-    Raises:
-        UserError: a video is damaged, shows no face, or does not fit the cameras. Nothing is left then.
     """
     settings = CaptureSettings(stride=footage.stride)
     try:

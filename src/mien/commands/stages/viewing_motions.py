@@ -51,11 +51,7 @@ def of_workspace(root: Path, run: str | None) -> Viewed:
 
 
 def person_of(path: Path, portable: PortableAvatar) -> tuple[FaceModel, FaceParams]:
-    """The face model of an avatar that comes from a file, and the person at rest.
-
-    Raises:
-        UserError: the face model has changed since the file was written.
-    """
+    """The face model of an avatar that comes from a file, and the person at rest."""
     about, rest = portable.about, portable.neutral
     model = load_face_model(about.face_model)
     if model.content_hash != about.face_model_hash:

@@ -102,9 +102,6 @@ def filmed_frames(sequence: Sequence, face_model: FaceModel, settings: TrainSett
         face_model: The face model of its tracking.
         settings: What is held out.
         mattes: Mattes that are written.
-
-    Raises:
-        UserError: nothing is left to train on, or a camera to hold out is missing.
     """
     trained = {frame.timestep for frame in training_frames([sequence], settings)}
     left_out = held_out_of(sequence, settings.split).numpy()

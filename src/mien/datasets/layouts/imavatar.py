@@ -20,11 +20,7 @@ _POSES = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 
 
 def write(folder: Path, filmed: Filmed) -> Written:
-    """Write the files of a subject of IMavatar.
-
-    Raises:
-        UserError: the folder has a name that its loaders stumble over.
-    """
+    """Write the files of a subject of IMavatar."""
     if "image" in folder.name:
         raise UserError(
             f"{folder}: programs of this layout replace every 'image' in a path by 'mask'; give --out another name"

@@ -41,20 +41,12 @@ class Layout:
     """Whether its programs pose FLAME themselves, so that no other face model helps them."""
 
     def write(self, folder: Path, filmed: "Filmed") -> Written:
-        """Write a capture into a new folder.
-
-        Raises:
-            UserError: the capture does not fit, in one line.
-        """
+        """Write a capture into a new folder."""
         return import_module(f"mien.datasets.layouts.{self.name}").write(folder, filmed)
 
 
 def check_new_folder(folder: Path) -> None:
-    """Check that a folder can be made, and that nothing is in it.
-
-    Raises:
-        UserError: something is there, or it cannot be written.
-    """
+    """Check that a folder can be made, and that nothing is in it."""
     from mien.disk.files import check_writable
 
     check_writable(folder, folder=True)

@@ -25,9 +25,6 @@ def write_layout(folder: Path, filmed: Filmed, layout: Layout) -> str:
     """Write a capture into a new folder, and return what is told of it in one line.
 
     The folder appears as a whole. README.txt says what it holds, and `scoring/truth` has the held-out pictures.
-
-    Raises:
-        UserError: the capture does not fit the layout, or the folder is not empty or cannot be written.
     """
     check_new_folder(folder)
     _check_fit(filmed, layout)

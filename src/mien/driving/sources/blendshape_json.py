@@ -38,12 +38,7 @@ _MAX_TIME = 1e15
 
 
 def read_blendshape_json(path: Path) -> Motion:
-    """Read motion from blend shapes as json.
-
-    Raises:
-        UserError: The file cannot be read or has none of the layouts, a name is unknown, a score is NaN or out of
-            range, or times go back or have another unit. The message names the frame.
-    """
+    """Read motion from blend shapes as json."""
     try:
         with open_recording(path) as file:
             content = parse_json(text_of(file.read()), any_size=True, constants=True)

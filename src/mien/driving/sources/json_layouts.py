@@ -68,11 +68,7 @@ class Recorded:
 
 
 def recorded(content: Any, path: Path) -> Recorded:
-    """The frames of a json file of any layout.
-
-    Raises:
-        UserError: It has none of the layouts, or its names are not ARKit's.
-    """
+    """The frames of a json file of any layout."""
     if isinstance(content, dict) and "weightMat" in content:
         return _audio2face(content, path)
     if isinstance(content, dict) and "names" in content and "frames" in content:
@@ -100,9 +96,6 @@ def from_face_landmarker(frame: dict[str, Any], where: str) -> tuple[Scores | No
     """Scores by name and T_camera_face [4, 4] (centimetres, OpenGL axes) of the first face in a result.
 
     Either is None if the result does not have it.
-
-    Raises:
-        UserError: The result has another layout, or its matrix holds NaN or huge numbers.
     """
     try:
         faces, poses = _of(frame, _BLENDSHAPES), _of(frame, _MATRICES) or []

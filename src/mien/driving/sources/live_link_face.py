@@ -69,10 +69,6 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
         fps: Frames per second of the timecode, or rows a second where its frame field never changes and where there is
             no timecode. The default is the smallest usual rate above its highest frame number, or 60 for takes of less
             than a second.
-
-    Raises:
-        UserError: The file cannot be read, lacks columns, or a value is missing, NaN or out of range. The message names
-            the line.
     """
     header, lines = _read_rows(path)
     columns = {_canonical(name): index for index, name in enumerate(header)}

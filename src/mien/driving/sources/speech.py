@@ -58,11 +58,7 @@ FPS = 30.0
 
 
 def read_speech(path: Path) -> Motion:
-    """The motion for a file with sound. The same file gives the same motion.
-
-    Raises:
-        UserError: the file is missing, has no sound, or is longer than an hour.
-    """
+    """The motion for a file with sound. The same file gives the same motion."""
     return motion_of_sound(read_sound(path))
 
 

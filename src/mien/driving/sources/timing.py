@@ -37,9 +37,6 @@ def even_moments(capture: Capture, fps: float) -> Moments | None:
     """Moments of a sequence at a rate, or None if its frames are evenly spaced at this rate already.
 
     In a pause, the face is held until the last moment before the next frame, as a player holds the picture.
-
-    Raises:
-        UserError: a pause is too long, or there would be too many moments (`check_times`).
     """
     seconds = capture.timestamps - capture.timestamps[:1]
     if len(seconds) < 2 or seconds[-1] <= 0:

@@ -49,11 +49,7 @@ class Control:
 
 
 def anny_version() -> str:
-    """Return the installed version of the package.
-
-    Raises:
-        UserError: it is not installed.
-    """
+    """Return the installed version of the package."""
     try:
         return importlib.metadata.version("anny")
     except importlib.metadata.PackageNotFoundError:

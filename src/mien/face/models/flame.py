@@ -71,11 +71,7 @@ class FlameFile:
 
 
 def read_flame(path: Path) -> FlameFile:
-    """Read a .npz or .pkl in FLAME's schema. Reading a pickle runs none of its code.
-
-    Raises:
-        UserError: the file is missing, damaged or incomplete. The message names the key and what to do.
-    """
+    """Read a .npz or .pkl in FLAME's schema. Reading a pickle runs none of its code."""
     names, arrays = _arrays_of(path)
     for key in _SHAPES:
         if key not in arrays:

@@ -74,11 +74,7 @@ def is_gnm(names: list[str]) -> bool:
 
 
 def read_gnm(path: Path) -> GnmFile:
-    """Read `gnm_head.npz`.
-
-    Raises:
-        UserError: the file is missing, damaged or incomplete. The message names the array and what to do.
-    """
+    """Read `gnm_head.npz`."""
     wanted = (*_SHAPES, *_OPTIONAL, *_TEXTS)
     try:
         _, arrays = read_npz(path, wanted, texts=_TEXTS)

@@ -68,11 +68,7 @@ def is_ict_folder(path: Path) -> bool:
 
 
 def read_ict(path: Path) -> IctFile:
-    """Read the packed .npz, or the folder FaceXModel.
-
-    Raises:
-        UserError: a file is missing or damaged, or it is not ICT-FaceKit Light.
-    """
+    """Read the packed .npz, or the folder FaceXModel."""
     ict = _read_folder(path) if path.is_dir() else _read_packed(path)
     if ict.template.shape != (VERTICES, 3) or ict.quads.shape != (QUADS, 4):
         raise UserError(
@@ -94,11 +90,7 @@ def read_ict(path: Path) -> IctFile:
 
 
 def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
-    """Convert ICT-FaceKit to a face model without landmarks.
-
-    Raises:
-        UserError: its shape is not that of a head, in the order that the documentation lists.
-    """
+    """Convert ICT-FaceKit to a face model without landmarks."""
     kept = np.concatenate([np.arange(start, end) for start, end in _KEPT])
     new_index = np.full(VERTICES + 1, -1)
     new_index[kept] = np.arange(len(kept))

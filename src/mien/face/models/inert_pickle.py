@@ -49,9 +49,6 @@ def read_inert_pickle(path: Path, wanted: Collection[str] | None = None) -> dict
     Args:
         path: Path of the pickle.
         wanted: Names to read; all by default.
-
-    Raises:
-        UserError: the file is missing, is no pickle, is damaged or too large, or holds no dictionary.
     """
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:

@@ -37,9 +37,6 @@ def read_model_file(path: Path, name: str, shareable: bool = False, teeth: bool 
         name: Name of the face model.
         shareable: Whether the licence of a model in FLAME's schema lets avatars carry a copy. Those of GNM and ICT do.
         teeth: Whether FLAME gets the teeth of GaussianAvatars.
-
-    Raises:
-        UserError: the file is missing, damaged, or in another schema.
     """
     members = _members(path)
     others = is_gnm(members) or is_ict_folder(path) or _is_packed_ict(members)

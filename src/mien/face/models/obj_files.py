@@ -14,11 +14,7 @@ _MAX_BYTES = 64 << 20
 
 
 def read_obj(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "q 4"]]:
-    """Return positions and faces of three or four corners; -1 is the last corner of a triangle.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """Return positions and faces of three or four corners; -1 is the last corner of a triangle."""
     lines = _lines(path)
     with _Told(path):
         corners = [[int(part.split(b"/")[0]) - 1 for part in line.split()[1:]] for line in lines if line[:2] == b"f "]
@@ -28,11 +24,7 @@ def read_obj(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "q 4
 
 
 def read_obj_positions(path: Path, count: int) -> Float[np.ndarray, "v 3"]:
-    """Return the positions of a file that has `count` of them.
-
-    Raises:
-        UserError: the file is missing or damaged, or has another number of positions.
-    """
+    """Return the positions of a file that has `count` of them."""
     lines = _lines(path)
     with _Told(path):
         positions = _positions(lines)

@@ -45,9 +45,6 @@ def with_teeth(flame: FlameFile, name: str) -> FlameFile:
     Args:
         flame: FLAME with its own 5,023 vertices in their order.
         name: The file, for messages.
-
-    Raises:
-        UserError: it is another model.
     """
     if flame.template.shape != (VERTICES, 3) or flame.faces.shape != (FACES, 3):
         raise UserError(

@@ -42,9 +42,6 @@ def write_flame_params(path: Path, face_model: FaceModel, face: FaceParams) -> N
 
     For models in FLAME's schema, these are FLAME's parameters. For others, `rotation` and `translation` are the pose of
     the head frame, and `shape` and `expr` are coefficients of the model's own directions.
-
-    Raises:
-        UserError: the model has free joints that the file cannot hold.
     """
     arrays = flame_params_of(path, face_model, face)
     content = io.BytesIO()
@@ -60,9 +57,6 @@ def flame_params_of(path: Path, face_model: FaceModel, face: FaceParams) -> dict
         path: The file or folder that they are for, for messages.
         face_model: The face model of the parameters.
         face: The subject at t timesteps.
-
-    Raises:
-        UserError: the model has free joints that the file cannot hold.
     """
     free = face_model.free_joint_names
     others = set(free) - {name for names in _POSES.values() for name in names}
@@ -90,12 +84,7 @@ def flame_params_of(path: Path, face_model: FaceModel, face: FaceParams) -> dict
 
 @torch.no_grad()
 def read_flame_params(path: Path, face_model: FaceModel) -> FaceParams:
-    """Read flame_param.npz as parameters of a face model. Nothing in it is run, and its size is limited.
-
-    Raises:
-        UserError: it is missing, a link, damaged or incomplete, holds NaN or large numbers, or belongs to another
-            model.
-    """
+    """Read flame_param.npz as parameters of a face model. Nothing in it is run, and its size is limited."""
     return face_of_flame_params(path, _read_arrays(path), face_model)
 
 
@@ -108,9 +97,6 @@ def face_of_flame_params(path: Path, arrays: Mapping[str, np.ndarray], face_mode
         arrays: `shape` [n], `expr` [t, e], `rotation`, `translation`, `neck_pose` and `jaw_pose` [t, 3], `eyes_pose`
             [t, 6] (left, then right), and perhaps `static_offset` [1, v, 3].
         face_model: The face model that they belong to.
-
-    Raises:
-        UserError: an array is missing, of another shape, holds NaN or large numbers, or belongs to another model.
     """
     arrays = _checked(path, arrays)
     v = len(face_model.template)

@@ -96,9 +96,6 @@ class GlbWriter:
         Args:
             path: The file.
             content: The json, without accessors, bufferViews and buffers.
-
-        Raises:
-            UserError: the path cannot be written.
         """
         whole = {
             **content,
@@ -172,11 +169,7 @@ class Glb:
 
 
 def read_glb(path: Path) -> Glb:
-    """Read a .glb file that `GlbWriter` wrote.
-
-    Raises:
-        UserError: it is missing, damaged, or not a .glb file.
-    """
+    """Read a .glb file that `GlbWriter` wrote."""
     remedy = "write it again with `mien export`"
     if not path.is_file():
         raise UserError(f"{path}: no such file; {remedy}")

@@ -99,11 +99,7 @@ _OPACITY_LOGITS = (-6.5, 7.5)
 
 
 def pack(avatar: PortableAvatar, motion: Motion | None = None) -> bytes:
-    """The packed form of an avatar, with a motion or without. The same input gives the same bytes.
-
-    Raises:
-        UserError: pages cannot draw the network of the avatar.
-    """
+    """The packed form of an avatar, with a motion or without. The same input gives the same bytes."""
     tensors: dict[str, dict[str, Any]] = {}
     pieces: list[bytes] = []
     content = _tree({"avatar": _prepared(avatar), "motion": motion}, "", tensors, pieces)

@@ -12,11 +12,7 @@ _NAMES = ("means", "quats", "scales", "opacities", "sh")
 
 
 def finite_arrays(path: Path, gaussians: Gaussians) -> tuple[np.ndarray, ...]:
-    """Means, quaternions, scales, opacities and SH of unbatched Gaussians as float32.
-
-    Raises:
-        UserError: a value is NaN or infinite. The message names the file, `path`.
-    """
+    """Means, quaternions, scales, opacities and SH of unbatched Gaussians as float32."""
     arrays = tuple(getattr(gaussians, name).detach().cpu().float().numpy() for name in _NAMES)
     bad = np.zeros(len(gaussians), bool)
     for array in arrays:

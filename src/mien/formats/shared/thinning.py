@@ -40,9 +40,6 @@ def fitted(
         motion: The motion that is packed with it, if there is one.
         largest: Largest size of the file in bytes.
         size: Returns the size of the file for a packed avatar.
-
-    Raises:
-        UserError: the file is larger with the fewest Gaussians, or pages cannot draw the avatar's colours.
     """
 
     def bytes_of(some: PortableAvatar) -> int:

@@ -65,19 +65,12 @@ def find_webcam_files(model: Path | None = None) -> WebcamFiles:
 
     Args:
         model: The model's file. None for the one that MIEN_FACE_LANDMARKER names, or else for that of mien.
-
-    Raises:
-        UserError: one of them is missing, is of another version, or is no such model.
     """
     return WebcamFiles(_package(), _model(model))
 
 
 def webcam_part(files: WebcamFiles) -> str:
-    """Return what a page holds for the webcam, as html.
-
-    Raises:
-        UserError: a file cannot be read.
-    """
+    """Return what a page holds for the webcam, as html."""
     contents = {name: _read(_place(files.package, path)) for name, (path, _) in _FILES.items()}
     contents["model"] = own_model() if files.model is None else _read(files.model)
     parts = "\n".join(
@@ -89,11 +82,7 @@ def webcam_part(files: WebcamFiles) -> str:
 
 
 def own_model() -> bytes:
-    """Return the bytes of the face_landmarker.task that comes with mien.
-
-    Raises:
-        UserError: a part is missing, as where mien was built from its source distribution, or is damaged.
-    """
+    """Return the bytes of the face_landmarker.task that comes with mien."""
     return b"".join(_read(OWN / part) for part in _MODEL_PARTS)
 
 

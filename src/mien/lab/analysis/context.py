@@ -93,21 +93,13 @@ class Context:
 
     @cached_property
     def sequences(self) -> list[TrainedSequence]:
-        """The sequences of the run.
-
-        Raises:
-            UserError: one is missing, or was tracked again after the run was trained.
-        """
+        """The sequences of the run."""
         sequences = [read_sequence(folder) for folder in self.sequence_dirs]
         check_data(self.run_dir, {sequence.name: sequence.tracking for sequence in sequences})
         return sequences
 
     def experiment(self, run_dir: Path | None = None) -> Experiment | None:
-        """The first protocol with held-out frames of this run, or of a short training; None if nothing was held out.
-
-        Raises:
-            UserError: a sequence is missing, or was tracked again after the run was trained.
-        """
+        """The first protocol with held-out frames of this run, or of a short training; None if nothing was held out."""
         return next(iter(load_experiments(run_dir or self.run_dir, self.sequence_dirs).values()), None)
 
     def kept(self, name: str, key: Any, measure: Callable[[], Mapping[str, float | int]]) -> dict[str, Any]:
@@ -169,11 +161,7 @@ class Context:
         return Variant(run_dir, avatar, read_curves(run_dir), read_training_summary(run_dir))
 
     def say_how_long(self, part: str, trainings: int) -> None:
-        """Report beforehand how long the short trainings of a part take, from the pace of the run.
-
-        Raises:
-            UserError: a sequence is missing, or was tracked again after the run was trained.
-        """
+        """Report beforehand how long the short trainings of a part take, from the pace of the run."""
         _ = self.sequences
         pace = self.summary["seconds"] / max(self.summary["steps"], 1)
         minutes = trainings * self.options.steps * pace / 60

@@ -45,10 +45,6 @@ def run_analysis(
         sequence_dirs: The folders of the run's sequences, in its order.
         folder: The folder to write into.
         options: Steps and seconds.
-
-    Raises:
-        UserError: the run is of another method or not finished, an option is out of range, the folder cannot be
-            written, or another process writes it.
     """
     options.check()
     check_method(analysis, run_dir)
@@ -85,11 +81,7 @@ def run_analysis(
 
 
 def check_method(analysis: Analysis, run_dir: Path) -> None:
-    """Check that a run is of the method of an analysis.
-
-    Raises:
-        UserError: it is of another method.
-    """
+    """Check that a run is of the method of an analysis."""
     found = read_run_config(run_dir)["method"]["kind"]
     if found != analysis.method:
         raise UserError(

@@ -23,11 +23,7 @@ class AnalysisOptions:
     """Seconds to spend on each timed row. A row ends after the first picture that exceeds them."""
 
     def check(self) -> None:
-        """Check that all numbers are in their ranges.
-
-        Raises:
-            UserError: a number is out of range. The message names the option, its value and the range.
-        """
+        """Check that all numbers are in their ranges."""
         check_ranges(self, lambda name: f"--{name}")
 
 
@@ -66,11 +62,7 @@ class Analysis:
 
 
 def chosen_parts(analysis: Analysis, names: Sequence[str], train: bool) -> list[Part]:
-    """The parts of those names, in the analysis' order. Without names: all that need no training, or all with `train`.
-
-    Raises:
-        UserError: there is no part of a name.
-    """
+    """The parts of those names, in the analysis' order. Without names: all that need no training, or all with `train`."""
     known = [part.name for part in analysis.parts]
     for name in names:
         if name not in known:

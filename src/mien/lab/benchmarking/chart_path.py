@@ -9,11 +9,7 @@ KINDS = (".png", ".svg", ".pdf")
 
 
 def check_chart_path(path: Path) -> None:
-    """Check, before anything is measured, that a chart can be written at this path.
-
-    Raises:
-        UserError: the ending is no supported kind of picture, or the path cannot be written.
-    """
+    """Check, before anything is measured, that a chart can be written at this path."""
     if path.suffix not in KINDS:
         raise UserError(f"{path}: charts are written as {', '.join(KINDS)}; give a name with one of these endings")
     check_writable(path)

@@ -80,9 +80,6 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
     With one camera, FOLDER/video.mp4 is what a user would have filmed. With several, FOLDER/capture is a Capture with
     calibration, exact mattes, and landmarks that a detector finds in the drawn pictures (NaN where it finds none).
     FOLDER/truth is for `read_truth`. A complete folder is left as it is; an interrupted one is continued.
-
-    Raises:
-        UserError: the folder cannot be written.
     """
     inputs = inputs_hash(scene)
     if not _is_current(folder, inputs):

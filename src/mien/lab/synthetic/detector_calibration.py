@@ -93,11 +93,7 @@ def _sight(scene: SyntheticScene, images: Sequence[np.ndarray], face_model: Face
 
 
 def fit_response(people: Sequence[Sightings], components: int = _COMPONENTS) -> DetectorResponse:
-    """Fit the linear model that explains the detections of these people by least squares.
-
-    Raises:
-        UserError: the detector found too few people.
-    """
+    """Fit the linear model that explains the detections of these people by least squares."""
     people = [person for person in people if len(person.R_seen) >= _MIN_PICTURES]
     if len(people) < 2 * _FOLDS:
         raise UserError(
@@ -127,9 +123,6 @@ def differing_response(
 
     Means and the part by turns change. Expressions and people keep what was measured on more people: what few people
     say about them did not help on others.
-
-    Raises:
-        UserError: the two detectors found too few people in the same pictures.
     """
     pairs = [
         (own, other)

@@ -92,11 +92,7 @@ def _combined(keys: list[str]) -> str:
 
 
 def reference_named(name: str) -> ReferenceCapture:
-    """Return a reference capture by its name.
-
-    Raises:
-        UserError: there is none of that name.
-    """
+    """Return a reference capture by its name."""
     if name not in REFERENCES:
         raise UserError(f"there is no reference capture {name!r}; choose one of: {', '.join(REFERENCES)}")
     return REFERENCES[name]

@@ -91,11 +91,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
 
 
 def read_truth(folder: Path) -> Truth:
-    """Read what `write_truth` wrote.
-
-    Raises:
-        UserError: a file is missing, damaged or of another version.
-    """
+    """Read what `write_truth` wrote."""
     content = read_json(folder / _JSON, FORMAT, VERSION)
     arrays = read_arrays(folder / _ARRAYS)
     try:

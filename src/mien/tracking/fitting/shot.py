@@ -64,11 +64,7 @@ def has_enough_faces(capture: Capture) -> bool:
 
 
 def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
-    """Make the input of a fit from a capture.
-
-    Raises:
-        UserError: The capture has several cameras without calibration, or too few timesteps with a face.
-    """
+    """Make the input of a fit from a capture."""
     cameras = len(capture.camera_ids)
     if cameras != 1 and capture.calibration is None:
         raise UserError(
@@ -98,11 +94,7 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
 
 @contextmanager
 def explaining_singular(shots: Sequence[Shot]) -> Iterator[None]:
-    """Turn equations of landmarks that have no solution into an error that names the sequences.
-
-    Raises:
-        UserError: The equations have no solution.
-    """
+    """Turn equations of landmarks that have no solution into an error that names the sequences."""
     try:
         yield
     except torch.linalg.LinAlgError:

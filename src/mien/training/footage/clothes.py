@@ -28,9 +28,6 @@ def read_clothes(folder: Path, shape: tuple[int, int, int]) -> UInt8[np.ndarray,
     Args:
         folder: The sequence's folder.
         shape: Number of timesteps, height and width of its pictures.
-
-    Raises:
-        UserError: the file is damaged, or its masks are of other pictures.
     """
     file = folder / FOREIGN
     if not file.exists():

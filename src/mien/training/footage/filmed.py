@@ -41,11 +41,7 @@ def write_coverage(run_dir: Path, coverage: Coverage) -> None:
 
 
 def read_coverage(run_dir: Path, face_model: FaceModel) -> Coverage | None:
-    """The coverage of a run, or None for runs that were trained without it.
-
-    Raises:
-        UserError: it is damaged, or does not belong to the face model.
-    """
+    """The coverage of a run, or None for runs that were trained without it."""
     path = run_dir / FILE
     if not path.is_file():
         return None

@@ -65,11 +65,7 @@ def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
 
 
 def held_out_of(sequence: Sequence, split: Split) -> Bool[Tensor, " t"]:
-    """Which timesteps of a sequence are held out: by `held_out`, or by the dataset that the sequence comes from.
-
-    Raises:
-        UserError: the split is the dataset's, and the sequence has none.
-    """
+    """Which timesteps of a sequence are held out: by `held_out`, or by the dataset that the sequence comes from."""
     timesteps = sequence.capture.timesteps
     if split != OWN_SPLIT:
         return held_out(timesteps, split)
@@ -87,9 +83,6 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
 
     Frames in which something covers a part of the face are left out as well, unless no others are left. The split
     divides each sequence that is trained on. A held-out sequence or camera is held out at all timesteps.
-
-    Raises:
-        UserError: no frame is left, or a sequence or camera to hold out does not exist.
     """
     names = [sequence.name for sequence in sequences]
     check_held_out(names, settings)

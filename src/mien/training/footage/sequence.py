@@ -282,11 +282,7 @@ def _read_parts(folder: Path) -> Sequence:
 
 
 def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
-    """Like `read_sequence`, with a scoring that was read before.
-
-    Raises:
-        UserError: as for `read_sequence`.
-    """
+    """Like `read_sequence`, with a scoring that was read before."""
     capture, tracking = read_capture(folder / "capture"), read_tracking(folder / "tracking")
     check_tracking_of(capture, tracking, folder / "tracking")
     if scoring.masks.shape != capture.mattes.shape:

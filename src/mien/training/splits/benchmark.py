@@ -37,9 +37,6 @@ def with_benchmark_split(
         settings: Settings whose `split` is `BENCHMARK_SPLIT`.
         names: Names of the sequences of the run.
         camera_ids: The ids of the cameras of each sequence, by the sequence's name.
-
-    Raises:
-        UserError: nothing of it is there, nothing is left to train on, or the settings hold out something else as well.
     """
     tests = tuple(name for name in names if _TEST.search(name))
     ids = tuple(dict.fromkeys(camera for name in names for camera in camera_ids[name]))

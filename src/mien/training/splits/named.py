@@ -55,9 +55,6 @@ def split_by_name(names: Sequence[str], folder: str, subject: str | None = None)
         names: Names of the sequences.
         folder: Name of the subject's folder, which gives the subject if none is given.
         subject: The subject's number in NeRSemble.
-
-    Raises:
-        UserError: the subject is unknown, a sequence is missing, or two sequences are the same.
     """
     subject = _subject(folder, subject)
     found: dict[str, str] = {}
@@ -117,9 +114,6 @@ def with_named_split(
         settings: Settings whose `split` is `NAMED_SPLIT`.
         split: The subject's sequences.
         camera_ids: The ids of the cameras of each sequence, by the sequence's name; None before they are known.
-
-    Raises:
-        UserError: the settings hold out something else as well, or a sequence lacks the camera of novel views.
     """
     _check_own(settings.held_out_sequences, (split.held_out,), "--hold-out")
     _check_own(settings.held_out_cameras, NOVEL_VIEW, "--hold-out-cameras")

@@ -59,11 +59,7 @@ def write_own_split(folder: Path, split: OwnSplit | None, about: Mapping[str, An
 
 
 def read_own_split(folder: Path | None) -> OwnSplit | None:
-    """Return the split of a sequence. It is None for sequences that were not imported, or whose dataset has none.
-
-    Raises:
-        UserError: the file is damaged or of another version.
-    """
+    """Return the split of a sequence. It is None for sequences that were not imported, or whose dataset has none."""
     if folder is None or not (folder / _FILE).exists():
         return None
     path = folder / _FILE
@@ -79,11 +75,7 @@ def read_own_split(folder: Path | None) -> OwnSplit | None:
 
 
 def imported_from(folder: Path) -> str | None:
-    """Return the name of the dataset that a sequence was imported from, or None if it was not imported.
-
-    Raises:
-        UserError: the file is damaged or of another version.
-    """
+    """Return the name of the dataset that a sequence was imported from, or None if it was not imported."""
     if not (folder / _FILE).exists():
         return None
     imported = read_json(folder / _FILE, FORMAT, VERSION, remedy=_REMEDY).get("imported")
@@ -100,9 +92,6 @@ def with_own_split(
         settings: Settings whose `split` is `OWN_SPLIT`.
         splits: The split of each sequence, by the sequence's name.
         timesteps: The number of timesteps of each sequence.
-
-    Raises:
-        UserError: a sequence has no split, or the settings hold out something else as well.
     """
     bare = [name for name, split in splits.items() if split is None]
     if bare:

@@ -114,11 +114,7 @@ def _charts(
 
 
 def _entries(context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Step, number of Gaussians and step time of the entries of the curves in which all are finite.
-
-    Raises:
-        UserError: there is no such entry.
-    """
+    """Step, number of Gaussians and step time of the entries of the curves in which all are finite."""
     curves = np.stack([context.curves[name] for name in ("step", "gaussians", "step_ms")])
     finite = curves[:, np.isfinite(curves).all(0)]
     if not finite.size:

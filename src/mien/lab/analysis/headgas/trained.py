@@ -26,11 +26,7 @@ class Trained:
 
 
 def trained_range(context: Context) -> Trained:
-    """The range of the run's training, from its avatar, or from its sequences if the avatar does not hold it.
-
-    Raises:
-        UserError: the avatar does not hold it, and a sequence is missing or was tracked again.
-    """
+    """The range of the run's training, from its avatar, or from its sequences if the avatar does not hold it."""
     avatar, filmed = context.avatar, context.avatar.filmed
     at_rest = float(_angles(avatar.subject, context.camera.position)[0, 0])
     count = avatar.subject.expression.shape[1]

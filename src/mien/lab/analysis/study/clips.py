@@ -52,11 +52,7 @@ class HeldOut:
 
 
 def read_held_out(run_dir: Path, sequence_dirs: Sequence[Path]) -> HeldOut:
-    """The held-out frames of a run, with its avatar.
-
-    Raises:
-        UserError: the run is not finished, or its sequences are missing or changed.
-    """
+    """The held-out frames of a run, with its avatar."""
     experiments = load_experiments(run_dir, sequence_dirs).values()
     frames = {
         (one.sequences[frame.sequence].name, one.camera_id(frame), frame.timestep): (one, frame)
@@ -67,11 +63,7 @@ def read_held_out(run_dir: Path, sequence_dirs: Sequence[Path]) -> HeldOut:
 
 
 def choose_clips(workspaces: Sequence[StudyRuns], settings: StudySettings) -> list[Clip]:
-    """Random clips, in turn from each workspace, as long as there are any.
-
-    Raises:
-        UserError: the runs of a workspace have no two consecutive held-out frames in common, or cannot be read.
-    """
+    """Random clips, in turn from each workspace, as long as there are any."""
     random = np.random.default_rng(settings.seed)
     left = []
     for index, workspace in enumerate(workspaces):

@@ -76,11 +76,7 @@ class Encoded:
 
 
 def encode(frames: UInt8[np.ndarray, "t h w 3"], fps: float, most: int, what: str) -> Encoded:
-    """The frames as a video of at most `most` bytes, in the best quality that fits.
-
-    Raises:
-        UserError: even the lowest quality is larger. The message begins with `what`.
-    """
+    """The frames as a video of at most `most` bytes, in the best quality that fits."""
     with tempfile.TemporaryDirectory(prefix="mien-study-") as folder:
         path = Path(folder) / "clip.mp4"
         for crf in _CRFS:

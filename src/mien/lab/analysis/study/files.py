@@ -86,11 +86,7 @@ def write_key(path: Path, key: StudyKey) -> None:
 
 
 def read_key(path: Path) -> StudyKey:
-    """Read the key of a study.
-
-    Raises:
-        UserError: it is missing, damaged or no key.
-    """
+    """Read the key of a study."""
     content = read_json(path, KEY, VERSION, "`mien study make`", _KEY_REMEDY)
     with expect_whole(path, _KEY_REMEDY):
         key = StudyKey(
@@ -109,11 +105,7 @@ def read_key(path: Path) -> StudyKey:
 
 
 def read_answers(path: Path, key: StudyKey) -> Answers:
-    """Read the answers of one participant.
-
-    Raises:
-        UserError: the file is missing, damaged, incomplete or no answer file, was edited, or is of another study.
-    """
+    """Read the answers of one participant."""
     content = _answer_json(path)
     with expect_whole(path, _AGAIN):
         study, participant = _opaque(content["study"]), _opaque(content["participant"])
@@ -134,11 +126,7 @@ def read_answers(path: Path, key: StudyKey) -> Answers:
 
 
 def read_all_answers(paths: Sequence[Path], key: StudyKey) -> list[Answers]:
-    """Read answer files, and all .json files of folders, sorted by participant.
-
-    Raises:
-        UserError: as for `read_answers`; a folder has no answer file, or two files are of the same participant.
-    """
+    """Read answer files, and all .json files of folders, sorted by participant."""
     seen: dict[str, tuple[Path, Answers]] = {}
     for path in _answer_files(paths):
         answers = read_answers(path, key)

@@ -29,10 +29,6 @@ def write_study(path: Path, workspaces: Sequence[StudyRuns], settings: StudySett
         path: The .html file. The key is `key_path(path)`.
         workspaces: The runs to compare.
         settings: Clips, sizes and seed.
-
-    Raises:
-        UserError: a setting is out of range, the runs cannot be read or share no held-out frames, or the videos do not
-            fit; or another process is writing the page.
     """
     settings.check()
     with hold(path):

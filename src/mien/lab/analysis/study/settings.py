@@ -27,11 +27,7 @@ class StudySettings:
     page."""
 
     def check(self) -> None:
-        """Check that all numbers are in their ranges.
-
-        Raises:
-            UserError: one is not. The message names the option, its value and the range.
-        """
+        """Check that all numbers are in their ranges."""
         check_ranges(self, lambda name: f"--{name}")
         if self.side % TILE_UNIT:
             near = max(64, self.side // TILE_UNIT * TILE_UNIT)
