@@ -20,29 +20,6 @@ head in their world and chooses the crops.
 settings, and `quiet_mediapipe` loads MediaPipe without its messages.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mien.lazy import lazy_names
-
-if TYPE_CHECKING:
-    from mien.capture.capture import Capture
-    from mien.capture.from_cameras import capture_cameras
-    from mien.capture.from_video import capture_video, capture_video_parts
-    from mien.capture.quality import FrameQuality, is_light_changing
-    from mien.capture.settings import CaptureSettings
-    from mien.capture.store import read_capture, read_capture_hash, write_capture
-else:
-    __getattr__, __dir__ = lazy_names(__name__, __file__)
-
-__all__ = [
-    "Capture",
-    "CaptureSettings",
-    "FrameQuality",
-    "capture_cameras",
-    "capture_video",
-    "capture_video_parts",
-    "is_light_changing",
-    "read_capture",
-    "read_capture_hash",
-    "write_capture",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

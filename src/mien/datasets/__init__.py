@@ -4,43 +4,6 @@
 `writing` puts that into a workspace.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mien.lazy import lazy_names
-
-if TYPE_CHECKING:
-    from mien.datasets.arrays import read_arrays
-    from mien.datasets.dataset import (
-        Clip,
-        Dataset,
-        FilmedSequence,
-        Findings,
-        Footage,
-        ReadSequence,
-        TrackedSequence,
-        TrainedAvatar,
-    )
-    from mien.datasets.registry import datasets, find_dataset, known_datasets, recognised
-    from mien.datasets.sequences import filmed_sequence, tracked_sequence
-    from mien.datasets.writing import write_sequence
-else:
-    __getattr__, __dir__ = lazy_names(__name__, __file__)
-
-__all__ = [
-    "Clip",
-    "Dataset",
-    "FilmedSequence",
-    "Findings",
-    "Footage",
-    "ReadSequence",
-    "TrackedSequence",
-    "TrainedAvatar",
-    "datasets",
-    "filmed_sequence",
-    "find_dataset",
-    "known_datasets",
-    "read_arrays",
-    "recognised",
-    "tracked_sequence",
-    "write_sequence",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

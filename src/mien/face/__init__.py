@@ -7,33 +7,6 @@ in the user's `cache`, and `checks` tests what is read. Models come from two sou
 makes texture coordinates for a head without any). `mirror` finds each triangle's image on the other side.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from mien.lazy import lazy_names
-
-if TYPE_CHECKING:
-    from mien.face.listing import FaceModelInfo, available_face_models, read_added_source
-    from mien.face.loading import add_face_model, load_face_model
-    from mien.face.mirror import mirror_triangles
-    from mien.face.model import FaceModel, Landmarks
-    from mien.face.params import FaceParams, concatenate, most_frontal_camera
-    from mien.face.parts import PARTS, part_boxes
-    from mien.face.posing import head_poses
-
-__getattr__, __dir__ = lazy_names(__name__, __file__)
-__all__ = [
-    "PARTS",
-    "FaceModel",
-    "FaceModelInfo",
-    "FaceParams",
-    "Landmarks",
-    "add_face_model",
-    "read_added_source",
-    "available_face_models",
-    "concatenate",
-    "head_poses",
-    "load_face_model",
-    "mirror_triangles",
-    "most_frontal_camera",
-    "part_boxes",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,6 +1,5 @@
 """Formats of files for other programs: what each holds, and how it is written and read."""
 
-from mien.formats.format import Content, Format, Holds, Options
-from mien.formats.registry import endings, find_format, format_of, formats, numbered
+import lazy_loader
 
-__all__ = ["Content", "Format", "Holds", "Options", "endings", "find_format", "format_of", "formats", "numbered"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -12,31 +12,6 @@ The order of the files:
 - `detector_calibration` measures a landmark detector on drawn people.
 """
 
-from mien.lab.synthetic.captures import (
-    synthesize,
-    write_synthetic_capture,
-    write_synthetic_video,
-)
-from mien.lab.synthetic.recipe import RECIPES, Detail, Segment, SyntheticRecipe
-from mien.lab.synthetic.references import REFERENCES, ReferenceCapture, reference_named
-from mien.lab.synthetic.scene import SyntheticFrame, SyntheticScene
-from mien.lab.synthetic.truth import Truth, read_truth, truth_of, write_truth
+import lazy_loader
 
-__all__ = [
-    "RECIPES",
-    "REFERENCES",
-    "Detail",
-    "ReferenceCapture",
-    "Segment",
-    "SyntheticFrame",
-    "SyntheticRecipe",
-    "SyntheticScene",
-    "Truth",
-    "read_truth",
-    "reference_named",
-    "synthesize",
-    "truth_of",
-    "write_synthetic_capture",
-    "write_synthetic_video",
-    "write_truth",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

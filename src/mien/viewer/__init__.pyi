@@ -1,0 +1,3 @@
+from .access import Door as Door
+from .server import serve as serve
+from .session import Session as Session
