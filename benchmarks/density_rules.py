@@ -21,13 +21,13 @@ import torch
 from mien.avatar import Avatar, GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.avatar.settings import DensityRules, FaceTuning, GradientSettings
+from mien.disk.files import read_tensors
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit
 from mien.face import FaceParams, load_face_model
 from mien.lab.synthetic import synthesize
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.render import rasterize
-from mien.storage import read_tensors
 from mien.tracking.scoring import Scoring, make_scoring
 from mien.training import PRESETS, train
 from mien.training.footage.frames import Frame, evenly_spread, held_out

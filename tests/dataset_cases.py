@@ -28,7 +28,6 @@ from mien.capture import read_capture
 from mien.capture.cameras.calibration import read_calibration
 from mien.capture.settings import CaptureSettings
 from mien.cli import main
-from mien.commands.stages import import_footage
 from mien.datasets import matting, overlay, sequences
 from mien.datasets.dataset import Footage
 from mien.datasets.registry import datasets
@@ -42,6 +41,7 @@ from mien.face.models.coefficients import coefficient_head
 from mien.face.models.flame import flame_face_model, read_flame
 from mien.limits import camera_fault
 from mien.media.video import read_video_frames, write_video
+from mien.pipeline import import_dataset as import_footage
 from mien.pipeline.import_dataset import run_import_stage
 from mien.training import read_sequence
 from mien.training.splits.own import read_own_split

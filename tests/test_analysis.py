@@ -19,11 +19,11 @@ import train_toy
 from capture_helpers import tree_bytes
 from damage import edit_json
 from mien.cli import main
+from mien.disk.files import write_tensors
 from mien.face import FaceModel
 from mien.lab.analysis.gaussian_avatars import growth, speed
 from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
 from mien.pages.plots import Axes, Series
-from mien.storage import write_tensors
 from mien.training.run import read_curves
 from shared_things import MadeOnce, toy_workspace
 from toy_workspace import write_toy_workspace

@@ -27,6 +27,7 @@ from mien.avatar import load_avatar
 from mien.avatar.files import write_avatar
 from mien.capture import write_capture
 from mien.cli import main
+from mien.disk.files import read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation.metrics_file import read_metrics
@@ -34,7 +35,6 @@ from mien.export.glb import write_glb
 from mien.media.output import plan_output
 from mien.media.video import write_video
 from mien.media.writing import write_pictures
-from mien.storage import read_arrays, read_json, read_tensors, write_arrays, write_json, write_tensors
 from mien.tracking import write_tracking
 from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring

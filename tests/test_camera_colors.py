@@ -9,10 +9,10 @@ import torch
 
 import train_toy
 from mien.avatar.schedules import Progress
+from mien.disk.files import read_tensors
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.render.rendering import Rendering
-from mien.storage import read_tensors
 from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.camera_colors import CameraColors

@@ -19,10 +19,10 @@ from mien.capture.person.crop import whole_picture
 from mien.capture.person.given import read_given
 from mien.capture.settings import CaptureSettings
 from mien.cli import main
-from mien.commands.stages import import_footage
 from mien.errors import UserError
 from mien.media.color_correction import ColorCorrection
 from mien.media.source import FrameSelection, open_source
+from mien.pipeline import import_dataset as import_footage
 from mien.render.camera_paths import read_cameras
 
 WIDTH, HEIGHT = 320, 240

@@ -10,7 +10,7 @@ from mien.capture import capture_video
 from mien.capture.person.screen import screen_matte, screen_of, without_screen
 from mien.capture.quality import is_light_changing, measure_face, quality_report, relative_quality
 from mien.capture.settings import CaptureSettings
-from mien.storage import read_json
+from mien.disk.files import read_json
 
 SIDE = 120
 SKIN, HAIR = (0.80, 0.60, 0.48), (0.25, 0.18, 0.12)

@@ -15,10 +15,10 @@ from mien.capture.person.matte import refine_matte
 from mien.capture.person.plate import plate_matte
 from mien.capture.quality import measure_face, quality_report, relative_quality
 from mien.capture.settings import CaptureSettings
+from mien.disk.files import write_arrays
 from mien.errors import UserError
 from mien.media.tone import srgb_signal
 from mien.media.video import read_lazily, write_video
-from mien.storage import write_arrays
 
 
 def boxed(center_x: float, center_y: float, side: float, width: int, height: int) -> np.ndarray:

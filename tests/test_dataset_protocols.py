@@ -16,7 +16,7 @@ from evaluation_case import make_experiment, two_cameras, write_run, write_seque
 from mien.capture import read_capture
 from mien.capture.store import read_capture_hash
 from mien.commands.evaluate import Protocol
-from mien.disk.files import write_json
+from mien.disk.files import write_arrays, write_json
 from mien.errors import UserError
 from mien.evaluation import dataset_protocols, evaluate, scoring
 from mien.evaluation.dataset_protocols import DATASET_PROTOCOLS, dataset_protocol
@@ -24,7 +24,6 @@ from mien.evaluation.experiment import avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import ssim
 from mien.evaluation.protocols import EvaluationSettings
-from mien.storage import write_arrays
 from mien.tracking.scoring_files import read_scoring, write_scoring
 from mien.training.footage.clothes import FOREIGN, packed_clothes
 from mien.training.footage.frames import Frame

@@ -13,7 +13,6 @@ import dataset_writers as writers
 from dataset_scene import Scene, draw, drawn_person, head_view, projected, unfound
 from mien.capture.cameras.calibration import read_calibration
 from mien.capture.settings import CaptureSettings
-from mien.commands.stages import import_footage
 from mien.datasets import sequences
 from mien.datasets.dataset import Clip, FilmedSequence, Footage, TrackedSequence
 from mien.datasets.nerface import viewmats_from_nerface
@@ -21,6 +20,7 @@ from mien.datasets.registry import datasets, find_dataset
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.media.video import write_video
+from mien.pipeline import import_dataset as import_footage
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.training.splits.own import OwnSplit

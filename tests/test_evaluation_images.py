@@ -10,6 +10,7 @@ import torch
 
 from evaluation_case import make_experiment, write_run, write_sequence
 from mien.cli import main
+from mien.disk.files import read_json
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
@@ -17,7 +18,6 @@ from mien.evaluation.metrics import psnr
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.media.video import write_video
-from mien.storage import read_json
 from plain_settings import plain_run
 
 pytestmark = pytest.mark.unchecked

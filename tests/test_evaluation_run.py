@@ -18,6 +18,7 @@ import torch
 from evaluation_case import SIZE, make_experiment, two_cameras, write_run, write_sequence
 from mien.capture.store import read_capture_hash
 from mien.cli import main
+from mien.disk.files import read_tensors, write_json, write_tensors
 from mien.errors import UserError
 from mien.evaluation import evaluate, protocols
 from mien.evaluation.baselines import make_baselines
@@ -33,7 +34,6 @@ from mien.evaluation.scoring import METRICS
 from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.media.pictures import to_uint8
 from mien.media.video import probe_video, read_video_frames
-from mien.storage import read_tensors, write_json, write_tensors
 from mien.tracking.scoring_files import write_scoring
 from mien.training import read_sequence
 from mien.training.footage.frames import Frame, spread_frames

@@ -16,6 +16,7 @@ import torch
 from mien import runtime
 from mien.camera import camera_from_fov
 from mien.cli import main
+from mien.disk.files import write_json
 from mien.errors import UserError
 from mien.export import in_world, read_ply, write_ply
 from mien.export.ply import property_names
@@ -30,7 +31,6 @@ from mien.pipeline.picture_options import PictureOptions
 from mien.render import rasterize
 from mien.render.camera_paths import read_cameras, sway, write_cameras
 from mien.rotation import matrix_from_axis_angle, rigid_transform
-from mien.storage import write_json
 from shared_things import MadeOnce, toy_workspace
 from test_splat_files import some
 from web_case import drawn_head

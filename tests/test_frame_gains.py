@@ -10,12 +10,12 @@ import torch
 from evaluation_case import make_experiment
 from mien.avatar.schedules import Progress
 from mien.capture.quality import FrameQuality
+from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.fitting import fit_face
 from mien.evaluation.metrics import l1
 from mien.render.rendering import Rendering
-from mien.storage import read_tensors, write_tensors
 from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.alignment import align_faces

@@ -10,8 +10,7 @@ import pytest
 from av.filter import Graph
 
 from capture_helpers import encode
-from mien.capture.deinterlacing import Deinterlace
-from mien.media.fields import FieldOrder, combs, deinterlace
+from mien.media.fields import Deinterlace, FieldOrder, combs, deinterlace
 from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames
 
 HEIGHT, WIDTH, FRAMES = 96, 128, 6

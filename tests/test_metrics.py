@@ -10,13 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from mien.cli import main
+from mien.disk.files import read_json
 from mien.errors import UserError
 from mien.evaluation import scoring
 from mien.evaluation.metrics import MAX_PSNR, Windows, crop_to, l1, psnr, ssim, ssim_map
 from mien.media.source import read_image
 from mien.perceptual import distance, lpips, weights
 from mien.perceptual.distance import load_perceptual
-from mien.storage import read_json
 
 
 def test_psnr_and_l1() -> None:

@@ -15,8 +15,8 @@ from mien.avatar.methods import METHODS
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import RefillSettings
 from mien.commands.parsing.settings_options import leaves
+from mien.disk.config import FRACTION, NotBelow, Range, check_ranges
 from mien.errors import UserError
-from mien.ranges import FRACTION, NotBelow, Range, check_ranges
 from mien.training import PRESETS, TrainSettings, train, trainer
 from mien.training.settings import MAIN_SETTINGS
 from test_settings import help_of, with_file

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from mien import extras, runtime
+from mien import plugins as extras
+from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.cli import COMMANDS, main
 from mien.export.web_page import write_page

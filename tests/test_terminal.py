@@ -15,13 +15,12 @@ from rich.console import Console
 from forked import ForkServer
 from mien import runtime
 from mien.cli import main
-from mien.commands.stages.expected import count_scored, expected_pieces
 from mien.errors import UserError
 from mien.machine import progress
-from mien.machine.progress import progress_bar, say, whole_command
+from mien.machine.progress import Overall, Piece, progress_bar, say, whole_command
 from mien.machine.terminal import plain_name, printable, show
 from mien.machine.threads import MAX_THREADS, asked_threads, thread_count
-from mien.overall import Overall, Piece
+from mien.pipeline.create import count_scored, expected_pieces
 from mien.tracking.settings import TrackingSettings
 from mien.training import TrainSettings
 

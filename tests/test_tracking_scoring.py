@@ -11,8 +11,8 @@ import torch
 from capture_helpers import tree_bytes
 from damage import edit_json
 from mien.camera import look_at
+from mien.disk.files import read_json, read_tensors, write_tensors
 from mien.errors import UserError
-from mien.storage import read_json, read_tensors, write_tensors
 from mien.tracking import read_tracking, write_tracking
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.neck_line import bottom_vertices, fit_neck_lines

@@ -14,12 +14,12 @@ import train_toy
 from forked import ForkServer
 from instruction_sets import by_threads
 from mien.avatar import Avatar
+from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.benchmarking.train_step import SETTINGS as BENCHMARK_SETTINGS
 from mien.lab.benchmarking.train_step import training_case
 from mien.machine.stops import Terminated
-from mien.storage import read_tensors, write_tensors
 from mien.training import train
 from mien.training.checkpoint import checkpoint_files
 from mien.training.run import read_curves, read_training_summary

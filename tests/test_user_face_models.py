@@ -16,6 +16,7 @@ from mien.avatar import load_avatar
 from mien.capture import write_capture
 from mien.capture.capture import Capture
 from mien.cli import main
+from mien.disk.files import file_digest, write_json
 from mien.errors import UserError
 from mien.face import FaceModel, load_face_model
 from mien.face.cache import cache_folder
@@ -26,7 +27,6 @@ from mien.lab.synthetic import synthesize
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.pipeline import face_models as stage
 from mien.runtime import load as load_portable
-from mien.storage import file_digest, write_json
 from mien.tracking import read_tracking, track
 from mien.tracking.landmarks import embedding
 from mien.tracking.landmarks.embedding import EmbeddingSettings

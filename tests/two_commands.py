@@ -15,11 +15,11 @@ from forked import Forked, ForkServer
 from mien.capture.store import read_capture_hash
 from mien.cli import main
 from mien.disk import locks
+from mien.disk.files import write_arrays
 from mien.disk.workspace import Workspace
 from mien.evaluation import living
 from mien.face.loading import add_face_model
 from mien.pipeline.track import tracking_fingerprint
-from mien.storage import write_arrays
 from mien.tracking import write_tracking
 from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring

@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_args, get_origin
 from sphinx.application import Sphinx
 
 import mien
-from mien.ranges import Range
+from mien.disk.config import Range
 
 _ranges: dict[str, str] = {}
 """Texts of ranges by class and field. A class is documented at the door of its room, not in its own module."""

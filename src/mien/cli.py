@@ -19,10 +19,10 @@ from pathlib import Path
 import mien
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
-from mien.extras import missing_package
 from mien.machine.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
 from mien.machine.terminal import drop_output, open_closed_streams, printable, show, tell
 from mien.machine.threads import asked_threads, use_one_torch_thread
+from mien.plugins import missing_package
 
 GROUPS = {
     "Make an avatar": ("demo", "create", "capture", "track", "align", "train", "import", "batch"),

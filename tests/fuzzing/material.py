@@ -26,6 +26,7 @@ from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import write_avatar
 from mien.avatar.methods import METHODS
 from mien.disk.config import encode
+from mien.disk.files import write_json
 from mien.evaluation import evaluate
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import EvaluationSettings
@@ -49,7 +50,6 @@ from mien.lab.analysis.study.shuffling import shuffled
 from mien.media.sound import RATE
 from mien.media.video import write_video
 from mien.runtime import write_portable
-from mien.storage import write_json
 from mien.tracking import track_subject
 from mien.tracking.fitting.resume import StageCache
 from mien.tracking.settings import PhotometricSettings, TrackingSettings

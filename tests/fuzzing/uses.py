@@ -31,6 +31,7 @@ from mien.commands.parsing.options import TrainOptions, with_settings
 from mien.datasets.dataset import TrainedAvatar
 from mien.datasets.registry import datasets, recognised
 from mien.datasets.writing import write_sequence
+from mien.disk.files import read_tensors
 from mien.disk.workspace import Workspace, open_workspace
 from mien.driving import drive
 from mien.driving.motion import Motion
@@ -56,7 +57,6 @@ from mien.pipeline.import_dataset import front_camera
 from mien.render import rasterize
 from mien.runtime import write_portable
 from mien.runtime.avatar import Avatar
-from mien.storage import read_tensors
 from mien.training import read_sequence, train
 from mien.training.checkpoint import resume
 from mien.training.run import read_face_track, run_camera, write_imported_run

@@ -10,6 +10,7 @@ from torch import Tensor
 from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_named, method_of
 from mien.disk.config import decode, encode, for_loading
+from mien.disk.files import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -20,7 +21,6 @@ from mien.inside import check_subtrees, check_tree
 from mien.limits import MAX_NUMBER
 from mien.runtime.baked import Filmed
 from mien.runtime.checks import baked_fault, filmed_fault
-from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 
 _AVATAR, _VERSION = "mien.avatar", 1
 _MAX_INDEX = 2**31 - 1

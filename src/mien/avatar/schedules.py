@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from mien.ranges import FRACTION, Range
+from mien.disk.config import FRACTION, Range
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,13 @@
 """Settings that several methods share. Needs no torch, because the command line lists and checks them.
 
-Every number has its range beside it (`mien.ranges`), and every field a description that `--help-all` shows.
+Every number has its range beside it (`mien.disk.config`), and every field a description that `--help-all` shows.
 """
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, TypedDict, final
 
 from mien.avatar.schedules import Rate
-from mien.ranges import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
+from mien.disk.config import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
 
 GAUSSIAN_COUNT = Range(1, 10_000_000)
 """Range of a number of Gaussians. Tens of millions would not fit into memory."""

@@ -38,12 +38,12 @@ from mien.capture.quality import MEASURES, FrameQuality, quality_report, relativ
 from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
+from mien.disk.files import file_digest
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.media.pace import frame_rate, tell_pauses
-from mien.storage import file_digest
 
 _LANDMARKS_MOST_ASTRAY = 1.0
 """Largest distance between landmarks and the projected head, in sides of the landmarks' box. Farther ones are taken for

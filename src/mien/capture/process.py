@@ -23,11 +23,11 @@ from mien.capture.person.people import Person
 from mien.capture.person.screen import screen_of, without_screen
 from mien.capture.person.survey import Survey
 from mien.capture.quality import MEASURES, measure_face
+from mien.disk.files import expect_whole, read_arrays, write_arrays
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import brought_to
 from mien.media.source import FrameSource, SourceFrame
-from mien.storage import expect_whole, read_arrays, write_arrays
 
 _MATTE_HELD_FRAMES = 12  # frames before and after in which another face still counts where it is not found
 _LEAD_IN = 8

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mien.capture.deinterlacing import Deinterlace
 from mien.capture.person.backend import DetectorChoice
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
+from mien.media.fields import Deinterlace
 
 _MIN_SIZE = 32
 

@@ -15,8 +15,8 @@ from mien.batch.engines import EngineOptions, engine_named, engine_names
 from mien.batch.plan import Batch
 from mien.commands.parsing.help_text import Described
 from mien.errors import UserError
-from mien.extras import EXTRA_OF
 from mien.machine.terminal import show
+from mien.plugins import EXTRA_OF
 
 _WATCH_SECONDS = 5.0
 _TASKS = {

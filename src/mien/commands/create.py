@@ -12,7 +12,7 @@ from mien.capture.settings import CaptureSettings
 from mien.commands.parsing.options import TrainOptions, check_viewer
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.overall import Overall
+from mien.machine.progress import Overall
 from mien.tracking.settings import ScoringSettings, TrackingSettings
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.settings import PRESETS, TrainSettings
@@ -117,7 +117,7 @@ class Command:
 
     def _overall(self, settings: TrainSettings) -> Overall:
         """What is to be done, with expected times."""
-        from mien.commands.stages.expected import count_captured, count_scored, expected_pieces
+        from mien.pipeline.create import count_captured, count_scored, expected_pieces
         from mien.pipeline.names import sequence_names
 
         frames, names = [count_captured(video, self.capture) for video in self.videos], []

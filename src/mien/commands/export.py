@@ -190,7 +190,7 @@ class Command:
     def run(self) -> None:
         """Pose the avatar and write the files, or write the capture."""
         if self.format == SUBMISSION:
-            from mien.commands.stages.exporting_benchmark import export_submission
+            from mien.pipeline.export_dataset import export_submission
 
             workspace = open_workspace(self.workspace)
             assert self.benchmark is not None
@@ -202,7 +202,7 @@ class Command:
             return
         kind = self._kind()
         if self._is_file():
-            from mien.commands.stages.converting import convert
+            from mien.pipeline.export import convert
 
             convert(self.workspace, self.out, kind, self._options())
             return

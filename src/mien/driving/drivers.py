@@ -10,7 +10,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mien.avatar.avatar import neutral_of
-from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.driving.expression_map import fit_expression_map
 from mien.driving.rest import facing
 from mien.driving.sources.blendshape_json import read_blendshape_json
@@ -23,6 +22,7 @@ from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate, most_frontal_camera
 from mien.machine.progress import say
+from mien.media.sound import SOUND_ENDINGS
 from mien.training.footage.sequence import Sequence, read_sequence
 
 _TRACKED_REST = "the calmest tenth of its frames"

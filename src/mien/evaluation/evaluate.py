@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mien.disk.config import check_ranges
+from mien.disk.files import file_digest, write_json
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
@@ -24,8 +26,6 @@ from mien.evaluation.scoring import worker_threads
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.inside import check_tree
 from mien.perceptual.lpips import load_lpips
-from mien.ranges import check_ranges
-from mien.storage import file_digest, write_json
 from mien.training.footage.filmed import read_coverage
 from mien.training.frame_gains import GAINS
 from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera

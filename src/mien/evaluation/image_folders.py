@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mien.disk.files import read_json, write_json
 from mien.errors import UserError
 from mien.evaluation.image_source import PictureSource, open_pictures
 from mien.evaluation.scoring import (
@@ -26,7 +27,6 @@ from mien.evaluation.scoring import (
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar, say
 from mien.media.pictures import Box
-from mien.storage import read_json, write_json
 from mien.tracking.scoring import head_crop
 from mien.training.footage.frames import evenly_spread
 from mien.training.footage.sequence import composite

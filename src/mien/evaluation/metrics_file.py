@@ -5,11 +5,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
+from mien.disk.files import expect_whole, read_json
 from mien.evaluation.experiment import Edges
 from mien.face.parts import PARTS
 from mien.inside import is_one_line
-from mien.metric_names import METRICS
-from mien.storage import expect_whole, read_json
+
+METRICS = ("psnr", "ssim", "l1", "perceptual")
+COLUMNS = (
+    ("psnr", "PSNR, dB", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False),
+    ("perceptual", "ST-LPIPS", 3, False),
+)  # fmt: skip
+"""Metric, heading, number of digits, whether higher is better."""
+
 
 FORMAT, VERSION = "mien.metrics", 1
 _REMEDY = "delete this file, not its folder, and run `mien evaluate` again"

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.disk.config import Range
 from mien.evaluation.baselines import Baselines, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
 from mien.evaluation.experiment import (
@@ -45,7 +46,6 @@ from mien.evaluation.trained_frames import look_at_trained
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips
-from mien.ranges import Range
 from mien.training.footage.frames import Frame, spread_frames
 
 AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"

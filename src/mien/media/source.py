@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.deinterlacing import Deinterlace
 from mien.capture.person.alpha import as_matte, over_ground
 from mien.errors import UserError
 from mien.inside import listed
 from mien.media.color_correction import ColorCorrection
 from mien.media.decoding import decode_picture, may_have_alpha
+from mien.media.fields import Deinterlace
 from mien.media.lens import Lens
 from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.media.video_file import VIDEO_SUFFIXES

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
+from mien.disk.files import file_digest
 from mien.disk.reading import read_bytes
 from mien.errors import UserError
-from mien.storage import file_digest
 
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _PACKAGE, _INSTALL = "lpips", "pip install --no-deps lpips==0.1.4"

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from mien.capture.store import read_capture
+from mien.disk.files import expect_whole, read_tensors, write_tensors
 from mien.disk.locks import hold
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
@@ -18,7 +19,6 @@ from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.pipeline.train import read_together
 from mien.rotation import axis_angle_from_matrix
-from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.tracking.files import read_tracking, write_tracking
 from mien.tracking.tracking import Tracking
 from mien.training.alignment import align

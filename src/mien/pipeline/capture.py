@@ -8,12 +8,12 @@ from mien.capture.capture import Capture
 from mien.capture.from_cameras import capture_cameras
 from mien.capture.from_video import capture_video_parts
 from mien.capture.settings import CaptureSettings
+from mien.disk.files import check_writable
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.terminal import counted
 from mien.pipeline.names import rig_name, sequence_name
-from mien.storage import check_writable
 
 
 def run_capture_stage(

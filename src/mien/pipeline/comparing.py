@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mien.avatar.settings import MethodConfig
+from mien.disk.files import file_digest, read_json, write_atomically, write_json
 from mien.disk.locks import WAIT, hold
 from mien.disk.workspace import COMPARED, Workspace
 from mien.errors import UserError
@@ -21,7 +22,6 @@ from mien.machine.terminal import show
 from mien.pipeline.evaluate import run_evaluation_stage
 from mien.pipeline.quality import StageTimes, draw_and_track, reference_settings, score_unseen_views
 from mien.pipeline.train import run_training_stage
-from mien.storage import file_digest, read_json, write_atomically, write_json
 from mien.training.footage.frames import training_frames
 from mien.training.footage.sequence import Sequence, read_sequence
 from mien.training.run import read_training_summary

@@ -10,8 +10,8 @@ import numpy as np
 
 from mien.avatar.files import load_avatar
 from mien.capture.settings import CaptureSettings
-from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.parsing.options import NEUTRALS, check_driver, check_neutral, holds_pictures, is_tracked_sequence
+from mien.disk.files import file_digest, write_atomically
 from mien.disk.workspace import Workspace, open_workspace
 from mien.driving.drivers import Driver, read_recording, read_tracked_driver
 from mien.driving.keeping import keep_to_filmed
@@ -23,6 +23,7 @@ from mien.face.model import FaceModel
 from mien.machine.progress import say, track_progress
 from mien.media.output import plan_output
 from mien.media.pictures import side_by_side
+from mien.media.sound import SOUND_ENDINGS
 from mien.media.source import FrameSelection, list_images, open_source
 from mien.media.writing import write_pictures
 from mien.pipeline.capture import run_capture_stage
@@ -30,7 +31,6 @@ from mien.pipeline.draw import draw, posed_softly, view, warn_of_white
 from mien.pipeline.names import is_picture
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.track import run_tracking_stage
-from mien.storage import file_digest, write_atomically
 from mien.tracking.settings import TrackingSettings
 from mien.training.run import filmed_range, run_camera
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from mien.disk.files import file_digest
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.face.cache import cache_folder
@@ -14,7 +15,6 @@ from mien.face.models.model_files import SUFFIXES, default_name, licence_of, rea
 from mien.face.models.teeth import TOOTH_VERTICES, VERTICES
 from mien.machine.progress import say
 from mien.pipeline.names import no_model_file
-from mien.storage import file_digest
 from mien.tracking.landmarks.embedding import EmbeddingSettings, embed_landmarks
 from mien.tracking.landmarks.regions import with_regions_by_landmarks
 

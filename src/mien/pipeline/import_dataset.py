@@ -1,28 +1,37 @@
 """From the files of other programs to runs and sequences of a workspace."""
 
+import json
 import math
 import shlex
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from mien.avatar.avatar import Avatar
 from mien.camera import Camera, camera_from_fov, look_at
-from mien.commands.stages.import_footage import write_footage
+from mien.capture.from_cameras import capture_cameras
+from mien.capture.from_video import capture_video
+from mien.capture.settings import CaptureSettings
 from mien.datasets.dataset import Dataset, Footage, ReadSequence, TrackedSequence, TrainedAvatar
 from mien.datasets.writing import OVERLAY, write_sequence
+from mien.disk.files import write_atomically
 from mien.disk.locks import check_free, hold
 from mien.disk.workspace import Workspace
-from mien.inside import remove_tree
+from mien.errors import UserError
+from mien.inside import inside, remove_tree
 from mien.machine.progress import say
 from mien.machine.terminal import counted
+from mien.media.color_correction import NAME as COLOR_CORRECTION
 from mien.pipeline.face_models import face_model_of
 from mien.pipeline.names import check_new_run, check_new_sequence
 from mien.pipeline.track import run_tracking_stage
 from mien.tracking.settings import TrackingSettings
 from mien.training.run import BUSY_REMEDY, write_imported_run
+from mien.training.splits.own import write_own_split
 
 _DISTANCE = 1.2
 """Distance of the camera from the middle of the head, in metres."""
@@ -135,3 +144,70 @@ def front_camera(avatar: Avatar) -> Camera:
     return camera_from_fov(
         2 * math.atan(0.5 * _MARGIN * extent / _DISTANCE), _SIDE, _SIDE, look_at(position, target, pose[:3, 1])
     )
+
+
+def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path) -> None:
+    """Capture the videos of a sequence into its folder, and write what else the dataset has beside it.
+
+    Args:
+        folder: The sequence's folder, which is missing.
+        footage: The videos and what is known of them.
+        dataset: The dataset that it comes from.
+        source: The place that it was read from.
+    """
+    settings = CaptureSettings(stride=footage.stride)
+    try:
+        if footage.cameras is None:
+            capture_video(footage.videos[0], folder / "capture", settings, footage.name)
+        else:
+            _capture_rig(folder / "capture", footage, footage.cameras, source)
+        imported = {"dataset": dataset.name, "from": str(source.absolute())}
+        write_own_split(folder, footage.own_split, {"imported": imported})
+        for name, content in footage.files.items():
+            write_atomically(inside(folder, name), lambda place, content=content: place.write_bytes(content))
+    except BaseException:
+        remove_tree(folder)
+        raise
+
+
+def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera], source: Path) -> None:
+    """Capture calibrated videos. They get the names of their cameras by links, which the capture expects.
+
+    Complaints about a link or the calibration name what the user knows instead.
+    """
+    corrections = None if footage.color_corrections is None else footage.color_corrections()
+    with tempfile.TemporaryDirectory(prefix="mien-import-") as name:
+        place = Path(name)
+        videos, known = [], {}
+        for camera_id, video in zip(cameras, footage.videos, strict=True):
+            videos.append(place / f"{camera_id}{video.suffix}")
+            videos[-1].symlink_to(video.resolve())
+            known[str(videos[-1])] = str(video)
+        plates = None
+        if footage.clean_plates is not None:
+            plates = place / "plates"
+            plates.mkdir()
+            for camera_id, plate in footage.clean_plates.items():
+                link = plates / f"{camera_id}{plate.suffix}"
+                link.symlink_to(plate.resolve())
+                known[f"--capture.clean-plate {link}"] = known[str(link)] = str(plate)
+        calibration = place / "cameras.json"
+        entries: list[dict[str, Any]] = [
+            {"id": camera_id, "K": camera.K.double().tolist(), "viewmat": camera.viewmat.double().tolist(),
+             "width": camera.width, "height": camera.height}
+            for camera_id, camera in cameras.items()
+        ]  # fmt: skip
+        for entry, (camera_id, matrix) in zip(entries, corrections.items(), strict=True) if corrections else ():
+            assert entry["id"] == camera_id
+            entry[COLOR_CORRECTION] = matrix.tolist()
+        calibration.write_text(json.dumps({"format": "mien.cameras", "version": 1, "cameras": entries}))
+        settings = CaptureSettings(stride=footage.stride, clean_plate=plates)
+        try:
+            capture_cameras(videos, calibration, out, footage.name, settings)
+        except UserError as error:
+            if str(place) not in str(error):
+                raise
+            told = str(error)
+            for link, file in {**known, str(calibration): f"{source} (its cameras)"}.items():
+                told = told.replace(link, file)
+            raise UserError(told) from None

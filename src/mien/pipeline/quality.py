@@ -14,6 +14,7 @@ import torch
 from mien.avatar.methods import method_named
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture, read_capture_hash
+from mien.disk.files import read_json, replace_folder, write_atomically, write_json
 from mien.disk.locks import WAIT, hold
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
@@ -43,7 +44,6 @@ from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.evaluate import run_evaluation_stage, run_sequences
 from mien.pipeline.track import run_tracking_stage
 from mien.pipeline.train import run_training_stage
-from mien.storage import read_json, replace_folder, write_atomically, write_json
 from mien.tracking.files import read_tracking, write_tracking
 from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import write_scoring

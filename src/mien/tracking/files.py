@@ -8,12 +8,12 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
+from mien.disk.files import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
 from mien.face.params import FaceParams
 from mien.inside import check_tree, is_one_line
 from mien.limits import MAX_NUMBER, camera_fault
-from mien.storage import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.tracking.tracking import PARTS, Appearance, Tracking
 
 _FORMAT, _VERSION = "mien.tracking", 1

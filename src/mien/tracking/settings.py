@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
+from mien.disk.config import COUNT, COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 from mien.errors import UserError
-from mien.ranges import COUNT, COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
 _FOCALS = (10.0, 1e6)
 """Smallest and largest focal length in pixels: a fisheye thumbnail, and a 16K picture through a telescope."""

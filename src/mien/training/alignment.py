@@ -22,13 +22,13 @@ from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning
 from mien.avatar.store import Moments
 from mien.disk.config import overlay
+from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate
 from mien.machine.progress import progress_bar
 from mien.machine.threads import one_torch_thread
 from mien.render.rasterize import rasterize_each
-from mien.storage import read_tensors, write_tensors
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
 from mien.training.footage.frames import Frame, evenly_spread, training_frames

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from mien.disk.config import COUNT, POSITIVE, Range, check_ranges
 from mien.disk.reading import MAX_SIDE
-from mien.ranges import COUNT, POSITIVE, Range, check_ranges
 
 
 @dataclass(frozen=True)

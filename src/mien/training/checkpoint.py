@@ -10,10 +10,10 @@ from mien.adam import FactoredMoments
 from mien.avatar.avatar import Avatar
 from mien.avatar.files import overwrite
 from mien.avatar.store import Moments
+from mien.disk.files import expect_whole, read_tensors, write_tensors
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.system import peak_memory_mb
-from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.adam import Adam
 from mien.training.density_control.strategy import DensityStrategy
 from mien.training.face_track import FaceTrack

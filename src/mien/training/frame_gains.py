@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.capture.quality import is_light_changing
+from mien.disk.files import read_tensors
 from mien.errors import UserError
 from mien.render.rendering import Rendering
-from mien.storage import read_tensors
 from mien.training.camera_colors import LearnedColors, recolored
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence

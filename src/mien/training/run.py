@@ -21,6 +21,7 @@ from mien.avatar.methods import method_of
 from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.disk.config import encode
+from mien.disk.files import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.disk.locks import WAIT, check_free
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -29,7 +30,6 @@ from mien.face.params import FaceParams
 from mien.inside import check_tree, is_plain_name
 from mien.limits import camera_fault
 from mien.runtime.baked import Filmed
-from mien.storage import expect_whole, read_json, read_tensors, write_json, write_tensors
 from mien.tracking.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
 from mien.training.footage.coverage import Coverage

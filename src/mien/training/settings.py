@@ -6,11 +6,10 @@ from typing import Annotated, Any, Literal
 
 from mien.avatar.methods import method_named
 from mien.avatar.settings import Differences, MethodConfig
-from mien.disk.config import overlay
+from mien.disk.config import FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges, overlay
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 from mien.machine.devices import DeviceName
-from mien.ranges import FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars", "nersemble-benchmark", "dataset"]
 """Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a

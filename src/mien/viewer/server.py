@@ -23,8 +23,8 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from mien.errors import UserError
-from mien.extras import missing_package
 from mien.machine.terminal import tell
+from mien.plugins import missing_package
 from mien.viewer.access import HEADERS, Door
 from mien.viewer.drawing import View
 from mien.viewer.following import CameraSwitch

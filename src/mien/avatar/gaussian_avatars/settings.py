@@ -12,8 +12,7 @@ from mien.avatar.settings import (
     PerceptualLoss,
     Photometric,
 )
-from mien.disk.config import overlay
-from mien.ranges import FRACTION, NOT_NEGATIVE, NotBelow, Range
+from mien.disk.config import FRACTION, NOT_NEGATIVE, NotBelow, Range, overlay
 
 
 @dataclass(frozen=True)

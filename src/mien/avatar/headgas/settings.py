@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import EPSILON_RANGE, Differences, FaceTuning, GradientSettings, MethodConfig
-from mien.ranges import FRACTION, NOT_NEGATIVE, Range, ToLoad
+from mien.disk.config import FRACTION, NOT_NEGATIVE, Range, ToLoad
 
 Variant = Literal["full", "no_mlp", "delta", "change_all", "no_blending"]
 """The method and its ablations (supplement, section 2), as `mien.avatar.headgas.variants` makes them."""

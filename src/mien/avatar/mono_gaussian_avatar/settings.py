@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import EPSILON_RANGE, GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
-from mien.ranges import NOT_NEGATIVE, Above, Range, ToLoad
+from mien.disk.config import NOT_NEGATIVE, Above, Range, ToLoad
 
 LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""

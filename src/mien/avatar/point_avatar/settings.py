@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
-from mien.ranges import NOT_NEGATIVE, Range, ToLoad
+from mien.disk.config import NOT_NEGATIVE, Range, ToLoad
 
 _WIDTH = Range(1, 1024)
 _RATE = Rate(4e-4, begin=0.1)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from mien.avatar.schedules import Rate
 from mien.avatar.settings import GAUSSIAN_COUNT, FaceTuning, MethodConfig, Photometric
-from mien.ranges import NOT_NEGATIVE, Range, ToLoad
+from mien.disk.config import NOT_NEGATIVE, Range, ToLoad
 
 
 @dataclass(frozen=True)

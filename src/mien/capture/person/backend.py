@@ -14,7 +14,7 @@ def choose_detector(choice: DetectorChoice = "auto") -> Detector:
     """Return the detector that runs: for `auto`, mediapipe where it is installed, and otherwise litert.
 
     Raises:
-        ModuleNotFoundError: its package is not installed. `mien.extras` says which extra brings it.
+        ModuleNotFoundError: its package is not installed. `mien.plugins` says which extra brings it.
     """
     if choice == "auto":
         choice = "litert" if find_spec("mediapipe") is None else "mediapipe"

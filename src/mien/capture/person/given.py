@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from mien.capture.person.crop import Crop, whole_picture
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.settings import CaptureSettings
+from mien.disk.files import read_arrays
 from mien.disk.reading import open_ordinary, short_lines
 from mien.errors import UserError
 from mien.limits import MAX_NUMBER
@@ -21,7 +22,6 @@ from mien.machine.terminal import counted
 from mien.media.decoding import decode_picture
 from mien.media.lens import Lens
 from mien.media.source import FrameSelection, FrameSource, list_images, open_source, read_image
-from mien.storage import read_arrays
 
 _MAX_LINE = 2 * LANDMARKS * 64
 """Most characters of a csv line: more than a number of any precision takes."""

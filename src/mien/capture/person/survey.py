@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float, Int64, UInt8
 
 from mien.capture.person.backend import DetectorChoice
 from mien.capture.person.faces import MAX_FACES, FaceFinder
+from mien.disk.files import expect_whole, read_arrays, write_arrays
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import same_shape
 from mien.media.source import FrameSource, SourceFrame
-from mien.storage import expect_whole, read_arrays, write_arrays
 
 _CUT_THUMBNAIL = (32, 18)
 """Width and height in pixels of the thumbnails that are compared, whatever the picture's shape."""

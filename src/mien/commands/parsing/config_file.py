@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from mien.avatar.methods import has_method, method_names
-from mien.disk.config import no_such_setting
+from mien.disk.config import no_such_setting, shown
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.ranges import shown
 
 _FORMAT, _VERSION = "mien.run", 1
 _TAKEN = ("method", "settings")

@@ -11,7 +11,6 @@ import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, has_method, method_named, method_names
 from mien.avatar.settings import MethodConfig
-from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.parsing.config_file import ConfigFile, read_config_file
 from mien.commands.parsing.help_text import Described, OtherValues, subclass_with
 from mien.commands.parsing.settings_options import apply_options, check_names, leaves, options_type, other_values
@@ -19,6 +18,7 @@ from mien.disk.config import overlay
 from mien.disk.workspace import is_workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device
+from mien.media.sound import SOUND_ENDINGS
 from mien.training.settings import MAIN_SETTINGS, PRESETS, Split, TrainSettings, doubly_held_out
 from mien.training.splits.named import NAMED_SPLIT
 

@@ -15,9 +15,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from mien.avatar.schedules import Rate
 from mien.commands.parsing.help_text import field_docs
-from mien.disk.config import no_such_setting
+from mien.disk.config import Range, no_such_setting, range_of, shown
 from mien.errors import UserError
-from mien.ranges import Range, range_of, shown
 
 Settings = TypeVar("Settings")
 _RATES = "Learning rates over the run: constant, or log-linear from start to end."

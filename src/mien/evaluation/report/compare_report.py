@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.evaluation.compare import Comparison, Row, ScoredRun, Table
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.living import FILM
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import PROTOCOL_NAMES, figure
+from mien.evaluation.metrics_file import COLUMNS, PROTOCOL_NAMES, figure
 from mien.evaluation.report.page import (
     GLOSSARY,
     Card,
@@ -29,10 +30,8 @@ from mien.evaluation.report.report_sections import frame_name
 from mien.machine.progress import track_progress
 from mien.media.pictures import Box, data_uri, error_heat, picture_uri, to_uint8
 from mien.media.video import read_video_frames
-from mien.metric_names import COLUMNS
 from mien.pages.pages import render
 from mien.pages.plots import Axes, Series, line_chart
-from mien.storage import write_atomically
 from mien.training.footage.frames import Frame
 
 _FRAMES = 5

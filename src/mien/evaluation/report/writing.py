@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from mien.disk.files import write_atomically
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, Living
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,
+    COLUMNS,
     FITTED_NAME,
     OVER_DARK_NAME,
     PART_NAMES,
@@ -33,9 +35,7 @@ from mien.evaluation.report.page import (
     metric_groups,
     metric_headings,
 )
-from mien.metric_names import COLUMNS
 from mien.pages.pages import LIVING_PAGE, render
-from mien.storage import write_atomically
 from mien.training.footage.coverage import Coverage
 
 _ROWS = {

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
@@ -23,7 +24,6 @@ from mien.face.params import FaceParams
 from mien.inside import open_to_read
 from mien.limits import MAX_NUMBER
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.storage import write_atomically
 
 _POSES = {"neck_pose": ("neck",), "jaw_pose": ("jaw",), "eyes_pose": ("left_eye", "right_eye")}
 """Free joints of mien by the array that holds their axis-angle vectors."""

@@ -7,6 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from mien.disk.files import write_atomically
 from mien.disk.reading import read_bytes
 from mien.evaluation.report.page import Card, Cell, DataTable, Picture, video_of
 from mien.inside import inside
@@ -15,7 +16,6 @@ from mien.lab.analysis.spec import Analysis
 from mien.media.pictures import data_uri
 from mien.pages.pages import render
 from mien.pages.plots import line_chart
-from mien.storage import write_atomically
 
 _MAX_PICTURE_BYTES = 64 << 20
 """Limit of a picture of the page, in bytes."""

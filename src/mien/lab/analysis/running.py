@@ -8,6 +8,7 @@ from typing import Any
 
 import mien
 from mien import _native
+from mien.disk.files import expect_whole, file_digest, read_json, write_json
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.inside import check_tree, inside
@@ -18,7 +19,6 @@ from mien.lab.analysis.result import PartResult, file_names
 from mien.lab.analysis.spec import Analysis, AnalysisOptions, Part
 from mien.machine.progress import say
 from mien.media.picture_files import write_png
-from mien.storage import expect_whole, file_digest, read_json, write_json
 from mien.training.run import read_run_config, read_training_summary
 
 FORMAT, VERSION = "mien.analysis", 1

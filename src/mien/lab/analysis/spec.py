@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+from mien.disk.config import Range, check_ranges
 from mien.errors import UserError
 from mien.lazy import named
-from mien.ranges import Range, check_ranges
 
 if TYPE_CHECKING:
     from mien.lab.analysis.context import Context

@@ -16,6 +16,7 @@ from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.capture.person.faces import LANDMARKS, LandmarkDetector
 from mien.capture.store import write_capture
+from mien.disk.files import read_json, write_json
 from mien.errors import UserError
 from mien.face.loading import face_model_edition
 from mien.inside import remove_tree
@@ -24,7 +25,6 @@ from mien.lab.synthetic.scene import SyntheticScene
 from mien.lab.synthetic.truth import hash_surface, truth_of, write_truth
 from mien.machine.progress import progress_bar, say, track_progress
 from mien.media.video import write_video
-from mien.storage import read_json, write_json
 from mien.tracking.tracking import Tracking
 
 FORMAT, VERSION = "mien.synthetic_capture", 1

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from mien.disk.files import read_arrays, read_json, write_arrays, write_json
 from mien.errors import UserError
 from mien.lab.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure_anatomy
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.machine import exact
-from mien.storage import read_arrays, read_json, write_arrays, write_json
 from mien.tracking.files import read_tracking, write_tracking
 from mien.tracking.tracking import Tracking
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from torch import Tensor
 
+from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
 from mien.inside import remove_tree
 from mien.machine.progress import say
-from mien.storage import read_tensors, write_tensors
 
 INTERVAL_SECONDS = 20.0
 """Least time between two versions of a piece that is replaced again and again."""

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from mien.capture.capture import Capture
+from mien.disk.files import write_atomically
 from mien.face.model import FaceModel
 from mien.media.pictures import picture_uri, shrink
 from mien.pages.pages import render
-from mien.storage import write_atomically
 from mien.tracking.report.contact_sheet import SheetRow, sheet_frames, sheet_rows
 from mien.tracking.report.curves import Curves, charts
 from mien.tracking.report.heat import HOTTEST

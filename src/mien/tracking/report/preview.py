@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from mien.capture.capture import Capture
+from mien.disk.files import write_atomically
 from mien.face.model import FaceModel
 from mien.media.picture_files import encode_picture
 from mien.media.pictures import data_uri
 from mien.pages.pages import render
-from mien.storage import write_atomically
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.shot import Shot
 from mien.tracking.landmarks.model import LandmarkModel

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.capture.capture import Capture
+from mien.disk.files import write_json
 from mien.face.model import FaceModel
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.storage import write_json
 from mien.tracking.landmarks.groups import BROWS, LEFT_EYELIDS, LEFT_IRIS, LIPS, NOSE, OVAL, RIGHT_EYELIDS, RIGHT_IRIS
 from mien.tracking.report.curves import Curves
 from mien.tracking.report.overlay import frontal_camera

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from mien.disk.files import read_tensors
 from mien.errors import UserError
-from mien.storage import read_tensors
 
 FOREIGN = "foreign.safetensors"
 """File of a sequence with arrays of its dataset for which mien has no place of its own."""

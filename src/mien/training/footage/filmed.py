@@ -11,11 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
+from mien.disk.files import expect_whole, read_tensors, write_tensors
 from mien.face.model import FaceModel
 from mien.render.camera_paths import turned_camera
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.runtime.baked import Filmed
-from mien.storage import expect_whole, read_tensors, write_tensors
 from mien.training.footage.coverage import Coverage
 
 _FILMED_CONFIDENCE = 0.85  # mean confidence of the visible surface from which a view counts as filmed. Set by eye

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
+from mien.disk.files import file_digest
 from mien.lab.analysis.context import Context, Variant, mean_psnr
 from mien.lab.analysis.drawing import measure_in_turn
 from mien.lab.analysis.result import Chart, PartResult, Table
 from mien.pages.plots import Axes, Series
-from mien.storage import file_digest
 from mien.training.footage.frames import spread_frames
 
 _LAST = 0.2

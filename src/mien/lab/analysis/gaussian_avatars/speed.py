@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from mien import _native
+from mien.disk.files import file_digest
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.result import Chart, PartResult, Picture, Table
@@ -13,7 +14,6 @@ from mien.machine.terminal import counted
 from mien.media.pictures import to_uint8
 from mien.pages.plots import Axes, Series
 from mien.render import rasterize
-from mien.storage import file_digest
 
 TABLE_3 = {(225, 401): 187, (550, 802): 187, (1100, 1604): 156, (2200, 3208): 95, (4400, 6416): 36}
 """Width and height in pixels (the paper writes height x width) -> frames per second, for subject 306."""

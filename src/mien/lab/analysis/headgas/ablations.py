@@ -9,6 +9,7 @@ import torch
 from mien import _native
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.headgas.settings import Variant as VariantName
+from mien.disk.files import file_digest
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to
 from mien.lab.analysis.context import Context, Variant
@@ -19,7 +20,6 @@ from mien.lab.analysis.scoring import METRICS, held_out_scores, perceptual_metri
 from mien.lab.analysis.views import labeled
 from mien.media.pictures import side_by_side, to_uint8
 from mien.perceptual.distance import PerceptualDistance
-from mien.storage import file_digest
 from mien.training.footage.frames import Frame
 
 PAPER: dict[str, tuple[str, int | None, float | None, float]] = {

@@ -3,6 +3,7 @@
 import numpy as np
 
 from mien import _native
+from mien.disk.files import file_digest
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.headgas.trained import busy_face
@@ -11,7 +12,6 @@ from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.machine.terminal import counted
 from mien.pages.plots import Axes, Series
-from mien.storage import file_digest
 
 PAPER = {512: 4.0, 1024: 5.0, 2048: 8.6}
 """Side of a square picture in pixels -> mean milliseconds of a frame, for 21,000 to 37,000 Gaussians on a GPU."""

@@ -1,12 +1,12 @@
 """Time of training and of a frame, beside the paper's (Table 4 of the supplement)."""
 
 from mien import _native
+from mien.disk.files import file_digest
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.drawing import measure_drawing
 from mien.lab.analysis.result import PartResult, Table
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.terminal import counted
-from mien.storage import file_digest
 
 PAPER = {
     "NeRFace": (48.0, 2000.0),

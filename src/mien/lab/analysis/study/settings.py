@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from mien.disk.config import Range, check_ranges
 from mien.errors import UserError
-from mien.ranges import Range, check_ranges
 
 TILE_UNIT = 16
 """Sides of tiles are multiples of this, the side of H.264's blocks, so that no block holds pixels of two tiles."""
