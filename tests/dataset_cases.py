@@ -32,6 +32,7 @@ from mien.datasets import matting, overlay, sequences
 from mien.datasets.dataset import Footage
 from mien.datasets.registry import datasets
 from mien.datasets.writing import write_sequence
+from mien.disk.limits import camera_fault
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face import FaceModel
@@ -39,7 +40,6 @@ from mien.face.loading import add_face_model
 from mien.face.model import Landmarks
 from mien.face.models.coefficients import coefficient_head
 from mien.face.models.flame import flame_face_model, read_flame
-from mien.limits import camera_fault
 from mien.media.video import read_video_frames, write_video
 from mien.pipeline import import_dataset as import_footage
 from mien.pipeline.import_dataset import run_import_stage

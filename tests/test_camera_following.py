@@ -13,7 +13,6 @@ from mien.driving.constants import DRIVING
 from mien import runtime
 from mien.capture.person.faces import LandmarkDetector
 from mien.cli import main
-from mien.commands.stages import viewing_motions
 from mien.driving.live.follower import Follower, FollowOptions
 from mien.driving.live.landmark_fit import LandmarkFit
 from mien.driving.live.one_euro import OneEuro
@@ -23,6 +22,7 @@ from mien.lab.synthetic.recipe import Segment
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.media.camera_names import camera_named
 from mien.media.video import probe_video, read_video_frames, write_video
+from mien.pipeline import view_motions as viewing_motions
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime import write_portable
 from mien.viewer.drawing import View

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mien.cli import main
-from mien.commands.stages import viewing_motions
 from mien.driving.drivers import Driver
 from mien.driving.motion import ARKIT_NAMES
 from mien.driving.sources.speech import FPS, motion_of_sound, read_speech
@@ -18,6 +17,7 @@ from mien.media.sound import RATE, read_sound
 from mien.media.video import count_frames, read_video_frames, write_video
 from mien.pipeline import drive as driving
 from mien.pipeline import view as viewing
+from mien.pipeline import view_motions as viewing_motions
 from mien.viewer.session import Session
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace

@@ -16,12 +16,12 @@ from mien.camera import camera_from_fov
 from mien.capture.person.matte import guided_filter
 from mien.disk.config import Range
 from mien.disk.files import check_writable, remove_leftovers, write_atomically
+from mien.disk.limits import MAX_NUMBER
 from mien.errors import UserError
 from mien.face.checks import check_face_model
 from mien.face.mirror import triangle_geometry
 from mien.face.models.npz import read_npz
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
-from mien.limits import MAX_NUMBER
 from mien.pipeline.expression import with_expression
 from mien.render.camera_paths import sway
 from mien.tracking.fitting.views import Views

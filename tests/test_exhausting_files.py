@@ -30,6 +30,7 @@ from mien.capture.person.crop import whole_picture
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.person.given import GivenMattes, read_landmarks
 from mien.cli import main
+from mien.disk.limits import rigid_fault
 from mien.disk.reading import parse_json
 from mien.driving import drive, motion
 from mien.driving.sources.blendshape_json import read_blendshape_json
@@ -44,7 +45,6 @@ from mien.face.checks import check_face_params
 from mien.face.models.flame import read_flame
 from mien.formats.shared.glb_file import GlbWriter, read_glb
 from mien.gaussians import Gaussians
-from mien.limits import rigid_fault
 from mien.media.picture_files import decode_png, png_fits
 from mien.runtime.checks import check
 from mien.training import train

@@ -13,13 +13,13 @@ from mien.capture.cameras.calibration import CalibratedCamera, match_sources, re
 from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.datasets.live_link_face_take import LIVE_LINK_FACE
+from mien.disk.inside import listed
 from mien.disk.workspace import Workspace
 from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.driving.sources.blendshape_json import read_blendshape_json
 from mien.driving.sources.live_link_face import read_live_link_face
 from mien.errors import UserError
 from mien.evaluation.image_source import open_pictures
-from mien.inside import listed
 from mien.media.source import list_images
 from mien.pipeline import drive as driving
 from recordings import live_link_face, row, write_csv, write_json

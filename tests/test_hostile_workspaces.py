@@ -21,6 +21,7 @@ from mien.capture import read_capture
 from mien.capture.frame_files import CacheWriter, FrameLayout, FrameWriter
 from mien.cli import main
 from mien.disk.files import file_digest, read_tensors, write_tensors
+from mien.disk.inside import check_tree, inside, is_plain_name, remove_tree
 from mien.disk.workspace import Workspace, check_new_workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation import evaluate
@@ -28,7 +29,6 @@ from mien.evaluation.experiment import Frame
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face.loading import read_landmarks
-from mien.inside import check_tree, inside, is_plain_name, remove_tree
 from mien.tracking import pipeline, read_tracking, track_subject
 from mien.tracking.scoring_files import read_scoring
 from mien.tracking.settings import TrackingSettings

@@ -5,17 +5,18 @@ Entry points are read at their first use, because that takes 30 ms, which most c
 A faulty addition stops only what asks for it by name. Lists leave it out, with a warning that names its package.
 """
 
+import importlib
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from mien.errors import UserError
 from mien.machine.terminal import tell
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
-import sys
 
 EXTRA_OF = {
     "torch": "create",
@@ -203,3 +204,9 @@ def _points(group: str) -> "dict[str, list[EntryPoint]]":
 
 def _package(point: "EntryPoint") -> str:
     return point.dist.name if point.dist else "an unknown package"
+
+
+def named(place: str) -> Any:
+    """The object of a module that is named as "MODULE:NAME". The module is imported now."""
+    module, name = place.split(":")
+    return getattr(importlib.import_module(module), name)

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from mien.avatar.settings import Differences, MethodConfig
 from mien.errors import UserError
-from mien.lazy import named
-from mien.plugins import plugin, plugin_names, plugins
+from mien.plugins import named, plugin, plugin_names, plugins
 
 if TYPE_CHECKING:
     from mien.avatar.avatar import Avatar

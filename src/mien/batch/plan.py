@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from mien.disk.files import expect_whole, read_json, remove_leftovers, write_atomically, write_json
+from mien.disk.inside import check_unlinked, inside, is_one_line, is_plain_name
 from mien.disk.locks import BeingWrittenError, hold
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.inside import check_unlinked, inside, is_one_line, is_plain_name
 
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
 WORKSPACE = "{workspace}"

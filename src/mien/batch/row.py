@@ -22,9 +22,9 @@ from typing import IO, Any
 
 import mien
 from mien.batch.plan import WORKSPACE, Batch, Row, State, row_from
+from mien.disk.inside import open_to_append, open_to_read
 from mien.disk.locks import BeingWrittenError, hold
 from mien.errors import CannotWriteError, UserError
-from mien.inside import open_to_append, open_to_read
 from mien.machine.stops import orderly_stops
 from mien.machine.system import end_this_process, peak_memory_mb
 from mien.machine.terminal import printable, tell

@@ -13,9 +13,9 @@ import numpy as np
 
 from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, CacheWriter, FrameLayout, read_png
 from mien.disk.files import read_json, write_json
+from mien.disk.inside import drop_if_shared, remove_tree
 from mien.disk.locks import BeingWrittenError, hold
 from mien.errors import CannotWriteError, UserError
-from mien.inside import drop_if_shared, remove_tree
 from mien.machine.progress import progress_bar
 from mien.media.picture_files import map_pictures
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.disk.inside import open_new, open_to_change
 from mien.errors import UserError
-from mien.inside import open_new, open_to_change
 from mien.media.picture_files import decode_png, encode_picture, write_at
 
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"

@@ -39,9 +39,9 @@ from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
 from mien.disk.files import file_digest
+from mien.disk.inside import remove_tree
 from mien.disk.locks import hold
 from mien.errors import UserError
-from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.media.pace import frame_rate, tell_pauses
 

@@ -28,9 +28,9 @@ from mien.capture.room import check_room
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
 from mien.disk.files import cannot_write, file_digest, read_json, write_json
+from mien.disk.inside import check_tree, has_other_names, remove_tree
 from mien.disk.locks import hold
 from mien.errors import UserError
-from mien.inside import check_tree, has_other_names, remove_tree
 from mien.machine.progress import say
 from mien.machine.terminal import plain_name
 from mien.media.source import FrameSelection, FrameSource, open_source

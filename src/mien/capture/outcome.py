@@ -14,7 +14,7 @@ from mien.capture.person.video_kind import kind_report
 from mien.capture.process import Chunk
 from mien.capture.quality import quality_report, relative_quality
 from mien.capture.store import CaptureData, finish_capture
-from mien.inside import remove_tree
+from mien.disk.inside import remove_tree
 from mien.machine.progress import say
 from mien.media.pace import frame_rate, pace_report
 from mien.media.source import FrameSource

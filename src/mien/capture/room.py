@@ -4,8 +4,8 @@ import shutil
 from pathlib import Path
 
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
+from mien.disk.inside import remove_tree
 from mien.errors import UserError
-from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.machine.terminal import counted
 

@@ -16,10 +16,10 @@ from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, Frame
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.quality import FrameQuality
 from mien.disk.files import cannot_write, expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
+from mien.disk.inside import check_tree, is_one_line, is_plain_name, remove_tree
+from mien.disk.limits import MAX_NUMBER, camera_fault, checked_side
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
-from mien.inside import check_tree, is_one_line, is_plain_name, remove_tree
-from mien.limits import MAX_NUMBER, camera_fault, checked_side
 from mien.machine.progress import progress_bar
 
 FORMAT, VERSION = "mien.capture", 1

@@ -19,11 +19,11 @@ from mien.capture.settings import CaptureSettings
 from mien.commands import create
 from mien.commands.parsing.complaints import complaint_of
 from mien.commands.parsing.options import TrainOptions, check_method, with_settings
+from mien.disk.inside import is_plain_name, listed
 from mien.disk.reading import parse_json, read_bytes
 from mien.disk.tables import table_rows, text_of, with_point
 from mien.disk.workspace import check_no_workspace
 from mien.errors import UserError
-from mien.inside import is_plain_name, listed
 from mien.tracking.settings import ScoringSettings, TrackingSettings
 from mien.training.alignment_settings import AlignmentSettings
 from mien.training.settings import TrainSettings

@@ -14,9 +14,9 @@ from mien.commands.parsing.options import PresetName, check_method, listed_metho
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking.registry import STEP_BENCHMARKS
-from mien.lazy import named
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
 from mien.machine.terminal import show
+from mien.plugins import named
 
 if TYPE_CHECKING:
     import torch

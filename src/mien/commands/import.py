@@ -75,8 +75,8 @@ class Command:
             ) from None
 
     def _read(self, dataset: Dataset, told: str | None) -> None:
-        from mien.commands.stages.findings import findings_lines
         from mien.machine.progress import say
+        from mien.pipeline.import_dataset import findings_lines
 
         if told is not None and (self.dry_run or dataset.holds == "sequences"):
             say(f"{self.path}: {told}")  # before they are read, which takes long

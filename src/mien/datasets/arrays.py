@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from mien.datasets.content import REMEDY
+from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import read_bytes
 from mien.errors import UserError
 from mien.face.models.npz import parse_npy, read_npz
-from mien.limits import MAX_NUMBER
 
 _MAX_NPY_BYTES = 16 << 20
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from mien.disk.inside import is_one_line
+from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import open_ordinary, parse_json, read_bytes
 from mien.errors import UserError
-from mien.inside import is_one_line
-from mien.limits import MAX_NUMBER
 
 REMEDY = "copy the files of the dataset again"
 _MAX_JSON_BYTES = 512 << 20

@@ -14,12 +14,12 @@ from jaxtyping import Float
 
 from mien.datasets.content import REMEDY, rotation_part
 from mien.datasets.flame_poses import axis_angles, face_of_flame, in_front, matrices_from_rows_6d
+from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import MAX_SIDE, open_archive, open_member, open_ordinary
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.models.inert_pickle import parse_inert_pickle
 from mien.face.params import FaceParams
-from mien.limits import MAX_NUMBER
 from mien.machine.progress import progress_bar
 
 VERSION = "FLAME 2020 (generic_model.pkl)"

@@ -20,8 +20,8 @@ from mien.datasets.content import (
     sniff,
 )
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
+from mien.disk.inside import listed
 from mien.errors import UserError
-from mien.inside import listed
 
 if TYPE_CHECKING:
     import numpy as np

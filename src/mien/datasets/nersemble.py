@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, numbers, read_object, rotation_part
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
+from mien.disk.inside import is_plain_name
 from mien.errors import UserError
-from mien.inside import is_plain_name
 
 if TYPE_CHECKING:
     import numpy as np

@@ -13,11 +13,11 @@ from mien.capture.person.backend import choose_detector, detector_entry
 from mien.capture.person.faces import LANDMARKS, LandmarkDetector
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import FilmedSequence, TrackedSequence
+from mien.disk.limits import camera_fault
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.limits import camera_fault
 from mien.tracking.neck_line import fit_neck_lines
 from mien.tracking.tracking import Tracking
 

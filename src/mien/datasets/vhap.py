@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, rotation_part, sniff
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
+from mien.disk.inside import is_plain_name
 from mien.errors import UserError
-from mien.inside import is_plain_name
 
 if TYPE_CHECKING:
     import numpy as np

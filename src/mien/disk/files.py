@@ -22,9 +22,9 @@ import safetensors.numpy
 import safetensors.torch
 from torch import Tensor
 
+from mien.disk.inside import open_new, remove_tree
 from mien.disk.reading import open_ordinary, parse_json, read_bytes
 from mien.errors import CannotWriteError, UserError
-from mien.inside import open_new, remove_tree
 
 __all__ = [
     "cannot_write",

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mien.disk.inside import check_subtrees, inside
 from mien.errors import UserError
-from mien.inside import check_subtrees, inside
 
 COMPARED = "compare-"
 """First letters of the names of runs that `mien bench compare` makes."""

@@ -9,6 +9,7 @@ from typing import Any
 
 from mien.disk.config import check_ranges
 from mien.disk.files import file_digest, write_json
+from mien.disk.inside import check_tree
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
@@ -24,7 +25,6 @@ from mien.evaluation.report.report_sections import cross_section
 from mien.evaluation.report.writing import RunRecord, write_report
 from mien.evaluation.scoring import worker_threads
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
-from mien.inside import check_tree
 from mien.perceptual.lpips import load_lpips
 from mien.training.footage.filmed import read_coverage
 from mien.training.frame_gains import GAINS

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mien.disk.inside import listed
 from mien.errors import UserError
-from mien.inside import listed
 from mien.machine.progress import say
 from mien.media.decoding import decode_picture
 from mien.media.video import read_video_frames

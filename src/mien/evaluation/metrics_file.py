@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 from mien.disk.files import expect_whole, read_json
+from mien.disk.inside import is_one_line
 from mien.evaluation.experiment import Edges
 from mien.face.parts import PARTS
-from mien.inside import is_one_line
 
 METRICS = ("psnr", "ssim", "l1", "perceptual")
 COLUMNS = (

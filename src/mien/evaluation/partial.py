@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from mien.disk.files import write_atomically
+from mien.disk.inside import open_to_append
+from mien.disk.limits import checked_whole
 from mien.disk.reading import parse_json, read_bytes
 from mien.evaluation.scoring import Scores
-from mien.inside import open_to_append
-from mien.limits import checked_whole
 from mien.training.footage.frames import Frame
 
 _MAX_BYTES = 256 << 20

@@ -22,14 +22,14 @@ from mien.avatar.files import overwrite
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.avatar.methods import METHODS
 from mien.disk.files import cannot_write, write_atomically
+from mien.disk.inside import open_to_read
+from mien.disk.limits import MAX_NUMBER
 from mien.errors import UserError
 from mien.export.ply import BINDING, property_names, read_columns, stacked, stacked_sh
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.formats.shared.flame_params import read_flame_params, write_flame_params
-from mien.inside import open_to_read
-from mien.limits import MAX_NUMBER
 from mien.runtime.baked import MeshBound
 
 POINTS, PARAMETERS, MODEL = "point_cloud.ply", "flame_param.npz", "face_model"

@@ -13,10 +13,10 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from mien.disk.files import write_atomically
+from mien.disk.limits import rigid_fault
 from mien.disk.reading import open_ordinary
 from mien.errors import UserError
 from mien.gaussians import Gaussians
-from mien.limits import rigid_fault
 
 _MAX_HEADER_BYTES = 65536
 _REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}

@@ -15,11 +15,11 @@ import torch
 from PIL import Image, UnidentifiedImageError
 
 from mien.disk.files import write_atomically
+from mien.disk.limits import checked_whole
 from mien.disk.reading import open_archive, open_member, open_ordinary, parse_json
 from mien.errors import UserError
 from mien.formats.shared.splats import finite_arrays, unit_quats
 from mien.gaussians import Gaussians
-from mien.limits import checked_whole
 from mien.media.decoding import announced_size
 
 _VERSION = 2

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from mien.disk.inside import is_one_line
+from mien.disk.limits import MAX_NUMBER, skeleton_fault
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.inside import is_one_line
-from mien.limits import MAX_NUMBER, skeleton_fault
 
 _AXES = {
     "template": "v3", "faces": "f3", "uv": "u2", "uv_faces": "f3", "face_regions": "f", "identity_basis": "iv3",

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mien.disk.files import read_json
+from mien.disk.inside import is_one_line
 from mien.errors import UserError
 from mien.face.cache import cache_folder
 from mien.face.models.anny_source import anny_tag
-from mien.inside import is_one_line
-from mien.lazy import named
+from mien.plugins import named
 
 if TYPE_CHECKING:
     import mien.face.model

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from mien.disk.files import expect_whole, read_json, read_tensors, write_atomically, write_json, write_tensors
+from mien.disk.inside import is_plain_name
+from mien.disk.limits import are_indices, is_moderate
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
 from mien.face.checks import check_face_model
@@ -28,8 +30,6 @@ from mien.face.listing import (
 )
 from mien.face.model import FaceModel, Landmarks
 from mien.face.models.coefficients import BASE, coefficient_count, coefficient_head
-from mien.inside import is_plain_name
-from mien.limits import are_indices, is_moderate
 
 LANDMARK_FORMAT, LANDMARK_VERSION = "mien.landmark_embedding", 1
 TENSORS = (

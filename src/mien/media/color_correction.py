@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mien.disk.limits import MAX_NUMBER
 from mien.errors import UserError
-from mien.limits import MAX_NUMBER
 
 NAME = "color_correction"
 _CHUNK = 1 << 14

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.disk.files import cannot_write, write_atomically
+from mien.disk.inside import open_to_read
 from mien.errors import UserError
-from mien.inside import open_to_read
 from mien.machine import system
 
 MAX_KEPT_BYTES = 256 << 20

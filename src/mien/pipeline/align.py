@@ -11,11 +11,11 @@ import torch
 
 from mien.capture.store import read_capture
 from mien.disk.files import expect_whole, read_tensors, write_tensors
+from mien.disk.inside import remove_tree
 from mien.disk.locks import hold
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.params import FaceParams
-from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.pipeline.train import read_together
 from mien.rotation import axis_angle_from_matrix

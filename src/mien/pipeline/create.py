@@ -9,12 +9,12 @@ from pathlib import Path
 from mien.avatar.files import load_avatar
 from mien.capture.settings import CaptureSettings
 from mien.disk.files import write_atomically
+from mien.disk.inside import listed
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.evaluation.living import FILM, living, write_film
 from mien.export.web_page import write_page
 from mien.formats.shared.packed import Motion
-from mien.inside import listed
 from mien.machine.progress import Piece, say
 from mien.media.video import probe_video
 from mien.pages.pages import LIVING_PAGE

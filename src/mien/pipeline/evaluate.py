@@ -5,6 +5,7 @@ from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Any
 
+from mien.disk.inside import check_tree
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation.compare import Comparison, compare_runs
@@ -13,7 +14,6 @@ from mien.evaluation.metrics_file import read_figures
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.report.compare_report import write_comparison
 from mien.evaluation.report.text import dataset_line, driven_line, protocol_lines
-from mien.inside import check_tree
 from mien.machine.progress import say
 from mien.training.run import read_run_config
 from mien.training.splits.named import DRIVING, NAMED_SPLIT, driving_sequences

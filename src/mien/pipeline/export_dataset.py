@@ -26,10 +26,10 @@ from mien.datasets.submission import (
 )
 from mien.disk.config import decode
 from mien.disk.files import replace_folder
+from mien.disk.inside import remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.params import FaceParams
-from mien.inside import remove_tree
 from mien.machine.progress import say, track_progress
 from mien.machine.terminal import counted
 from mien.media.pictures import to_uint8

@@ -16,7 +16,6 @@ from jaxtyping import UInt8
 from mien import runtime
 from mien.avatar.baking import as_array
 from mien.camera import Camera
-from mien.commands.stages.viewing_motions import switch_of
 from mien.disk.files import cannot_write
 from mien.driving.live.follower import FollowOptions
 from mien.errors import UserError
@@ -27,6 +26,7 @@ from mien.media.pixels import to_rgb
 from mien.media.video import write_video
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.view import Place, Viewed, open_viewed
+from mien.pipeline.view_motions import switch_of
 from mien.viewer.access import Door
 from mien.viewer.following import CameraSwitch
 from mien.viewer.server import serve

@@ -6,9 +6,9 @@ from itertools import combinations
 from pathlib import Path
 
 from mien.disk.files import file_digest
+from mien.disk.inside import is_plain_name
 from mien.disk.workspace import check_no_workspace
 from mien.errors import UserError
-from mien.inside import is_plain_name
 from mien.machine.terminal import plain_name
 
 

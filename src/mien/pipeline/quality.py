@@ -15,6 +15,7 @@ from mien.avatar.methods import method_named
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture, read_capture_hash
 from mien.disk.files import read_json, replace_folder, write_atomically, write_json
+from mien.disk.inside import remove_tree
 from mien.disk.locks import WAIT, hold
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
@@ -25,7 +26,6 @@ from mien.evaluation.metrics_file import protocol_means, read_metrics
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face.loading import load_face_model
-from mien.inside import remove_tree
 from mien.lab.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
 from mien.lab.benchmarking.unseen_views import (
     Figures,

@@ -12,13 +12,13 @@ from mien.capture.capture import Capture
 from mien.capture.store import read_capture, read_capture_hash
 from mien.datasets.writing import OVERLAY
 from mien.disk.files import remove_leftovers
+from mien.disk.inside import remove_tree
 from mien.disk.locks import hold
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
-from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.media.video import count_frames
 from mien.pipeline.face_models import face_model_of

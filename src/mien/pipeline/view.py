@@ -94,7 +94,7 @@ def _session(viewed: Viewed, motions: Motions) -> Session:
     """The avatar that browsers share, and the motions that it may play."""
     clips = {}
     if viewed.sequences or motions.play is not None:
-        from mien.commands.stages.viewing_motions import clip_of
+        from mien.pipeline.view_motions import clip_of
 
         clips = {name: clip_of(viewed, folder, name, motions.neutral) for name, folder in viewed.sequences.items()}
         if motions.play is not None:
@@ -110,7 +110,7 @@ def open_viewed(avatar: Path, run: str | None) -> Viewed:
     """Open a .mien file, or a run of a workspace."""
     if avatar.is_file():
         return viewed_file(avatar)
-    from mien.commands.stages.viewing_motions import of_workspace
+    from mien.pipeline.view_motions import of_workspace
 
     return of_workspace(avatar, run)
 
@@ -126,7 +126,7 @@ def viewed_file(path: Path) -> Viewed:
     portable = read_portable(path)
 
     def person() -> "tuple[mien.face.FaceModel, mien.face.FaceParams]":
-        from mien.commands.stages.viewing_motions import person_of
+        from mien.pipeline.view_motions import person_of
 
         return person_of(path, portable)
 
@@ -141,7 +141,7 @@ def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwit
     if not devices() or not is_loopback(place.host) or not place.token or os.environ.get(PARENT_VARIABLE) is not None:
         return None
     try:
-        from mien.commands.stages.viewing_motions import switch_of_first_camera
+        from mien.pipeline.view_motions import switch_of_first_camera
     except ModuleNotFoundError:
         return None
     return switch_of_first_camera(session, viewed)

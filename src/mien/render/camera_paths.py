@@ -13,9 +13,9 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.disk.files import read_json, write_json
+from mien.disk.limits import camera_fault
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.limits import camera_fault
 from mien.rotation import invert_rigid, matrix_from_axis_angle, rigid_transform
 
 FORMAT, VERSION = "mien.cameras", 1

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from mien.disk.inside import is_one_line
+from mien.disk.limits import MAX_NUMBER, are_indices, camera_fault, is_moderate, rigid_fault, skeleton_fault
 from mien.errors import UserError
-from mien.inside import is_one_line
-from mien.limits import MAX_NUMBER, are_indices, camera_fault, is_moderate, rigid_fault, skeleton_fault
 from mien.runtime.baked import (
     AttributeNetwork,
     Attributes,

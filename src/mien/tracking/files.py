@@ -9,11 +9,11 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.disk.files import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
+from mien.disk.inside import check_tree, is_one_line
+from mien.disk.limits import MAX_NUMBER, camera_fault
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
 from mien.face.params import FaceParams
-from mien.inside import check_tree, is_one_line
-from mien.limits import MAX_NUMBER, camera_fault
 from mien.tracking.tracking import PARTS, Appearance, Tracking
 
 _FORMAT, _VERSION = "mien.tracking", 1
@@ -68,7 +68,7 @@ def read_tracking(path: Path) -> Tracking:
 
     Raises:
         UserError: A file is missing, damaged, of another version, being written, or a link, or it holds numbers that
-            are not finite or exceed `mien.limits`.
+            are not finite or exceed `mien.disk.limits`.
     """
     return read_beside_writers(lambda: _read_tracking(path), [path], [path.parent])
 

@@ -9,9 +9,9 @@ import torch
 
 from mien.capture.capture import Capture
 from mien.capture.person.backend import detector_of
+from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.face.model import FaceModel
-from mien.inside import remove_tree
 from mien.machine.progress import say
 from mien.tracking.descent.schedule import fit_by_descent
 from mien.tracking.fitting.fit import Fit, Watch, ignore_progress

@@ -22,13 +22,13 @@ from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.disk.config import encode
 from mien.disk.files import expect_whole, read_json, read_tensors, write_json, write_tensors
+from mien.disk.inside import check_tree, is_plain_name
+from mien.disk.limits import camera_fault
 from mien.disk.locks import WAIT, check_free
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.inside import check_tree, is_plain_name
-from mien.limits import camera_fault
 from mien.runtime.baked import Filmed
 from mien.tracking.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState

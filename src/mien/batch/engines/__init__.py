@@ -13,8 +13,7 @@ from typing import Any
 
 from mien.batch.plan import Row
 from mien.errors import UserError
-from mien.lazy import named
-from mien.plugins import plugin, plugin_names
+from mien.plugins import named, plugin, plugin_names
 
 Work = Callable[[Row], Any]
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from mien.camera import Camera
 from mien.capture.store import is_file_name
+from mien.disk.inside import listed
 from mien.errors import UserError
-from mien.inside import listed
 from mien.media.color_correction import ColorCorrection, correction_of_entry
 from mien.media.lens import Lens, lens_of_entry
 from mien.render.camera_paths import camera_of_entry, read_camera_entries

@@ -14,9 +14,9 @@ from mien.capture.person.crop import Crop, whole_picture
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.settings import CaptureSettings
 from mien.disk.files import read_arrays
+from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import open_ordinary, short_lines
 from mien.errors import UserError
-from mien.limits import MAX_NUMBER
 from mien.machine.progress import say
 from mien.machine.terminal import counted
 from mien.media.decoding import decode_picture

@@ -9,9 +9,9 @@ import numpy as np
 from mien.datasets.layouts.filmed import Filmed
 from mien.datasets.layouts.layout import Layout, Written, check_new_folder
 from mien.disk.files import cannot_write, replace_folder
+from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
-from mien.inside import remove_tree
 from mien.machine.terminal import counted
 from mien.media.picture_files import write_png
 from mien.media.pictures import Box

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from mien.disk.limits import has_last_row
 from mien.disk.reading import parse_json
 from mien.disk.tables import text_of
 from mien.driving.motion import (
@@ -27,7 +28,6 @@ from mien.driving.motion import (
 from mien.driving.sources.json_layouts import Recorded, Scores, arkit_index, recorded, short
 from mien.driving.sources.sides import as_performer
 from mien.errors import UserError
-from mien.limits import has_last_row
 from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
 _NO_EXPRESSION = "_neutral"

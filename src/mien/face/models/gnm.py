@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from mien.disk.inside import is_plain_name
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.model import EYE_BACK, FaceModel
 from mien.face.models.flame import FLAME_LARGEST_COEFFICIENT
 from mien.face.models.npz import read_npz
-from mien.inside import is_plain_name
 
 REGIONS = ("skin", "neck", "eyes", "irises", "teeth", "tongue", "mouth")
 """Regions that follow from the groups of vertices. `mien.tracking.landmarks` finds more, by landmarks."""

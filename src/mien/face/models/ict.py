@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from mien.disk.inside import listed
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
@@ -21,7 +22,6 @@ from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid
 from mien.face.models.flame import FLAME_IRIS_RADIUS
 from mien.face.models.npz import read_npz
 from mien.face.models.obj_files import read_obj, read_obj_positions
-from mien.inside import listed
 
 VERTICES, QUADS = 26719, 26384
 """Vertices and faces of the model. Faces are quads; a triangle has -1 as its last corner."""

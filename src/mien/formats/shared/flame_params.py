@@ -16,13 +16,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.disk.files import write_atomically
+from mien.disk.inside import open_to_read
+from mien.disk.limits import MAX_NUMBER
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.models.npz import read_npz
 from mien.face.params import FaceParams
-from mien.inside import open_to_read
-from mien.limits import MAX_NUMBER
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 _POSES = {"neck_pose": ("neck",), "jaw_pose": ("jaw",), "eyes_pose": ("left_eye", "right_eye")}

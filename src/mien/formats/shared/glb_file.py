@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from mien.disk.files import write_atomically
+from mien.disk.limits import checked_whole
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.limits import checked_whole
 
 _MAGIC, _VERSION = 0x46546C67, 2
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942

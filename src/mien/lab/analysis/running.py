@@ -9,9 +9,9 @@ from typing import Any
 import mien
 from mien import _native
 from mien.disk.files import expect_whole, file_digest, read_json, write_json
+from mien.disk.inside import check_tree, inside
 from mien.disk.locks import hold
 from mien.errors import UserError
-from mien.inside import check_tree, inside
 from mien.lab.analysis.charts import write_chart
 from mien.lab.analysis.context import Context, digest_of
 from mien.lab.analysis.page import section_html, write_page

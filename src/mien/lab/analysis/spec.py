@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from mien.disk.config import Range, check_ranges
 from mien.errors import UserError
-from mien.lazy import named
+from mien.plugins import named
 
 if TYPE_CHECKING:
     from mien.lab.analysis.context import Context

@@ -8,8 +8,8 @@ from pathlib import Path
 from torch import Tensor
 
 from mien.disk.files import read_tensors, write_tensors
+from mien.disk.inside import remove_tree
 from mien.errors import UserError
-from mien.inside import remove_tree
 from mien.machine.progress import say
 
 INTERVAL_SECONDS = 20.0

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mien.disk.files import read_json, write_json
+from mien.disk.inside import is_one_line
 from mien.errors import UserError
-from mien.inside import is_one_line
 from mien.training.settings import TrainSettings
 
 OWN_SPLIT = "dataset"

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from mien.disk.files import expect_whole, read_json, write_json
+from mien.disk.inside import is_one_line, listed
+from mien.disk.limits import checked_whole
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.inside import is_one_line, listed
 from mien.lab.analysis.study.shuffling import shuffled
-from mien.limits import checked_whole
 
 QUESTIONS = {"quality": "visual quality", "expression": "expression accuracy"}
 """The questions of the study, by their names in answer files (MonoGaussianAvatar, supplement A.5)."""
