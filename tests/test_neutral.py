@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from mien.avatar import neutral_of
-from mien.commands.parsing.options import check_neutral
 from mien.driving import drive
 from mien.driving.drivers import Driver
 from mien.driving.neutral import with_neutral
@@ -16,6 +15,7 @@ from mien.driving.rest import REST_EXPRESSION, REST_GAZE, REST_HEAD, facing, kep
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.pipeline.drive import open_driver
+from mien.pipeline.driver import check_neutral
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from small_face_model import make_small_face_model
 from test_motion import row, write_csv

@@ -39,7 +39,7 @@ class Driver:
     store: str = ""
     """URL of the store of workspaces. Empty if all nodes share the batch's folder."""
     program: tuple[str, ...] = ()
-    """The command of a row's process. Empty means this Python with `-m mien.batch.row_name`."""
+    """The command of a row's process. Empty means this Python with `-m mien.commands.batch_row`."""
     work: Work | None = None
     """A function that runs a row in place of `attempt`, for trials of the engines."""
     look_seconds: float = 5.0

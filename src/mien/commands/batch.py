@@ -64,8 +64,8 @@ class Command:
     store: str = ""
     """URL of a folder for the workspaces, such as s3://bucket/people, if nodes share no folder. Copied in and out."""
     program: str = ""
-    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.batch.row_name". The folder of the
-    batch follows it."""
+    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.commands.batch_row". The
+    folder of the batch follows it."""
     watch: bool = False
     """For status: show it again every five seconds, until all rows have ended."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False

@@ -6,17 +6,11 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.parsing.options import (
-    check_avatar,
-    check_driver,
-    check_neutral,
-    check_port,
-    check_viewer,
-    has_viewer,
-)
+from mien.commands.parsing.options import check_avatar, check_port, check_viewer, has_viewer
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
+from mien.pipeline.driver import check_driver, check_neutral
 from mien.pipeline.picture_options import PictureOptions
 
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import tyro
 
 from mien.commands.parsing.help_text import Described
-from mien.commands.parsing.options import check_driver, check_neutral
 from mien.datasets.layouts.layout import Layout, MatteKind
 from mien.datasets.layouts.registry import LAYOUTS, find_layout
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, Holds
 from mien.formats.registry import endings, find_format, format_of, formats, numbered
+from mien.pipeline.driver import check_driver, check_neutral
 
 if TYPE_CHECKING:
     from mien.formats.format import Options

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.parsing.options import check_avatar, check_driver, check_neutral, check_port, check_viewer
+from mien.commands.parsing.options import check_avatar, check_port, check_viewer
 from mien.errors import UserError
+from mien.pipeline.driver import check_driver, check_neutral
 
 _LOOPBACK = "127.0.0.1"
 

@@ -1,7 +1,7 @@
 """Sequences with poses and coefficients of a head model that is not published.
 
-They get a head that the coefficients do not move (`mien.face.models.coefficients`). The poses are in that model's own axes and
-unit. One turn, one shift and one scale lead to them from mien's head frame. They are found by landmarks.
+They get a head that the coefficients do not move (`mien.face.models.coefficients`). The poses are in that model's own
+axes and unit. One turn, one shift and one scale lead to them from mien's head frame. They are found by landmarks.
 """
 
 from collections.abc import Iterable, Iterator

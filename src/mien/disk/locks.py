@@ -10,8 +10,8 @@ that gets the lock of a removed file starts again. After a kill the file stays, 
 
 The file may come from a stranger together with the workspace: no link is followed, and its content is not trusted.
 
-Readers look at a lock by `mien.machine.system.is_locked`, because they must not create the file, and because two of them that
-look at the same time must not take each other for writers. filelock has no such look.
+Readers look at a lock by `mien.machine.system.is_locked`, because they must not create the file, and because two of
+them that look at the same time must not take each other for writers. filelock has no such look.
 
 docs/conventions.md, "Two commands at once", lists which command holds which locks. Readers use `read_beside_writers`.
 """

@@ -16,7 +16,8 @@ BINARY: int = getattr(os, "O_BINARY", 0)
 NO_WAIT: int = getattr(os, "O_NONBLOCK", 0)
 """Flag of open(2): opening a pipe never waits for its other end. Windows has no pipes among its files."""
 NO_LINK: int = getattr(os, "O_NOFOLLOW", 0)
-"""Flag of open(2): a link is refused. Windows lacks it, so that `mien.disk.reading.open_handle` compares what it opened."""
+"""Flag of open(2): a link is refused. Windows lacks it, so that `mien.disk.reading.open_handle` compares what it
+opened."""
 
 HANGUPS: tuple[int, ...] = (signal.SIGBREAK,) if sys.platform == "win32" else (signal.SIGHUP,)
 """Signals that come when the terminal is closed."""

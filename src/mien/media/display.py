@@ -8,8 +8,8 @@ from av.sidedata.sidedata import Type as SideDataType
 from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
-from mien.capture.person.alpha import as_matte, over_ground
 from mien.errors import UserError
+from mien.media.alpha import as_matte, over_ground
 from mien.media.colors import UNSPECIFIED, Colors, colors_of
 from mien.media.tone import ToneMapper, is_wide, narrowed
 from mien.media.video_file import MAX_FRAME_PIXELS, TOO_MANY_PIXELS

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.capture.person.alpha import as_matte, over_ground
 from mien.disk.inside import listed
 from mien.errors import UserError
+from mien.media.alpha import as_matte, over_ground
 from mien.media.color_correction import ColorCorrection
 from mien.media.decoding import decode_picture, may_have_alpha
 from mien.media.fields import Deinterlace

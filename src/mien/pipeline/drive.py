@@ -10,7 +10,6 @@ import numpy as np
 
 from mien.avatar.files import load_avatar
 from mien.capture.settings import CaptureSettings
-from mien.commands.parsing.options import NEUTRALS, check_driver, check_neutral, holds_pictures, is_tracked_sequence
 from mien.disk.files import file_digest, write_atomically
 from mien.disk.workspace import Workspace, open_workspace
 from mien.driving.drivers import Driver, read_recording, read_tracked_driver
@@ -28,6 +27,7 @@ from mien.media.source import FrameSelection, list_images, open_source
 from mien.media.writing import write_pictures
 from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.draw import draw, posed_softly, view, warn_of_white
+from mien.pipeline.driver import NEUTRALS, check_driver, check_neutral, holds_pictures, is_tracked_sequence
 from mien.pipeline.names import is_picture
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.track import run_tracking_stage

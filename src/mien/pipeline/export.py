@@ -138,7 +138,7 @@ class RunContent:
 
 
 def export(content: RunContent, out: Path, kind: Format, options: Options) -> None:
-    """Write the avatar of a run in a format, and report it. A motion becomes numbered files if a file holds one pose."""
+    """Write the avatar of a run in a format, and tell of it. A motion is numbered files if a file holds one pose."""
     moving = content.poses() if kind.holds == "pose" else None
     if moving is None:
         say(f"{out}: reads the run and writes the file, which takes up to half a minute")

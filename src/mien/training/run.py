@@ -167,7 +167,7 @@ def read_face_track(run_dir: Path, face_model: FaceModel) -> FaceParams:
 
 
 def filmed_range(run_dir: Path, avatar: Avatar) -> Filmed:
-    """What training saw of the face. For avatars that do not say, all timesteps of the run, seen by its first camera."""
+    """What training saw of the face. If an avatar does not say: all timesteps of the run, seen by its first camera."""
     if avatar.filmed is not None:
         return avatar.filmed
     face = read_face_track(run_dir, avatar.face_model)

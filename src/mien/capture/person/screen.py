@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.person.alpha import GROUND
 from mien.capture.person.plate import PLATE_BACKGROUND_LEVEL, PLATE_HALO, PLATE_PERSON_LEVEL
+from mien.media.alpha import GROUND
 
 _SCREEN_LEAST_LEVEL = 0.2  # least level of a screen's brightest channel, 0..1
 _SCREEN_MOST_RED = 0.7  # most red of a screen, relative to its brightest channel. Skin has most of red

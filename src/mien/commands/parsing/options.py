@@ -15,10 +15,9 @@ from mien.commands.parsing.config_file import ConfigFile, read_config_file
 from mien.commands.parsing.help_text import Described, OtherValues, subclass_with
 from mien.commands.parsing.settings_options import apply_options, check_names, leaves, options_type, other_values
 from mien.disk.config import overlay
-from mien.disk.workspace import is_workspace, open_workspace
+from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device
-from mien.media.sound import SOUND_ENDINGS
 from mien.training.settings import MAIN_SETTINGS, PRESETS, Split, TrainSettings, doubly_held_out
 from mien.training.splits.named import NAMED_SPLIT
 
@@ -27,12 +26,6 @@ if TYPE_CHECKING:
 else:
     PresetName = Literal[tuple(PRESETS)]
 
-NEUTRALS = ("first", "calm", "model")
-"""Words that --neutral takes. Anything else is a file."""
-_DRIVERS = (
-    "a workspace, a video, a picture, a folder of pictures, a .csv of Live Link Face or of ARKit's names, a .json of "
-    "blend shapes, or a sound file"
-)
 _MAX_PORT = 65535
 _IN_DETAIL = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
 """Options that depend on the method. `with_settings` fills them in."""
@@ -246,55 +239,3 @@ def check_viewer() -> None:
     """Check that the package of the viewer's page is installed."""
     if not has_viewer():
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
-
-
-def is_tracked_sequence(folder: Path) -> bool:
-    """Whether a folder is that of one tracked sequence of a workspace."""
-    return (folder / "tracking").is_dir()
-
-
-def check_neutral(neutral: str | None) -> None:
-    """Check before any work that a driver's face at rest is a word of `NEUTRALS`, or a driver."""
-    if neutral is None or neutral in NEUTRALS:
-        return
-    if not Path(neutral).exists():
-        raise UserError(
-            f"--neutral {neutral}: no such file; give first, calm or model, or a video, recording, workspace or "
-            "sequence folder of the driver at rest"
-        )
-    if not is_tracked_sequence(Path(neutral)):
-        check_driver(Path(neutral), None)
-
-
-def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:
-    """Check before any work that the driver exists: a workspace with that sequence, or a file."""
-    suffix = by.suffix.lower() if by.is_file() else ""
-    if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
-        raise UserError(f"--fps {fps:g}: is for the times of a .csv; give a number above 0, at most 1000")
-    if not by.exists():
-        raise UserError(f"{by}: no such file or folder; give {_DRIVERS}")
-    if suffix in (".csv", ".json", *SOUND_ENDINGS) and sequence is not None:
-        raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
-    if not by.is_file():
-        if not holds_pictures(by):
-            open_workspace(by).pick_sequence(sequence)
-    elif suffix not in (".csv", ".json", *SOUND_ENDINGS):
-        from mien.media.video_file import open_video
-
-        try:
-            with open_video(by):
-                pass
-        except UserError as error:
-            raise UserError(f"{error}; what drives an avatar is {_DRIVERS}") from None
-
-
-def holds_pictures(folder: Path) -> bool:
-    """Whether a folder is one of pictures, and no workspace."""
-    if not folder.is_dir() or is_workspace(folder):
-        return False
-    from mien.media.source import list_images
-
-    try:
-        return bool(list_images(folder))
-    except UserError:
-        return False

@@ -1,8 +1,8 @@
 """Blend shapes as json: a plain list of frames, or what MediaPipe, BEAT, LAM and Audio2Face write.
 
-`mien.driving.sources.json_layouts` describes the layouts. Times are in milliseconds as "timestamp_ms" (or "timestampMs") and in
-seconds as "time". MediaPipe's matrices are in centimetres, with OpenGL axes. A frame without a face repeats the frame
-before it.
+`mien.driving.sources.json_layouts` describes the layouts. Times are in milliseconds as "timestamp_ms" (or
+"timestampMs") and in seconds as "time". MediaPipe's matrices are in centimetres, with OpenGL axes. A frame without a
+face repeats the frame before it.
 """
 
 import difflib

@@ -1,9 +1,9 @@
 """flame_param.npz, the face parameters in GaussianAvatars' folders: FLAME's own, and mien's `FaceParams`.
 
 FLAME's chain starts at the shoulders and turns about joints that follow identity, expression and offsets; a mien head
-is posed by itself (`mien.face.models.flame` explains how the two correspond). With R0 and R1 the rotations of FLAME's root and
-neck, J0 and J1 these joints relative to the origin o of the head frame, and t FLAME's translation:
-head rotation = R0 R1, head translation = R0 (J1 - R1 J1 - J0) + J0 + o + t, neck of mien = inverse of R1.
+is posed by itself (`mien.face.models.flame` explains how the two correspond). With R0 and R1 the rotations of FLAME's
+root and neck, J0 and J1 these joints relative to the origin o of the head frame, and t FLAME's translation: head
+rotation = R0 R1, head translation = R0 (J1 - R1 J1 - J0) + J0 + o + t, neck of mien = inverse of R1.
 """
 
 import io

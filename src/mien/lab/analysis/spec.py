@@ -62,7 +62,7 @@ class Analysis:
 
 
 def chosen_parts(analysis: Analysis, names: Sequence[str], train: bool) -> list[Part]:
-    """The parts of those names, in the analysis' order. Without names: all that need no training, or all with `train`."""
+    """The parts of those names, in the analysis' order. Without names: all, or without `train` all that need none."""
     known = [part.name for part in analysis.parts]
     for name in names:
         if name not in known:

@@ -11,7 +11,9 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.eyelids.eyes import Eye
-from mien.tracking.pixels.texture import LEAST_COSINE
+
+LEAST_COSINE = 0.25
+"""Least cosine between the surface's normal and the direction to the camera at which the surface's colour is used."""
 
 _WIDEST_EYE = 40  # largest width of an eyeball, in pixels. If it is wider, the picture is scaled down
 _NARROWEST_EYE = 20  # smallest width of an eyeball, in pixels. Narrower eyeballs show too little and are skipped

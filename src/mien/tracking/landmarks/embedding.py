@@ -74,7 +74,7 @@ class DetectedViews:
 def embed_landmarks(
     model: FaceModel, settings: EmbeddingSettings | None = None
 ) -> tuple[dict[str, Landmarks], Float[Tensor, " l"]]:
-    """The `mediapipe` and `ibug68` landmark sets of a face model, and each MediaPipe landmark's median error in pixels."""
+    """The landmark sets `mediapipe` and `ibug68` of a face model, and the median errors of MediaPipe's in pixels."""
     settings = settings or EmbeddingSettings()
     views, seen = _draw_and_detect(model, settings)
     faces, barycentric = torch.empty(LANDMARKS, dtype=torch.long), torch.empty(LANDMARKS, 3)

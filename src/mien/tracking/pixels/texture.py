@@ -15,12 +15,11 @@ from mien import _native
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.render.mesh import MeshFragments, rasterize_mesh
+from mien.tracking.eyelids.crops import LEAST_COSINE
 from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, fit_of
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.surface import PosedSurface
 
-LEAST_COSINE = 0.25
-"""Least cosine between the surface's normal and the direction to the camera at which the surface's colour is used."""
 _LEAST_WEIGHT = 0.05  # least total weight of a texel's sightings (each the squared cosine) for the texel to be known
 _FIRST_SIGMA = 0.1  # expected colour difference (0..1) before anything is known
 _SIGMA_BOUNDS = (0.01, 0.1)  # bounds of the expected colour difference afterwards

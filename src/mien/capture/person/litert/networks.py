@@ -48,7 +48,7 @@ def network_content(name: NetworkName) -> bytes:
 
 @functools.cache
 def _first_part() -> bytes:
-    """The start of face_landmarker.task. Its end, which only pages need, may be missing (mien.formats.shared.webcam)."""
+    """The start of face_landmarker.task. Its end, which only pages need, may be missing (`formats.shared.webcam`)."""
     return lzma.decompress((resources.files("mien.export") / "landmarker" / "face_landmarker.task.xz.1").read_bytes())
 
 
