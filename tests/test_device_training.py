@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from mien.training.whole_head.constants import WHOLE_HEAD
 from torch import Tensor
 
 import mien.machine.devices
@@ -127,7 +126,7 @@ def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
 @pytest.mark.parametrize("device", ["float64", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_a_whole_head_is_trained_on_a_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """By default, with sides that are filled and features. Steps reach a correction of the hair and a prune."""
-    monkeypatch.setattr("mien.training.whole_head.part.WHOLE_HEAD", replace(WHOLE_HEAD, hair_every=2))
+    monkeypatch.setattr("mien.training.whole_head.part._HAIR_EVERY", 2)
     corrections, correct = [], HairSurface.correct
     monkeypatch.setattr(HairSurface, "correct", lambda *given: corrections.append(correct(*given)) or corrections[-1])
     like = like_on("cuda") if device == "cuda" else torch.zeros((), dtype=torch.float64)

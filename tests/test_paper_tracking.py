@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from mien.tracking.constants import TRACKING
 
 from mien.adam import Moments
 from mien.tracking import track, track_subject
@@ -159,8 +158,8 @@ def test_the_neck_has_no_column_of_its_own(case):
 
 @pytest.mark.unchecked
 def test_the_same_with_any_number_of_threads(monkeypatch):
-    several_frames, case = replace(TRACKING.descent, most_batches=2), make_photometric_case(timesteps=5)
-    monkeypatch.setattr(epochs, "TRACKING", replace(TRACKING, descent=several_frames))
+    case = make_photometric_case(timesteps=5)
+    monkeypatch.setattr(epochs, "_MOST_BATCHES", 2)
     settings, runs = replace(ALONE, paper=replace(ALONE.paper, first_steps=10, steps=3, epochs=2)), []
     for threads in ("1", "2"):
         monkeypatch.setenv("MIEN_THREADS", threads)
