@@ -23,7 +23,7 @@ from mien.evaluation.metrics import l1
 from mien.face import FaceParams
 from mien.tracking import read_tracking
 from mien.training import TrainSettings, train
-from mien.training.alignment import TRAINING, FaceDescent, align, align_faces, steadier
+from mien.training.alignment import FaceDescent, align, align_faces, steadier
 from mien.training.alignment_settings import AlignmentSettings
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_toy_workspace
@@ -71,7 +71,7 @@ def test_faces_come_nearer_to_the_truth_and_the_avatar_stays() -> None:
 
 
 def test_what_was_stopped_goes_on_to_the_same_bytes(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("mien.training.alignment.TRAINING", replace(TRAINING, aligned_together=2))
+    monkeypatch.setattr("mien.training.alignment._ALIGNED_TOGETHER", 2)
     experiment = make_experiment(6)
     start, settings = astray(experiment.faces[0]), AlignmentSettings(resolution=32, iterations=2)
     begun: list[int] = []

@@ -5,7 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien.tracking import fitting
+from mien.tracking.fitting.fit import Fit, SequenceFit, Subject, smoothness_of
+from mien.tracking.fitting.parameters import layout_of
+from mien.tracking.fitting.shot import shot_of
+from mien.tracking.fitting.solver import Bounds, NormalEquations, Smoothness, minimize_frames, solve_chain
+from mien.tracking.fitting.views import batch_of
 from mien.tracking.landmarks import groups
 from mien.tracking.landmarks.model import reduce_face_model
 from mien.tracking.landmarks.outcome import fill_gaps
@@ -22,7 +26,7 @@ def test_derivatives_match_finite_differences(which):
     model, random = make_small_face_model(), torch.Generator().manual_seed(3)
     shape = 9 * len(model.free_joint_names), *model.template.shape
     model = replace(model, pose_basis=0.01 * torch.randn(shape, generator=random))
-    layout, camera = fitting.layout_of(model), still_camera()
+    layout, camera = layout_of(model), still_camera()
     row = torch.tensor([0, 2, 1, 2])  # two cameras saw a timestep
     reduced = reduce_face_model(model, layout)
     state = 0.3 * torch.rand(3, layout.size, generator=random, dtype=torch.float64)
@@ -34,12 +38,12 @@ def test_derivatives_match_finite_differences(which):
         state, identity, bias, focal = {**at, **changed}.values()
         K = camera.K.clone()
         K[[0, 1], [0, 1]] *= focal.exp()
-        return reduced.project(state, identity, bias, fitting.batch_of((replace(camera, K=K),) * 4), row)
+        return reduced.project(state, identity, bias, batch_of((replace(camera, K=K),) * 4), row)
 
     full = reduced.face_model
     marks = full.landmark_positions(full(layout.face_params(state, at["identity"])), "mediapipe")
     torch.testing.assert_close(project(), camera.project(marks)[0][row], atol=1e-4, rtol=0)
-    cameras = fitting.batch_of((camera,) * 4)
+    cameras = batch_of((camera,) * 4)
     linear = reduced.linearize(state, at["identity"], at["bias"], cameras, row, with_identity=True)
     analytic = {"state": linear.by_frame, "identity": linear.by_identity, "bias": linear.by_bias,
                 "focal": linear.by_log_focal[..., None]}[which]  # fmt: skip
@@ -51,7 +55,7 @@ def test_derivatives_match_finite_differences(which):
 
 def test_free_parameters():
     model = make_small_face_model()
-    layout = fitting.layout_of(model)
+    layout = layout_of(model)
     assert layout.names[6:] == (
         *(f"move{index}" for index in range(7)), "left_eye_x", "left_eye_y", "right_eye_x", "right_eye_y"
     )  # fmt: skip
@@ -61,9 +65,9 @@ def test_free_parameters():
     alike[[14, 16]], apart[14], apart[16] = 0.1, 0.1, -0.1
     assert alike @ layout.precision @ alike < apart @ layout.precision @ apart
     # Eyelids and eyes jump, and missing frames cut the chain.
-    layout = fitting.layout_of(replace(model, expression_names=("eyeBlinkLeft", *model.expression_names[1:])))
+    layout = layout_of(replace(model, expression_names=("eyeBlinkLeft", *model.expression_names[1:])))
     valid = torch.tensor([True, True, True, False, True, True, True, True])
-    smoothness = fitting.smoothness_of(layout, valid, 25.0, SmoothnessSettings())
+    smoothness = smoothness_of(layout, valid, 25.0, SmoothnessSettings())
     assert smoothness.linked.tolist() == [False, True, False, False, True, True, False]
     assert smoothness.precision[6] == 0 < smoothness.precision[7]
     assert (smoothness.precision[layout.joint_columns] == 0).all()
@@ -82,10 +86,10 @@ def test_bounded_least_squares():
         return ((state - target) @ metric * (state - target)).sum(1)
 
     def equations(state):
-        return fitting.NormalEquations(cost(state), (state - target) @ metric, metric.expand(2, 2, 2))
+        return NormalEquations(cost(state), (state - target) @ metric, metric.expand(2, 2, 2))
 
-    box = fitting.Bounds(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
-    found = fitting.minimize_frames(equations, cost, torch.full((2, 2), 0.5, dtype=torch.float64), box, 30)
+    box = Bounds(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
+    found = minimize_frames(equations, cost, torch.full((2, 2), 0.5, dtype=torch.float64), box, 30)
     assert found[:, 0].tolist() == [1, 0]
     # With x clamped, y minimises on: y = target_y - (0.9 / 1.0) (x - target_x), clamped as well.
     torch.testing.assert_close(found, torch.tensor([[1.0, 1.0], [0.0, 0.0]], dtype=torch.float64))
@@ -99,10 +103,10 @@ def test_chain_solver_matches_the_dense_solution(timesteps):
     gradient, state = torch.randn(2, timesteps, p, generator=random, dtype=torch.float64)
     linked = torch.ones(timesteps, dtype=torch.bool)
     linked[[0, -1]] = False
-    smoothness = fitting.Smoothness(torch.tensor([0.0, 1.0, 30.0], dtype=torch.float64), linked)
+    smoothness = Smoothness(torch.tensor([0.0, 1.0, 30.0], dtype=torch.float64), linked)
     held = torch.zeros(timesteps, p, dtype=torch.bool)
     held[1, 2] = True
-    step = fitting.solve_chain(fitting.NormalEquations(gradient[:, 0], gradient, hessian), smoothness, state, held)
+    step = solve_chain(NormalEquations(gradient[:, 0], gradient, hessian), smoothness, state, held)
 
     weights, second = smoothness.weights(state), torch.zeros(timesteps, timesteps, dtype=torch.float64)
     for t in range(1, timesteps - 1):
@@ -133,15 +137,15 @@ def test_landmark_groups_are_mediapipes():
 
 
 @pytest.fixture(scope="module")
-def case() -> tuple[LandmarkTerm, fitting.SequenceFit, fitting.Subject]:
+def case() -> tuple[LandmarkTerm, SequenceFit, Subject]:
     """Return a term over five timesteps, away from its minimum and from its prior's."""
     made = make_tracking_case(timesteps=5)
-    shot = fitting.shot_of(made.capture, TrackingSettings())
-    reduced = reduce_face_model(made.model, fitting.layout_of(made.model))
+    shot = shot_of(made.capture, TrackingSettings())
+    reduced = reduce_face_model(made.model, layout_of(made.model))
     state = 0.05 * torch.randn(5, reduced.layout.size, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     state[:, 5] -= 0.9
     state[:, 6:] = state[:, 6:].abs() + 0.1
-    own = fitting.SequenceFit(shot.cameras, state)
+    own = SequenceFit(shot.cameras, state)
     return all_landmarks(reduced, shot.views, own, TrackingSettings()), own, unknown_subject(reduced)
 
 
@@ -172,7 +176,7 @@ def test_priors_weigh_as_much_in_the_cost_as_in_the_equations(case):
 
 def test_shared_parameters_have_one_prior_in_the_cost_and_in_the_equations(case):
     term, own, subject = case
-    fit = fitting.Fit(subject, (own,))
+    fit = Fit(subject, (own,))
     precision = precision_of_shared(fit, [0], TrackingSettings())
     values = torch.linspace(0.3, 0.9, len(precision), dtype=torch.float64)
     prior = float(joint_cost([term], fit, precision, values)) - float(term.cost(own.state, subject, own.cameras).sum())
@@ -193,14 +197,14 @@ def term() -> LandmarkTerm:
     shares = torch.ones(len(case.model.expression_basis), 1, 1, dtype=torch.float64)
     shares[0], shares[FAINT - PLAIN] = 3, 0.01
     model = replace(case.model, expression_basis=shares * case.model.expression_basis)
-    shot = fitting.shot_of(case.capture, TrackingSettings())
-    reduced = reduce_face_model(model, fitting.layout_of(model))
+    shot = shot_of(case.capture, TrackingSettings())
+    reduced = reduce_face_model(model, layout_of(model))
     state = torch.zeros(60, reduced.layout.size, dtype=torch.float64)
     state[:, 5] -= 0.9
-    return all_landmarks(reduced, shot.views, fitting.SequenceFit(shot.cameras, state), TrackingSettings())
+    return all_landmarks(reduced, shot.views, SequenceFit(shot.cameras, state), TrackingSettings())
 
 
-def _nodding(term: LandmarkTerm, turn: float) -> fitting.SequenceFit:
+def _nodding(term: LandmarkTerm, turn: float) -> SequenceFit:
     """Return a fit in which both expressions follow pitch, beside motion of their own."""
     time = torch.arange(60, dtype=torch.float64)
     state = torch.zeros(60, term.model.layout.size, dtype=torch.float64)
@@ -208,7 +212,7 @@ def _nodding(term: LandmarkTerm, turn: float) -> fitting.SequenceFit:
     state[:, 0] = turn * (0.4 * time).sin()
     for column in (PLAIN, FAINT):
         state[:, column] = 0.5 + 0.2 * (0.4 * time).sin() + 0.1 * (1.3 * time).sin()
-    return fitting.SequenceFit(fitting.batch_of((still_camera(),)), state)
+    return SequenceFit(batch_of((still_camera(),)), state)
 
 
 def _following(state: torch.Tensor) -> torch.Tensor:
