@@ -35,7 +35,7 @@ build: setup
 
 # MediaPipe's face landmarker for pages, for `mien export --webcam` and the wheel: one package of npm, in a version that
 # sends nothing (src/mien/formats/shared/webcam.py checks its files by hash). Everything else works without it.
-LANDMARKER := src/mien/export/landmarker
+LANDMARKER := src/mien/formats/shared/landmarker
 TASKS_VISION := @mediapipe/tasks-vision@0.10.35
 landmarker: $(LANDMARKER)/vision_wasm_internal.wasm.xz
 $(LANDMARKER)/vision_wasm_internal.wasm.xz:

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from mien.export.web_page import write_packed
+from mien.formats.page import write_packed
 from mien.runtime.baked import PortableAvatar
 from test_web import skinned_head
 from test_web_gpu import PAGE, opened

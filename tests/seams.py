@@ -33,7 +33,7 @@ MAY_NAME = {
     "src/mien/lab/benchmarking/mono_step.py": "measures the step of one method",
     "src/mien/formats/registry.py": "the list of formats; one is named after the program whose files it reads",
     "src/mien/datasets/registry.py": "the list of datasets; one is named after the program whose files it reads",
-    "src/mien/export/gaussian_avatars_folder.py": "the files of that method's own program become its avatars",
+    "src/mien/formats/gaussian_avatars.py": "the files of that method's own program become its avatars",
 }
 """Files that may name a method although they are not its own, and why."""
 OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}/")

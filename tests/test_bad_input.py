@@ -31,7 +31,7 @@ from mien.disk.files import read_arrays, read_json, read_tensors, write_arrays, 
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation.metrics_file import read_metrics
-from mien.export.glb import write_glb
+from mien.formats.glb import write_glb
 from mien.media.output import plan_output
 from mien.media.video import write_video
 from mien.media.writing import write_pictures

@@ -14,7 +14,7 @@ import pytest
 from forked import ForkServer
 from mien.avatar.methods import METHODS
 from mien.cli import COMMANDS, main
-from mien.export.web_page import write_page
+from mien.formats.page import write_page
 from web_case import browse, drawn_head, served, violations
 
 ROOT = Path(__file__).parent.parent

@@ -36,14 +36,14 @@ from mien.driving import drive, motion
 from mien.driving.sources.blendshape_json import read_blendshape_json
 from mien.driving.sources.live_link_face import read_live_link_face
 from mien.errors import UserError
-from mien.export import ply, read_ply, write_ply
-from mien.export.glb_avatar import EXTENSION, read_glb_avatar
-from mien.export.ply import property_names
-from mien.export.sog import read_sog, write_sog
-from mien.export.usd import read_usd, write_usd
 from mien.face.checks import check_face_params
 from mien.face.models.flame import read_flame
+from mien.formats import ply, read_ply, write_ply
+from mien.formats.glb import EXTENSION, read_glb_avatar
+from mien.formats.ply import property_names
 from mien.formats.shared.glb_file import GlbWriter, read_glb
+from mien.formats.sog import read_sog, write_sog
+from mien.formats.usd import read_usd, write_usd
 from mien.gaussians import Gaussians
 from mien.media.picture_files import decode_png, png_fits
 from mien.runtime.checks import check

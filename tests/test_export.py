@@ -18,9 +18,9 @@ from mien.camera import camera_from_fov
 from mien.cli import main
 from mien.disk.files import write_json
 from mien.errors import UserError
-from mien.export import in_world, read_ply, write_ply
-from mien.export.ply import property_names
-from mien.export.spz import read_spz
+from mien.formats import in_world, read_ply, write_ply
+from mien.formats.ply import property_names
+from mien.formats.spz import read_spz
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.media.output import plan_output
 from mien.media.pixels import to_rgb, to_rgba

@@ -16,7 +16,7 @@ from mien.avatar.baking import make_portable
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.errors import UserError
-from mien.export.web_page import write_packed, write_page
+from mien.formats.page import write_packed, write_page
 from mien.formats.shared.packed import unpacked
 from mien.formats.shared.rows import with_rows
 from mien.formats.shared.thinning import contributions

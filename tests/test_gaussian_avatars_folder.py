@@ -15,10 +15,10 @@ from known import known
 from mien.avatar import Avatar
 from mien.avatar.methods import METHODS
 from mien.errors import UserError
-from mien.export import read_ply
-from mien.export.gaussian_avatars_folder import read_gaussian_avatars_folder, write_gaussian_avatars_folder
 from mien.face import FaceModel, FaceParams
 from mien.face.models.flame import flame_face_model, read_flame
+from mien.formats import read_ply
+from mien.formats.gaussian_avatars import read_gaussian_avatars_folder, write_gaussian_avatars_folder
 from mien.formats.shared.flame_params import read_flame_params, write_flame_params
 from mien.render import rasterize
 from plain_settings import plain_gaussian_avatars

@@ -10,8 +10,8 @@ import torch
 from mien import runtime
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
-from mien.export.glb import MeshModel, joint_positions, morph_targets, write_glb
 from mien.face import load_face_model
+from mien.formats.glb import MeshModel, joint_positions, morph_targets, write_glb
 from mien.formats.shared.glb_file import Glb, GlbWriter, read_glb
 from mien.formats.shared.texture import Shot, Surface, bake_texture
 from mien.runtime.named import LOOK_ANGLE, within_lids

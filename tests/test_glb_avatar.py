@@ -11,8 +11,7 @@ from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.errors import UserError
-from mien.export.glb import MeshModel, write_glb
-from mien.export.glb_avatar import EXTENSION, read_glb_avatar
+from mien.formats.glb import EXTENSION, MeshModel, read_glb_avatar, write_glb
 from mien.formats.shared.glb_file import GlbWriter, read_glb
 from needs import NO_VALIDATOR
 from shared_things import MadeOnce, toy_workspace

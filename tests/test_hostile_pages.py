@@ -13,7 +13,7 @@ import pytest
 
 from mien import runtime
 from mien.errors import UserError
-from mien.export.web_page import TEMPLATE, write_page
+from mien.formats.page import TEMPLATE, write_page
 from mien.formats.shared.packed import pack
 from mien.pages.pages import render, with_code
 from web_case import WEB, drawn_head, node

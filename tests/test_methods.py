@@ -24,10 +24,9 @@ from mien.avatar.schedules import Progress
 from mien.avatar.settings import GradientSettings, MethodConfig, PerceptualLoss, Photometric
 from mien.avatar.store import GaussianStore, Moments
 from mien.errors import UserError
-from mien.export.glb import MeshModel, write_glb
-from mien.export.glb_avatar import read_glb_avatar
-from mien.export.web_page import write_page
 from mien.face import FaceModel
+from mien.formats.glb import MeshModel, read_glb_avatar, write_glb
+from mien.formats.page import write_page
 from mien.formats.shared.packed import pack
 from mien.render import rasterize
 from mien.training import TrainSettings

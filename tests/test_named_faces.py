@@ -11,8 +11,8 @@ import torch
 
 from mien import runtime
 from mien.errors import UserError
-from mien.export.glb import morph_targets
 from mien.face import FaceModel, load_face_model
+from mien.formats.glb import morph_targets
 from mien.pipeline.expression import tell_of_unfilmed, with_expression
 from mien.pipeline.sheets import expression_tiles
 from mien.rotation import matrix_from_axis_angle

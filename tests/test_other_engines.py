@@ -11,9 +11,9 @@ import torch
 from mien import runtime
 from mien.camera import Camera
 from mien.cli import main
-from mien.export.spz import read_spz
-from mien.export.vrm import BODY, LICENCE, write_vrm
 from mien.formats.shared.glb_file import read_glb
+from mien.formats.spz import read_spz
+from mien.formats.vrm import BODY, LICENCE, write_vrm
 from mien.render import rasterize
 from mien.runtime.named import visemes
 from needs import NO_THREE_VRM, NO_VALIDATOR

@@ -31,7 +31,7 @@ def test_the_source_distribution_is_small_and_has_what_a_wheel_is_built_from(tmp
     assert archive.stat().st_size < make.MOST_SDIST_BYTES == 5_000_000
     with tarfile.open(archive) as tar:
         names = {name.partition("/")[2] for name in tar.getnames()}
-    landmarker = "src/mien/export/landmarker/face_landmarker.task.xz"
+    landmarker = "src/mien/formats/shared/landmarker/face_landmarker.task.xz"
     needed = {"pyproject.toml", "CMakeLists.txt", "native/bindings.cpp", f"{landmarker}.1"}
     assert {*needed, "src/mien/capture/data/selfie_segmentation.tflite.xz"} <= names
     unneeded = ("tests/", "web/", ".ci/", "benchmarks/", "docs/images/", "docs/pictures/", "docs/log.md", "build/")

@@ -16,8 +16,8 @@ from mien.avatar.schedules import Progress
 from mien.camera import camera_from_fov
 from mien.cli import main
 from mien.disk.workspace import open_workspace
-from mien.export.web_page import write_packed
 from mien.face import FaceModel, FaceParams, load_face_model
+from mien.formats.page import write_packed
 from mien.gaussians import world_means
 from mien.pipeline import draw as pictures
 from mien.pipeline.draw import posed_softly

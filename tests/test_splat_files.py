@@ -21,10 +21,10 @@ import zstandard
 from mien import runtime
 from mien.cli import main
 from mien.errors import UserError
-from mien.export import in_world, read_ply, write_ply
-from mien.export.sog import cells_of, read_sog, write_sog
-from mien.export.spz import read_spz, write_spz
-from mien.export.usd import read_usd, write_usd
+from mien.formats import in_world, read_ply, write_ply
+from mien.formats.sog import cells_of, read_sog, write_sog
+from mien.formats.spz import read_spz, write_spz
+from mien.formats.usd import read_usd, write_usd
 from mien.gaussians import Gaussians
 from mien.rotation import multiply_quaternions
 from needs import NO_PACKAGE, NO_SPLAT_TRANSFORM

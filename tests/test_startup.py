@@ -17,7 +17,7 @@ from mien import plugins as extras
 from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.cli import COMMANDS, main
-from mien.export.web_page import write_page
+from mien.formats.page import write_page
 from mien.formats.shared.packed import pack
 from mien.licences.spdx import requirements_of
 from mien.media.pixels import png_bytes
@@ -270,7 +270,7 @@ def test_a_head_that_the_filmed_frame_cuts_off_is_shown_whole(tmp_path: Path, mo
             assert bool(edges.min() < 200) is (cut and bool(zoom))
             assert picture.min() < 150
     packed = []
-    monkeypatch.setattr("mien.export.web_page.pack", lambda avatar, *rest: packed.append(avatar) or pack(avatar, *rest))
+    monkeypatch.setattr("mien.formats.page.pack", lambda avatar, *rest: packed.append(avatar) or pack(avatar, *rest))
     write_page(tmp_path / "me.html", replace(head, camera=near))
     assert packed[-1].camera.K[0, 0] < near.K[0, 0]
 

@@ -13,8 +13,8 @@ import web_case as web
 from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.errors import UserError
-from mien.export import web_page
-from mien.export.web_page import write_page
+from mien.formats import page as web_page
+from mien.formats.page import write_page
 from mien.formats.shared import webcam
 from mien.formats.shared.bound_features import bound_features
 from mien.formats.shared.packed import pack

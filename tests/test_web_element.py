@@ -13,8 +13,8 @@ import torch
 
 from mien import runtime
 from mien.camera import camera_from_fov, look_at
-from mien.export.glb import write_glb
-from mien.export.web_page import write_packed
+from mien.formats.glb import write_glb
+from mien.formats.page import write_packed
 from test_glb import mesh_model
 from web_case import (
     WEB,

@@ -9,7 +9,7 @@ import pytest
 
 import web_case as web
 from mien import runtime
-from mien.export.web_page import write_packed, write_page
+from mien.formats.page import write_packed, write_page
 from needs import NO_WEBGPU
 from test_web import REST, SHOW, SLIDE, WHITE, points, posing, skinned_head
 from test_web_element import LOADED, SHOT

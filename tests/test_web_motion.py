@@ -17,8 +17,8 @@ from mien.driving.sources.live_link_face import read_live_link_face
 from mien.driving.sources.sides import PAIRS
 from mien.driving.sources.speech import SPEECH_BAND_WEIGHTS, SPEECH_BANDS, SPEECH_LEAST_SHARE
 from mien.driving.transfer import face_of_motion
-from mien.export.web_page import write_page
 from mien.face import FaceParams, load_face_model
+from mien.formats.page import write_page
 from mien.media.sound import RATE
 from recordings import COLUMNS, LAYOUTS, row, write_csv, write_json
 from test_driving_by_speech import synthesised, tone, write_wav

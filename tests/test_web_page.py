@@ -10,8 +10,7 @@ import pytest
 from mien import runtime
 from mien.cli import main
 from mien.errors import UserError
-from mien.export.page_head import POSTER, Described, check_address
-from mien.export.web_page import write_page
+from mien.formats.page import POSTER, Described, check_address, write_page
 from web_case import browse, drawn_head, expect_usable, faces_of, motion_of
 
 portable = pytest.fixture(scope="module")(lambda: drawn_head(300, rank=2))

@@ -14,8 +14,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mien.driving.live.one_euro import OneEuro
-from mien.export.web_page import write_packed, write_page
 from mien.face import FaceModel, FaceParams
+from mien.formats.page import write_packed, write_page
 from mien.formats.shared.webcam import VERSION, find_webcam_files
 from mien.lab.synthetic import motion, scene
 from mien.lab.synthetic.recipe import SyntheticRecipe

@@ -1,4 +1,4 @@
-// Builds dist/ (the package), and src/mien/export/page.html, webgpu.js, webcam.html and microphone.html (the page that
+// Builds dist/ (the package), and src/mien/formats/shared/page.html, webgpu.js, webcam.html and microphone.html (the page that
 // `mien export` fills, and what --webgpu, --webcam and --microphone put into it; they are committed, so that the Python package needs no node). `node build.mjs FOLDER` writes all into FOLDER instead.
 import { build, transform } from "esbuild";
 import { mkdir, readFile, writeFile } from "node:fs/promises";
@@ -55,7 +55,7 @@ const smaller = async (name) => {
 const template = await smaller("page.html");
 for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webgpu.js", "src/webgpu.ts"], ["webcam.js", "src/webcam.ts"]])
   await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm", detector)) + "\n");
-const page = (name, text, own = name) => write(folder ? join(folder, own) : join(here, "../src/mien/export", name), text);
+const page = (name, text, own = name) => write(folder ? join(folder, own) : join(here, "../src/mien/formats/shared", name), text);
 await page("page.html", template.replace("{{script}}", () => script));
 await page("microphone.html", (await smaller("microphone_page.html")).replace("{{script}}", () => voice));
 await page("webcam.html", (await smaller("webcam_page.html")).replace("{{script}}", () => camera));

@@ -30,18 +30,18 @@ from mien.disk.files import write_json
 from mien.evaluation import evaluate
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import EvaluationSettings
-from mien.export import in_world, write_ply
-from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
-from mien.export.glb import MeshModel, write_glb
-from mien.export.sog import write_sog
-from mien.export.spz import write_spz
-from mien.export.usd import write_usd
 from mien.face.cache import cache_folder
 from mien.face.listing import ADDED_RECIPE
 from mien.face.loading import load_face_model, write_face_model, write_landmarks
 from mien.face.model import Landmarks
 from mien.face.models.flame import flame_face_model, read_flame
+from mien.formats import in_world, write_ply
+from mien.formats.gaussian_avatars import write_gaussian_avatars_folder
+from mien.formats.glb import MeshModel, write_glb
 from mien.formats.shared.packed import pack
+from mien.formats.sog import write_sog
+from mien.formats.spz import write_spz
+from mien.formats.usd import write_usd
 from mien.lab.analysis.registry import ANALYSES
 from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.spec import AnalysisOptions, chosen_parts

@@ -20,13 +20,13 @@ from mien.evaluation.image_folders import read_crops
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import read_metrics
 from mien.evaluation.partial import PartialScores
-from mien.export import read_ply
-from mien.export.gaussian_avatars_folder import read_gaussian_avatars_folder
-from mien.export.glb_avatar import read_glb_avatar
-from mien.export.sog import read_sog
-from mien.export.spz import read_spz
-from mien.export.usd import read_usd
 from mien.face.models.flame import flame_face_model, read_flame
+from mien.formats import read_ply
+from mien.formats.gaussian_avatars import read_gaussian_avatars_folder
+from mien.formats.glb import read_glb_avatar
+from mien.formats.sog import read_sog
+from mien.formats.spz import read_spz
+from mien.formats.usd import read_usd
 from mien.render.camera_paths import read_cameras
 from mien.runtime import read_portable
 from mien.tracking import read_tracking

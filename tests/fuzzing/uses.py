@@ -41,11 +41,11 @@ from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation.image_source import open_pictures, read_picture
 from mien.evaluation.metrics_file import read_metrics
-from mien.export import in_world, read_ply, write_ply
-from mien.export.gaussian_avatars_folder import write_gaussian_avatars_folder
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.listing import available_face_models
 from mien.face.models.flame import flame_face_model
+from mien.formats import in_world, read_ply, write_ply
+from mien.formats.gaussian_avatars import write_gaussian_avatars_folder
 from mien.formats.shared.glb_file import read_glb
 from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.spec import AnalysisOptions

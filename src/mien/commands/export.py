@@ -341,7 +341,7 @@ class Command:
         if self.largest is not None and not self.largest > 0:
             raise UserError(f"--largest {self.largest:g}: give a number of MB above 0")
         if self.address is not None:
-            from mien.export.page_head import check_address
+            from mien.formats.page import check_address
 
             check_address(self.address)
         if self.webcam_model is not None and not self.webcam:

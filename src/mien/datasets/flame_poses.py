@@ -48,7 +48,7 @@ def face_of_flame(path: Path, face_model: FaceModel, arrays: Mapping[str, np.nda
     Args:
         path: The dataset, for messages.
         face_model: A face model in FLAME's schema.
-        arrays: `shape` [n] and `expr` [t, e], and perhaps others (`mien.export.face_of_flame_params`).
+        arrays: `shape` [n] and `expr` [t, e], and perhaps others (`mien.formats.face_of_flame_params`).
     """
     t = len(arrays["expr"])
     rest = {name: np.zeros((t, 3)) for name in ("rotation", "translation", "neck_pose", "jaw_pose")}

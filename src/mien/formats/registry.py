@@ -1,24 +1,100 @@
-"""The list of formats. A new format is one file in this folder and one line here (CONTRIBUTING.md, "Add a format").
+"""The list of formats. A new format is one file in this folder and one row here (CONTRIBUTING.md, "Add a format").
 
+The files of the formats are imported at their first use, since most need torch and the command line only lists them.
 Other packages add formats by entry points of the group `mien.formats`.
 """
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from mien.formats.format import Format
-from mien.formats.gaussian_avatars import GAUSSIAN_AVATARS
-from mien.formats.glb import GLB
-from mien.formats.mien import MIEN
-from mien.formats.page import PACKED, PAGE
-from mien.formats.ply import PLY
-from mien.formats.sog import SOG
-from mien.formats.spz import SPZ
-from mien.formats.usd import USD
-from mien.formats.vrm import VRM
-from mien.plugins import plugin, with_plugins
+from mien.plugins import named, plugin, with_plugins
 
-_OWN = (MIEN, PAGE, PACKED, GLB, VRM, PLY, SPZ, SOG, USD, GAUSSIAN_AVATARS)
+
+def _of(place: str) -> Callable[..., Any]:
+    """A function of a file of this folder, "FILE:NAME"."""
+    return lambda *arguments: named(f"mien.formats.{place}")(*arguments)
+
+
+def _whole(why: str) -> dict[str, str]:
+    """Why a format with all expressions does not take one of them, or a motion."""
+    return dict.fromkeys(("set", "series"), f"{why}; leave --set and --series out")
+
+
+_PAGE_REFUSES = {"set": "a page sets every expression itself; leave --set out"}
+_OWN = (
+    Format(
+        "mien",
+        "avatar",
+        _of("mien:write"),
+        (".mien",),
+        _of("mien:read_portable"),
+        options=frozenset({"soft_cut"}),
+        refusals=_whole("a .mien file holds every expression"),
+    ),
+    Format(
+        "html",
+        "avatar",
+        _of("page:write"),
+        (".html",),
+        options=frozenset({"webgpu", "webcam", "microphone", "title", "address", "soft_cut", "largest"}),
+        refusals=_PAGE_REFUSES,
+    ),
+    Format(
+        "packed",
+        "avatar",
+        _of("page:write_packed_file"),
+        (".packed",),
+        options=frozenset({"soft_cut", "largest"}),
+        refusals=_PAGE_REFUSES,
+    ),
+    Format(
+        "glb",
+        "avatar",
+        _of("glb:write"),
+        (".glb",),
+        _of("glb:read_glb_avatar"),
+        from_files=False,
+        refusals=_whole("a .glb file has a morph target for every expression"),
+    ),
+    Format(
+        "vrm",
+        "avatar",
+        _of("vrm:write"),
+        (".vrm",),
+        from_files=False,
+        refusals=_whole("a .vrm file has an expression for every name"),
+    ),
+    Format("ply", "pose", _of("ply:write"), (".ply",), _of("ply:read_ply"), options=frozenset({"sh"})),
+    Format(
+        "spz",
+        "pose",
+        _of("spz:write"),
+        (".spz",),
+        _of("spz:read_spz"),
+        options=frozenset({"spz_version"}),
+    ),
+    Format("sog", "pose", _of("sog:write"), (".sog",), _of("sog:read_sog")),
+    Format(
+        "usd",
+        "sequence",
+        _of("usd:write"),
+        (".usd", ".usda", ".usdc", ".usdz"),
+        _of("usd:read_usd"),
+        check=_of("usd:check_usd"),
+    ),
+    Format(
+        "gaussian-avatars",
+        "folder",
+        _of("gaussian_avatars:write"),
+        from_files=False,
+        refusals=dict.fromkeys(
+            ("set", "series", "every"),
+            "GaussianAvatars' folder holds every timestep; leave --set, --series and --every out",
+        ),
+    ),
+)
 
 _GROUP = "mien.formats"
 """Group of entry points of other packages. They are imported only for lists, and for formats that mien lacks."""

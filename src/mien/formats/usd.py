@@ -1,19 +1,236 @@
-"""USD files: Gaussians in one pose, or every frame of a motion as a time sample (docs/splat_files.md)."""
+"""USD files with a ParticleField3DGaussianSplat (OpenUSD 26.03 or newer, by usd-core): a pose, or a sequence."""
 
+import errno
+import importlib
+import importlib.util
+import math
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from mien import export
-from mien.export.usd_package import USD_ENDINGS, check_usd
-from mien.formats.format import Content, Format, Options, pose_words
+import numpy as np
+import torch
+
+from mien.disk.files import write_atomically
+from mien.disk.reading import open_ordinary
+from mien.errors import UserError
+from mien.formats.format import Content, Options, pose_words
+from mien.formats.shared.splats import finite_arrays, unit_quats
+from mien.gaussians import Gaussians
+
+USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 
 
-def _write(path: Path, content: Content, options: Options) -> str:
+def check_usd(path: Path) -> None:
+    """Check that usd-core, which writes and reads `path`, is installed."""
+    if importlib.util.find_spec("pxr") is None:
+        raise UserError(f"{path}: needs the package usd-core, which is missing; run `pip install 'mien[usd]'`")
+
+
+_ROOT, _SPLATS = "/avatar", "/avatar/gaussians"
+_REACH = 3.0
+"""Standard deviations that the extent has around a centre."""
+_MAX_BYTES, _MAX_GAUSSIANS = 1 << 28, 2_000_000
+_REMEDY = "give a USD file of `mien export`"
+
+
+def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) -> int:
+    """Write unbatched Gaussians in world space (+y up, metres) as a USD stage, and return the number of poses.
+
+    Values are float32 and not compressed with loss. With `fps`, each pose is a time sample (0, 1, 2, ...); without it,
+    there is one pose and no time. The ending of `path` chooses the container (`USD_ENDINGS`).
+    """
+    check_usd(path)
+    Usd, UsdVol = _pxr("Usd", "UsdVol")
+
+    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
+        version = ".".join(map(str, Usd.GetVersion()))
+        raise UserError(f"{path}: needs usd-core 26.3 or newer, not {version}; run `pip install -U 'mien[usd]'`")
+    count = 0
+
+    def write(temporary: Path) -> None:
+        nonlocal count
+        # USD writes its files beside the output, so that only one disk can be full. It replaces files by renaming.
+        with tempfile.TemporaryDirectory(dir=temporary.parent.absolute(), prefix=".usd-") as folder, _usd_errors():
+            # A package is made of a finished file.
+            packed = path.suffix.lower() == ".usdz"
+            inner = Path(folder) / (path.with_suffix(".usdc").name if packed else path.name)
+            count = _write_stage(path, inner, poses, fps)
+            if packed:
+                _write_package(inner, temporary)
+            else:
+                inner.replace(temporary)
+
+    write_atomically(path, write)
+    return count
+
+
+def read_usd(path: Path, time: float | None = None) -> Gaussians:
+    """Read the Gaussians of a USD file at a time sample (default: without time)."""
+    check_usd(path)
+    Tf, Usd, UsdVol = _pxr("Tf", "Usd", "UsdVol")
+
+    _check_file(path)
+    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    try:
+        stage = Usd.Stage.Open(_layer_alone(path))
+        prims = (prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat))
+        field = UsdVol.ParticleField3DGaussianSplat(next(prims))
+        attributes = (
+            field.GetPositionsAttr(), field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(),
+            field.GetRadianceSphericalHarmonicsCoefficientsAttr(),
+        )  # fmt: skip
+        values = [attribute.Get(at) for attribute in attributes]
+    except (Tf.ErrorException, StopIteration):
+        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
+    if any(value is None for value in values):
+        raise UserError(f"{path}: has no Gaussians at time {time}; give a time of its samples")
+    try:
+        gaussians = _gaussians_of(values)
+    except (ValueError, TypeError, OverflowError):
+        raise UserError(f"{path}: its arrays do not fit each other; {_REMEDY}") from None
+    finite_arrays(path, gaussians)
+    return gaussians
+
+
+def _gaussians_of(values: list[Any]) -> Gaussians:
+    """Gaussians of the attributes of a field.
+
+    Raises:
+        ValueError: their lengths do not fit each other, or there are too many.
+    """
+    means, turns, scales, opacities, sh = (np.array(value, np.float32) for value in values)
+    count = len(means)
+    coefficients = len(sh) // max(count, 1)
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count * coefficients, 3))
+    if any(array.shape != shape for array, shape in zip((means, turns, scales, opacities, sh), shapes, strict=True)):
+        raise ValueError
+    if count > _MAX_GAUSSIANS or (count and coefficients not in (1, 4, 9, 16)):
+        raise ValueError
+    arrays = (means, turns[:, [3, 0, 1, 2]], scales, opacities, sh.reshape(count, coefficients, 3))
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what is no ordinary file, or is larger than any head. USD would wait for a pipe."""
+    try:
+        with open_ordinary(path) as file:
+            size = os.fstat(file.fileno()).st_size
+    except (OSError, ValueError):
+        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
+    if path.suffix.lower() not in USD_ENDINGS or size > _MAX_BYTES:
+        raise UserError(f"{path}: has no ending of USD, or more than {_MAX_BYTES:,} bytes; {_REMEDY}")
+
+
+def _layer_alone(path: Path) -> Any:
+    """The layer of a file, if it refers to no other file. A stranger's file could name any on this machine."""
+    (Sdf,) = _pxr("Sdf")
+
+    layer = Sdf.Layer.FindOrOpen(str(path.absolute()))
+    if layer is None:
+        raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
+    places: list[Any] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, places.append)
+    found = [layer.GetPrimAtPath(place) for place in places if place.IsPrimPath()]
+    # USD ends the whole process where it uses a prim without a name.
+    if any(place.isEmpty for place in places) or not all(found):
+        raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
+    clips = any(prim.HasInfo("clips") for prim in found)
+    if clips or layer.GetCompositionAssetDependencies():
+        raise UserError(f"{path}: refers to other files, which are not opened; flatten it into one file")
+    return layer
+
+
+def _pxr(*names: str) -> list[Any]:
+    """Modules of usd-core, which have no types."""
+    return [importlib.import_module(f"pxr.{name}") for name in names]
+
+
+@contextmanager
+def _usd_errors() -> Iterator[None]:
+    """Raise errors of USD as the system's error that is named in their text."""
+    (Tf,) = _pxr("Tf")
+    try:
+        yield
+    except Tf.ErrorException as error:
+        code = next((code for code in errno.errorcode if os.strerror(code) in str(error)), errno.EIO)
+        raise OSError(code, os.strerror(code)) from None
+
+
+def _write_stage(path: Path, file: Path, poses: Iterable[Gaussians], fps: float | None) -> int:
+    """Write the poses into `file`, and return their number. Messages name `path`."""
+    Usd, UsdGeom, UsdVol = _pxr("Usd", "UsdGeom", "UsdVol")
+
+    stage = Usd.Stage.CreateNew(str(file))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, _ROOT)
+    stage.SetDefaultPrim(root.GetPrim())
+    Usd.ModelAPI(root.GetPrim()).SetKind("component")
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _SPLATS)
+    count = 0
+    for count, gaussians in enumerate(poses, 1):  # noqa: B007
+        _add_pose(path, field, gaussians, None if fps is None else float(count - 1))
+    if fps is not None:
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(max(count - 1, 0))
+    stage.GetRootLayer().Save()
+    return count
+
+
+def _write_package(stage: Path, package: Path) -> None:
+    """Write the package of a stage's file.
+
+    Raises:
+        OSError: the package is not whole. USD gives no reason, and the usual one is a full disk.
+    """
+    Sdf, UsdUtils = _pxr("Sdf", "UsdUtils")
+
+    whole = UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(stage)), str(package))
+    try:
+        with zipfile.ZipFile(package) as members:
+            whole = whole and members.testzip() is None
+    except zipfile.BadZipFile:
+        whole = False
+    if not whole:
+        raise OSError(errno.ENOSPC, "its package is incomplete")
+
+
+def _add_pose(path: Path, field: Any, gaussians: Gaussians, time: float | None) -> None:
+    Usd, Vt = _pxr("Usd", "Vt")
+
+    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
+    assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
+    means, quats, scales, opacities, sh = finite_arrays(path, gaussians)
+    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    degree = math.isqrt(sh.shape[1]) - 1
+    turns = np.ascontiguousarray(unit_quats(quats)[:, [1, 2, 3, 0]])  # USD keeps the real part last in memory
+    reach = _REACH * scales.max(1, keepdims=True)
+    extent = np.stack([(means - reach).min(0), (means + reach).max(0)]) if len(means) else np.zeros((2, 3), np.float32)
+    field.CreatePositionsAttr().Set(Vt.Vec3fArray.FromNumpy(means), at)
+    field.CreateOrientationsAttr().Set(Vt.QuatfArray.FromNumpy(turns), at)
+    field.CreateScalesAttr().Set(Vt.Vec3fArray.FromNumpy(scales), at)
+    field.CreateOpacitiesAttr().Set(Vt.FloatArray.FromNumpy(opacities), at)
+    coefficients = np.ascontiguousarray(sh.reshape(-1, 3))
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr().Set(Vt.Vec3fArray.FromNumpy(coefficients), at)
+    field.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), at)
+    if not field.GetRadianceSphericalHarmonicsDegreeAttr().HasAuthoredValue():
+        field.CreateRadianceSphericalHarmonicsDegreeAttr().Set(degree)
+        field.CreateProjectionModeHintAttr().Set("perspective")
+        field.CreateSortingModeHintAttr().Set("zDepth")
+
+
+def write(path: Path, content: Content, options: Options) -> str:
+    """Write the file, and return what is told of it."""
     moving = content.poses()
     if moving is None:
-        export.write_usd(path, [content.pose()])
+        write_usd(path, [content.pose()])
         return pose_words(path, content)
-    count = export.write_usd(path, *moving)
+    count = write_usd(path, *moving)
     return f"{count} time samples, {path.stat().st_size / 1e6:.1f} MB"
-
-
-USD = Format("usd", "sequence", _write, USD_ENDINGS, lambda path: export.read_usd(path), check=check_usd)

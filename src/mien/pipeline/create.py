@@ -13,7 +13,7 @@ from mien.disk.inside import listed
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.evaluation.living import FILM, living, write_film
-from mien.export.web_page import write_page
+from mien.formats.page import write_page
 from mien.formats.shared.packed import Motion
 from mien.machine.progress import Piece, say
 from mien.media.video import probe_video

@@ -16,12 +16,12 @@ from mien.disk.workspace import Workspace
 from mien.driving.rest import facing, rest_of
 from mien.driving.transfer import drive
 from mien.errors import UserError
-from mien.export.glb import MeshModel
-from mien.export.world_space import in_world
 from mien.face.params import FaceParams
 from mien.formats.format import Format, Options
+from mien.formats.glb import MeshModel
 from mien.formats.registry import format_of, numbered
 from mien.formats.shared.packed import Motion
+from mien.formats.shared.world_space import in_world
 from mien.gaussians import Gaussians
 from mien.machine.progress import say, track_progress
 from mien.pipeline.drive import open_driver
@@ -187,7 +187,7 @@ class FileContent:
         """Return the Gaussians at rest. This needs torch."""
         import torch
 
-        from mien.export.world_space import in_world
+        from mien.formats.shared.world_space import in_world
         from mien.gaussians import Gaussians
 
         posed = self._posed()

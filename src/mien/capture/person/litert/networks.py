@@ -49,7 +49,9 @@ def network_content(name: NetworkName) -> bytes:
 @functools.cache
 def _first_part() -> bytes:
     """The start of face_landmarker.task. Its end, which only pages need, may be missing (`formats.shared.webcam`)."""
-    return lzma.decompress((resources.files("mien.export") / "landmarker" / "face_landmarker.task.xz.1").read_bytes())
+    return lzma.decompress(
+        (resources.files("mien.formats") / "shared" / "landmarker" / "face_landmarker.task.xz.1").read_bytes()
+    )
 
 
 def _member(archive: bytes, name: str) -> bytes:
