@@ -202,7 +202,7 @@ class Command:
             return
         kind = self._kind()
         if self._is_file():
-            from mien.pipeline.export import convert
+            from mien.pipeline.convert import convert
 
             convert(self.workspace, self.out, kind, self._options())
             return

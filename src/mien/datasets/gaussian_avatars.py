@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mien import export
 from mien.datasets.dataset import Dataset, TrainedAvatar
+from mien.formats.gaussian_avatars import read_gaussian_avatars_folder
 
 if TYPE_CHECKING:
     from mien.face.model import FaceModel
@@ -19,7 +19,7 @@ def _recognises(path: Path) -> str | None:
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> TrainedAvatar:
-    content = export.read_gaussian_avatars_folder(path, face_model)
+    content = read_gaussian_avatars_folder(path, face_model)
     return TrainedAvatar(content.avatar, content.face)
 
 

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     # By their full names: several rooms have a class of the same name, and the reference tells them apart so.
-    import mien.avatar
-    import mien.export
-    import mien.face
+    import mien.avatar.avatar
+    import mien.face.params
+    import mien.formats.glb
+    import mien.formats.shared.packed
+    import mien.formats.shared.webcam
     import mien.gaussians
-    import mien.runtime
+    import mien.runtime.baked
 
 Holds = Literal["pose", "sequence", "avatar", "folder"]
 """What a file of a format holds: Gaussians in one pose, or in many, a whole avatar, or a folder with a whole run."""
@@ -29,7 +31,7 @@ class Content(Protocol):
         """Number of Gaussians."""
         ...
 
-    def portable(self, confidence: bool = True, soft_cut: bool = False) -> "mien.runtime.PortableAvatar":
+    def portable(self, confidence: bool = True, soft_cut: bool = False) -> "mien.runtime.baked.PortableAvatar":
         """Return the whole avatar.
 
         `confidence` asks for what was filmed of each triangle, if that is known, and `soft_cut` for a head that fades
@@ -37,7 +39,7 @@ class Content(Protocol):
         """
         ...
 
-    def mesh(self) -> "mien.export.MeshModel":
+    def mesh(self) -> "mien.formats.glb.MeshModel":
         """Return the person's mesh with its texture coordinates. Avatars that come from a file have none."""
         ...
 
@@ -52,11 +54,11 @@ class Content(Protocol):
         """Return the Gaussians of every frame of the motion, as in `pose`, and frames per second; None without one."""
         ...
 
-    def motion(self) -> "mien.export.Motion | None":
+    def motion(self) -> "mien.formats.shared.packed.Motion | None":
         """Return the motion that was asked for, as face parameters with head poses."""
         ...
 
-    def trained(self) -> "tuple[mien.avatar.Avatar, mien.face.FaceParams]":
+    def trained(self) -> "tuple[mien.avatar.avatar.Avatar, mien.face.params.FaceParams]":
         """Return the trained avatar, and the person at all timesteps of its training."""
         ...
 
@@ -69,7 +71,7 @@ class Options:
     """Degree of the spherical harmonics in the file."""
     webgpu: bool = False
     """Whether a page draws with WebGPU where the browser has it."""
-    webcam: "mien.export.WebcamFiles | None" = None
+    webcam: "mien.formats.shared.webcam.WebcamFiles | None" = None
     """Files of the face landmarker, with which a webcam drives a page."""
     spz_version: int = 4
     """Version of a .spz file."""
@@ -103,7 +105,7 @@ class Format:
     write: Callable[[Path, Content, Options], str]
     endings: tuple[str, ...] = ()
     """Endings of the files, in lower case with the dot. Only folders have none."""
-    read: "Callable[[Path], mien.runtime.PortableAvatar | mien.gaussians.Gaussians] | None" = None
+    read: "Callable[[Path], mien.runtime.baked.PortableAvatar | mien.gaussians.Gaussians] | None" = None
     """Function that reads a file: a whole avatar, or Gaussians in one pose (the first of a sequence). It raises
     UserError in one line that names the path. None if files of this format are not read."""
     options: frozenset[str] = frozenset()

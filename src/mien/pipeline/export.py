@@ -1,25 +1,22 @@
-"""The content that `mien export` writes of a run: its avatar, poses and motions. Avatars of files: `converting`."""
+"""The content that `mien export` writes of a run: its avatar, poses and motions. Avatars of files: `convert`."""
 
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
-from mien import runtime
 from mien.avatar.avatar import Avatar
 from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import load_avatar
 from mien.disk.workspace import Workspace
 from mien.driving.rest import facing, rest_of
 from mien.driving.transfer import drive
-from mien.errors import UserError
 from mien.face.params import FaceParams
 from mien.formats.format import Format, Options
 from mien.formats.glb import MeshModel
-from mien.formats.registry import format_of, numbered
+from mien.formats.registry import numbered
 from mien.formats.shared.packed import Motion
 from mien.formats.shared.world_space import in_world
 from mien.gaussians import Gaussians
@@ -30,12 +27,6 @@ from mien.runtime.baked import MeshBound, PortableAvatar
 from mien.training.footage.filmed import read_coverage
 from mien.training.run import read_face_track, run_camera
 from mien.training.whole_head.soft_cut import with_soft_cut
-
-if TYPE_CHECKING:
-    import mien.avatar
-    import mien.export
-    import mien.face
-    import mien.gaussians
 
 
 @dataclass(frozen=True)
@@ -152,70 +143,3 @@ def export(content: RunContent, out: Path, kind: Format, options: Options) -> No
         written.append(numbered(out, index))
         kind.write(written[-1], content.still(gaussians), options)
     say(f"{written[0]} ... {written[-1].name}: {len(written)} files")
-
-
-class FileContent:
-    """An avatar that comes from a file, as `mien.formats.Content`. It has no run and no mesh with a texture."""
-
-    def __init__(self, source: Path):
-        """Read the file."""
-        kind = format_of(source)
-        avatar = None if kind is None or kind.read is None else kind.read(source)
-        if not isinstance(avatar, PortableAvatar):
-            raise UserError(f"{source}: files of this format do not hold a whole avatar; give a .mien or a .glb file")
-        self._source, self._avatar = source, avatar
-
-    @property
-    def name(self) -> str:
-        """The avatar's name."""
-        return self._avatar.about.name
-
-    @property
-    def count(self) -> int:
-        """Number of Gaussians."""
-        return len(self._posed())
-
-    def portable(self, confidence: bool = True, soft_cut: bool = False) -> PortableAvatar:
-        """Return the avatar as it was read."""
-        return self._avatar
-
-    def mesh(self) -> "mien.export.MeshModel":
-        """Refuse: the texture coordinates are only in a run."""
-        raise self._only_in_a_run()
-
-    def pose(self) -> "mien.gaussians.Gaussians":
-        """Return the Gaussians at rest. This needs torch."""
-        import torch
-
-        from mien.formats.shared.world_space import in_world
-        from mien.gaussians import Gaussians
-
-        posed = self._posed()
-        arrays = (posed.means, posed.quats, posed.scales, posed.opacities, posed.sh)
-        pose = None if posed.T_world_local is None else torch.from_numpy(posed.T_world_local.copy())
-        return in_world(Gaussians(*(torch.from_numpy(array.copy()) for array in arrays), T_world_local=pose))
-
-    def poses(self) -> None:
-        """Return None: a file is exported at rest."""
-
-    def motion(self) -> None:
-        """Return None: a file is exported at rest."""
-
-    def trained(self) -> "tuple[mien.avatar.Avatar, mien.face.FaceParams]":
-        """Refuse: what was trained is only in a run."""
-        raise self._only_in_a_run()
-
-    def _posed(self) -> runtime.Gaussians:
-        """The Gaussians at rest, with the head at the origin."""
-        return runtime.Avatar(self._avatar).pose(head_rotation=(0, 0, 0), head_translation=(0, 0, 0))
-
-    def _only_in_a_run(self) -> UserError:
-        return UserError(f"{self._source}: does not have all that this format needs; export it from its workspace")
-
-
-def convert(source: Path, out: Path, kind: Format, options: Options) -> None:
-    """Write the avatar in a file in another format, at rest with the head at the origin, and report it."""
-    content = FileContent(source)
-    told = kind.write(out, content, options)
-    size = f"{out.stat().st_size / 1e6:.1f} MB" if options.largest is None else told
-    say(f"{out}: {content.name!r} of {source}, {size}")
