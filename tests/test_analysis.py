@@ -13,7 +13,6 @@ import pytest
 import torch
 from markupsafe import escape
 
-import mien.lab.analysis as lab
 import toy_scene
 import train_toy
 from capture_helpers import tree_bytes
@@ -23,6 +22,10 @@ from mien.disk.files import write_tensors
 from mien.face import FaceModel
 from mien.lab.analysis.gaussian_avatars import growth, speed
 from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
+from mien.lab.analysis.registry import ANALYSES
+from mien.lab.analysis.result import Chart, PartResult, Table
+from mien.lab.analysis.running import run_analysis
+from mien.lab.analysis.spec import Analysis, AnalysisOptions, Part
 from mien.pages.plots import Axes, Series
 from mien.training.run import read_curves
 from shared_things import MadeOnce, toy_workspace
@@ -72,12 +75,12 @@ def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[st
     shown = capsys.readouterr()
     parts = json.loads(shown.out)["parts"]
     assert parts == stored["parts"]
-    assert list(parts) == [part.name for part in lab.ANALYSES["gaussian-avatars"].parts]
+    assert list(parts) == [part.name for part in ANALYSES["gaussian-avatars"].parts]
     assert "scale: 2 trainings of 2 steps each, about" in shown.err
     assert "not measured" not in shown.err
     folder = workspace / "analysis/toy"
     page = (folder / "analysis.html").read_text()
-    for part in lab.ANALYSES["gaussian-avatars"].parts:
+    for part in ANALYSES["gaussian-avatars"].parts:
         assert escape(part.summary) in page
         kept = parts[part.name]
         assert kept["findings"] or part.name == "teeth-trained"
@@ -182,20 +185,20 @@ def test_a_run_without_teeth_says_so(made_once: MadeOnce, tmp_path: Path) -> Non
     assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
 
 
-def part_of_dots(_: Any) -> lab.PartResult:
+def part_of_dots(_: Any) -> PartResult:
     dots = Series("dots", np.arange(3.0), np.array([1.0, np.nan, 3.0]), points=True)
-    table = lab.Table(("name", "value"), (("some", 1234), ("none", None)), "a caption")
-    chart = lab.Chart("dots", "Dots", (dots,), Axes("x", "y", shaded=((0.0, 1.0),)))
-    return lab.PartResult({}, ("It is found.",), (table,), (chart,), notes=("a <b> note",))
+    table = Table(("name", "value"), (("some", 1234), ("none", None)), "a caption")
+    chart = Chart("dots", "Dots", (dots,), Axes("x", "y", shaded=((0.0, 1.0),)))
+    return PartResult({}, ("It is found.",), (table,), (chart,), notes=("a <b> note",))
 
 
 def test_tables_and_charts_of_any_analysis_are_read_again(workspace: Path, tmp_path: Path) -> None:
-    dotted = lab.Analysis("gaussian_avatars", "a paper", (lab.Part("dots", "Dots", "test_analysis:part_of_dots"),))
-    arguments = (dotted, dotted.parts, workspace / "runs/toy", (), tmp_path / "out", lab.AnalysisOptions())
-    parts, page = lab.run_analysis(*arguments)["parts"], (tmp_path / "out/analysis.html").read_text()
+    dotted = Analysis("gaussian_avatars", "a paper", (Part("dots", "Dots", "test_analysis:part_of_dots"),))
+    arguments = (dotted, dotted.parts, workspace / "runs/toy", (), tmp_path / "out", AnalysisOptions())
+    parts, page = run_analysis(*arguments)["parts"], (tmp_path / "out/analysis.html").read_text()
     assert all(words in page for words in ("a &lt;b&gt; note", "1,234", "–", "<circle"))
     assert parts["dots"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
-    assert lab.run_analysis(*arguments)["parts"] == parts
+    assert run_analysis(*arguments)["parts"] == parts
     assert (tmp_path / "out/analysis.html").read_text() == page
 
 

@@ -14,22 +14,22 @@ if TYPE_CHECKING:
 
     import mien.avatar
     import mien.camera
-    import mien.capture
+    import mien.capture.capture
     import mien.face
-    import mien.tracking
-    import mien.training
+    import mien.tracking.tracking
+    import mien.training.splits.own
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedSequence:
     """One sequence of a dataset: its pictures, and the face that its authors tracked in them."""
 
-    capture: "mien.capture.Capture"
+    capture: "mien.capture.capture.Capture"
     """The pictures. The capture's name becomes the name of the sequence."""
-    tracking: "mien.tracking.Tracking"
+    tracking: "mien.tracking.tracking.Tracking"
     face_model: "mien.face.FaceModel"
     """The face model that the tracking's parameters belong to."""
-    own_split: "mien.training.OwnSplit | None" = None
+    own_split: "mien.training.splits.own.OwnSplit | None" = None
     """Timesteps and cameras that the dataset's authors hold out. None if they name no split."""
     foreign: "Mapping[str, numpy.ndarray]" = field(default_factory=dict)
     """Arrays for which mien has no place, such as coefficients of a model that nobody can ship. They are kept beside
@@ -40,8 +40,8 @@ class TrackedSequence:
 class FilmedSequence:
     """One sequence of a dataset without a face that mien can use: pictures, cameras, mattes and landmarks."""
 
-    capture: "mien.capture.Capture"
-    own_split: "mien.training.OwnSplit | None" = None
+    capture: "mien.capture.capture.Capture"
+    own_split: "mien.training.splits.own.OwnSplit | None" = None
     foreign: "Mapping[str, numpy.ndarray]" = field(default_factory=dict)
 
 
@@ -61,7 +61,7 @@ class Footage:
     It raises UserError if they are damaged. None if there are none."""
     stride: int = 1
     """Take every n-th frame."""
-    own_split: "mien.training.OwnSplit | None" = None
+    own_split: "mien.training.splits.own.OwnSplit | None" = None
     files: "Mapping[str, bytes]" = field(default_factory=dict)
     """Files to keep beside the capture, by name."""
 
