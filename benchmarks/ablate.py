@@ -1,6 +1,6 @@
 """Train captures with one constant or one setting changed at a time, and print what each change is worth.
 
-    python benchmarks/ablate.py out/wojtek out/d3 --set avatar.fill_opacity=0.9 --preset draft --steps 1000
+    python benchmarks/ablate.py out/wojtek out/d3 --set avatar.gaussian_avatars.surface.FILL_OPACITY=0.9 --preset draft --steps 1000
 
 Give the captures first: workspaces with tracked sequences. Each is trained once as it is and once with each change, as
 `mien train` does, and its held-out frames are scored as `mien evaluate` does. `--list` prints what --set can change;
@@ -18,9 +18,9 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from statistics import fmean
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import mien
@@ -29,8 +29,10 @@ from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.machine.terminal import show
 
-Change = tuple[Any, str, Any]
-"""The constants of a room, the name of one of them, and its other value."""
+Change = tuple[ModuleType, str, Any]
+"""The module of a constant, its name, and its other value."""
+ROOMS = ("avatar", "capture", "driving", "face", "media", "tracking", "training")
+"""Rooms whose constants decide how good an avatar is."""
 UNCHANGED = "unchanged"
 
 
@@ -44,29 +46,27 @@ class Figures(NamedTuple):
     seconds: float
 
 
-def rooms() -> dict[str, Any]:
-    """The constants of each room, by the name of its folder."""
-    root = Path(mien.__file__).parent
-    found: dict[str, Any] = {}
-    for path in sorted(root.rglob("constants.py")):
-        module = importlib.import_module(".".join(("mien", *path.relative_to(root).with_suffix("").parts)))
-        for one in vars(module).values():
-            if is_dataclass(one) and not isinstance(one, type):
-                found[path.parent.name] = one
+def constants() -> dict[str, tuple[ModuleType, str]]:
+    """The module and the name of each constant that is a number or several, by "ROOM.FILE.NAME" without underscores."""
+    root, found = Path(mien.__file__).parent, {}
+    for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
+        places = [node.targets for node in ast.parse(path.read_text("utf-8")).body if isinstance(node, ast.Assign)]
+        names = [place.id for targets in places for place in targets if isinstance(place, ast.Name)]
+        parts = path.relative_to(root).with_suffix("").parts
+        for name in filter(str.isupper, names):
+            module = importlib.import_module(".".join(("mien", *parts)))
+            if type(getattr(module, name)) in (int, float, tuple):
+                found[".".join((*parts, name.lstrip("_")))] = module, name
     return found
 
 
 def change_of(text: str) -> Change:
-    """Read ROOM.NAME=VALUE.
-
-    Raises:
-        UserError: there is no such constant, or the value has another type.
-    """
-    known, (name, _, value) = rooms(), text.partition("=")
-    room, _, field = name.partition(".")
-    if room not in known or field not in asdict(known[room]):
+    """Read ROOM.FILE.NAME=VALUE."""
+    key, _, value = text.partition("=")
+    if key not in (known := constants()):
         raise UserError(f"--set {text}: no such constant; --list prints them all")
-    now = getattr(known[room], field)
+    module, name = known[key]
+    now = getattr(module, name)
     try:
         new = ast.literal_eval(value)
     except (ValueError, SyntaxError):
@@ -74,25 +74,29 @@ def change_of(text: str) -> Change:
     new = float(new) if isinstance(now, float) and type(new) is int else new
     if type(new) is not type(now) or (isinstance(new, tuple) and isinstance(now, tuple) and len(new) != len(now)):
         raise UserError(f"--set {text}: give a value like {now!r}")
-    return known[room], field, new
+    return module, name, new
 
 
 @contextmanager
 def changed(change: Change) -> Iterator[None]:
-    """Give a constant its other value. Its dataclass is frozen, and only this script gets around that."""
-    constants, name, value = change
-    before = getattr(constants, name)
-    object.__setattr__(constants, name, value)
+    """Give a constant its other value, also in the modules that import it."""
+    module, name, value = change
+    before = getattr(module, name)
+    users = [other for key, other in sys.modules.items() if key.startswith("mien.") and vars(other).get(name) is before]
+    for user in (module, *users):
+        setattr(user, name, value)
     try:
         yield
     finally:
-        object.__setattr__(constants, name, before)
+        for user in (module, *users):
+            setattr(user, name, before)
 
 
 def run_name(label: str, options: Sequence[str]) -> str:
     """The name of a run: its change, and a hash of the options and of all constants as they are now."""
-    content = json.dumps([list(options), {name: asdict(values) for name, values in rooms().items()}])
-    return f"ablation-{re.sub('[^a-z0-9_.=-]', '_', label)}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
+    values = {key: repr(getattr(module, name)) for key, (module, name) in constants().items()}
+    content = json.dumps([list(options), values])
+    return f"ablation-{re.sub('[^a-z0-9_.=-]', '_', label.lower())}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
 
 
 def measure(folder: Path, label: str, change: Change | None, options: Sequence[str]) -> Figures:
@@ -135,7 +139,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true")
     given, options = parser.parse_known_args()
     if given.list:
-        show("\n".join(f"{room}.{k}={v!r}" for room, values in rooms().items() for k, v in asdict(values).items()))
+        show("\n".join(f"{key}={getattr(*place)!r}" for key, place in constants().items()))
     changes = [(UNCHANGED, None, []), *((text, change_of(text), []) for text in given.set)]
     changes += [(text, None, f"--{text}".split("=", 1)) for text in given.setting]
     if rows := [measure(path, name, one, [*options, *own]) for path in given.captures for name, one, own in changes]:
