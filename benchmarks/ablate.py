@@ -1,6 +1,6 @@
 """Train captures with one constant or one setting changed at a time, and print what each change is worth.
 
-    python benchmarks/ablate.py out/wojtek out/d3 --set avatar.gaussian_avatars.surface.FILL_OPACITY=0.9 --preset draft --steps 1000
+    python benchmarks/ablate.py out/wojtek out/d3 --set avatar.gaussian_avatars.surface.FILL_OPACITY=0.9 --steps 1000
 
 Give the captures first: workspaces with tracked sequences. Each is trained once as it is and once with each change, as
 `mien train` does, and its held-out frames are scored as `mien evaluate` does. `--list` prints what --set can change;
@@ -55,7 +55,8 @@ def constants() -> dict[str, tuple[ModuleType, str]]:
         parts = path.relative_to(root).with_suffix("").parts
         for name in filter(str.isupper, names):
             module = importlib.import_module(".".join(("mien", *parts)))
-            if type(getattr(module, name)) in (int, float, tuple):
+            values = getattr(module, name)
+            if all(type(value) in (int, float) for value in (values if isinstance(values, tuple) else (values,))):
                 found[".".join((*parts, name.lstrip("_")))] = module, name
     return found
 
