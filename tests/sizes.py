@@ -1,12 +1,14 @@
-"""Limits that no other tool checks: lines of functions in Python and C++, parameters in C++, lines of a file of tests.
+"""Limits that no other tool checks: lines of functions in Python and C++, parameters in C++, lines of files and rooms.
 
-`make lint` runs this file in the repository's root; ruff (PLR0913) counts the parameters of Python's functions. C++ is
+A room that outgrows its line in pyproject.toml makes room, or raises the line where a reviewer sees it. `make lint` runs this file in the repository's root; ruff (PLR0913) counts the parameters of Python's functions. C++ is
 not parsed: the layout that clang-format gives it tells where a function begins and ends.
 """
 
 import ast
 import re
 import sys
+import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -59,9 +61,22 @@ def _blanked(pattern: re.Pattern[str], text: str) -> str:
     return pattern.sub(lambda found: "\n" * found[0].count("\n"), text)
 
 
+def room_faults() -> Iterator[str]:
+    """Yield a message for each room of the package that has more lines than its budget in pyproject.toml."""
+    budgets = tomllib.loads(Path("pyproject.toml").read_text())["tool"]["mien"]["lines-of-rooms"]
+    lines: Counter[str] = Counter()
+    for path in Path("src/mien").rglob("*.py"):
+        inside = path.relative_to("src/mien").parts
+        lines[inside[0] if len(inside) > 1 else "root"] += path.read_text().count("\n")
+    for room in sorted(lines.keys() | budgets):
+        if lines[room] > budgets.get(room, 0):
+            yield f"src/mien/{room}: {lines[room]} lines; its budget in pyproject.toml is {budgets.get(room, 0)}"
+    print(f"Rooms: {sum(lines.values()):,} lines of {sum(budgets.values()):,}.")
+
+
 def main() -> int:
     """Check every source file, and report what exceeds a limit."""
-    faults, count = [], 0
+    faults, count = [*room_faults()], 0
     for folder in ("src", "tests", "examples", "benchmarks", "native"):
         for path in sorted(Path(folder).rglob("*")):
             check = {".py": python_faults, ".cpp": cpp_faults, ".h": cpp_faults}.get(path.suffix)
