@@ -1,7 +1,8 @@
 """Limits that no other tool checks: lines of functions in Python and C++, parameters in C++, lines of files and rooms.
 
-A room that outgrows its line in pyproject.toml makes room, or raises the line where a reviewer sees it. `make lint` runs this file in the repository's root; ruff (PLR0913) counts the parameters of Python's functions. C++ is
-not parsed: the layout that clang-format gives it tells where a function begins and ends.
+A room that outgrows its line in pyproject.toml makes room, or raises the line where a reviewer sees it. `make lint`
+runs this file in the repository's root; ruff (PLR0913) counts the parameters of Python's functions. C++ is not parsed:
+the layout that clang-format gives it tells where a function begins and ends.
 """
 
 import ast

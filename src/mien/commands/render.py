@@ -126,11 +126,8 @@ class Command:
         output = self.picture.plan(self._output, self._frames(timesteps) if cameras is None else len(cameras))
         warn_of_white(self.picture, run_dir, avatar)
         subject = avatar.subject
-        face = replace(
-            motion or self._chosen_timestep(run_dir, avatar.face_model) or subject,
-            identity=subject.identity,
-            vertex_offsets=subject.vertex_offsets,
-        )
+        face = motion or self._chosen_timestep(run_dir, avatar.face_model) or subject
+        face = replace(face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
         told = "choose a sequence that was tracked with the avatar's face model"
         check_face_params(avatar.face_model, face, f"--sequence {self.sequence}", told)
         face = with_expression(face, avatar.face_model, self.set)
