@@ -99,8 +99,11 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
     points = np.random.default_rng(0).uniform(40, 120, (3, 478, 2)).astype(np.float32)
     points[1] = np.nan
     write_arrays(tmp_path / "points.safetensors", {"landmarks": points})
-    np.savetxt(tmp_path / "points.csv", points.reshape(3, -1), "%.6f", ",")
-    np.testing.assert_allclose(read_landmarks(tmp_path / "points.csv", 3), points, atol=1e-5)
+    for separator, point, encoding in (("\t", ".", "utf-16"), (";", ",", "utf-8-sig"), (",", ".", "utf-8")):
+        rows = ["" if np.isnan(row).any() else separator.join(f"{value:.6f}" for value in row.flat) for row in points]
+        text = "x0" + separator + "y0\n" + "\n".join(rows).replace(".", point) + "\n"
+        (tmp_path / "points.csv").write_text(text, encoding)
+        np.testing.assert_allclose(read_landmarks(tmp_path / "points.csv", 3), points, atol=1e-5)
     settings = CaptureSettings(crop="none", mattes=mattes, landmarks=tmp_path / "points.safetensors")
     (capture,) = capture_video_parts(clip, tmp_path / "sequences", settings)
     np.testing.assert_allclose(capture.landmarks[:, 0], points, atol=1e-4)

@@ -112,6 +112,8 @@ def test_tables_of_other_programs(tmp_path: Path, key: str, step: float, fps: fl
     )
     assert motion.fps == pytest.approx(rate)
     assert jaw(motion) == [0, 0.1, 0.2, 0.3]
+    # pandas writes the number of each row, in a column without a name
+    assert jaw(read_live_link_face(table(tmp_path / "b.csv", "", "time", "jawOpen"))) == [0, 0.1, 0.2, 0.3]
     assert motion.coefficients[3, ARKIT_NAMES.index("mouthSmileLeft")] == pytest.approx(0.3)
     assert "has no columns EyeBlinkLeft, " in motion.notes[0]
     assert "(50 in all), so they stay 0" in motion.notes[0]

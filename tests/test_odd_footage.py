@@ -28,6 +28,7 @@ from mien.capture.sound import read_sound
 from mien.capture.tone import HLG, srgb_signal
 from mien.capture.video import count_frames, probe_video, read_video_frames, write_video
 from mien.cli import main
+from mien.commands.stages import driving
 from mien.errors import UserError
 from test_capture_parts import streak
 from test_interlaced import flagged, write, write_single_fields
@@ -332,7 +333,9 @@ def test_sound_follows_the_default_too(tmp_path: Path) -> None:
     assert read_sound(path).mean() == pytest.approx(8000 / 32768, abs=1e-3)
 
 
-def test_a_webcam_behind_a_screen_recording_is_named_and_can_be_chosen(test_data, tmp_path, capsys) -> None:
+def test_a_webcam_behind_a_screen_recording_is_named_and_can_be_chosen(
+    test_data, tmp_path, capsys, monkeypatch
+) -> None:
     path, face = tmp_path / "call.mkv", face_picture(test_data)
     write_tracks(path, [([flat(256)] * 4, False), ([face] * 4, False)])
     command = ["capture", str(path), "--out", str(tmp_path / "out"), "--capture.crop", "none"]
@@ -346,3 +349,10 @@ def test_a_webcam_behind_a_screen_recording_is_named_and_can_be_chosen(test_data
     assert (capture.timesteps, capture.width) == (4, 160)
     with pytest.raises(UserError, match=r"stream 2 is no stream of pictures; .* 0 \(256x256\), 1 \(160x160\)"):
         capture_video(path, tmp_path / "none", CaptureSettings(stream=2))
+    # As a driver, the film has a workspace for each way to capture it.
+    monkeypatch.setattr(driving, "run_tracking_stage", lambda workspace, *_, **__: workspace.sequence_names())
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(UserError, match="add --capture.stream 1$"):
+        driving.tracked_film(path, "anny")
+    workspace, names = driving.tracked_film(path, "anny", CaptureSettings(crop="none", stream=1))
+    assert [read_capture(workspace.sequence_dir(name) / "capture").width for name in names] == [160]

@@ -16,6 +16,7 @@ from mien.capture.video import write_video
 from mien.cli import main
 from recordings import live_link_face, plain, table
 from shared_things import MadeOnce, toy_workspace
+from test_odd_footage import flat, write_tracks
 
 COMMANDS = ("batch", "capture", "create", "drive", "export", "render", "view")
 THINGS = {
@@ -35,6 +36,7 @@ def place(tmp_path_factory: pytest.TempPathFactory, made_once: MadeOnce) -> Path
     place = tmp_path_factory.mktemp("place")
     shutil.copytree(toy_workspace(made_once), place / "W")
     write_video(place / "clip.mp4", [np.zeros((16, 16, 3), np.uint8)] * 2, 25.0)
+    write_tracks(place / "streams.mkv", [([flat(64)] * 2, False), ([flat(32)] * 2, False)])
     assert cv2.imwrite(str(place / "photo.jpg"), np.zeros((16, 16, 3), np.uint8))
     for folder, name in (("pictures", "photo.jpg"), ("one video", "clip.mp4")):
         (place / folder).mkdir()
@@ -61,6 +63,9 @@ def remedies(arguments: list[str], message: str) -> Iterator[list[str]]:
         yield arguments[:at] + arguments[at + 2 :]
     for words in re.findall(r"needs (--[a-z]+ [A-Za-z.0-9]+),? .*add it", message):
         yield [*arguments, *shlex.split(words)]
+    for index in re.findall(r"(\d+) \(\d+x\d+\)", message):
+        at = arguments.index("--capture.stream") + 1
+        yield [*arguments[:at], index, *arguments[at + 1 :]]
     for path in re.findall(r"give (.+?) itself", message):
         yield [path if word == str(Path(path).parent) else word for word in arguments]
     wrong = re.match(r"(?:--[a-z]+ )?([^:]+): ", message)
@@ -79,6 +84,8 @@ def remedies(arguments: list[str], message: str) -> Iterator[list[str]]:
     (f"drive W --by take.csv --neutral {NOT_GIVEN} --out a.mp4", 7),
     ("drive W --by take.csv --sequence a --out a.mp4", 1),
     ("drive W --by take.csv --fps 70", 1),
+    ("drive W --by streams.mkv --out a.mp4 --capture.stream 7", 2),
+    ("drive W --by take.csv --capture.stream 1 --out a.mp4", 1),
     ("drive W --by clip.mp4 --camera-format v4l2 --out a.mp4", 1),
     ("create photo.jpg --out N", 2),
     ("capture photo.jpg --out N", 2),

@@ -14,6 +14,7 @@ from random import Random
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
 import torch
 from torch import Tensor, nn
 
@@ -21,11 +22,13 @@ from fuzzing.material import ANALYSIS, CONFIG, GROWTH, QUICK, RUN, SEQUENCE, SET
 from mien import cli
 from mien.avatar import METHODS, load_avatar
 from mien.avatar.baking import make_portable
+from mien.batch import Batch
+from mien.capture import CaptureSettings, capture_video_parts, read_capture
 from mien.capture.calibration import CalibratedCamera
 from mien.capture.crop import whole_picture
 from mien.capture.given import GivenMattes
 from mien.capture.readings import readings_of
-from mien.capture.source import FrameSelection, open_source, read_image
+from mien.capture.source import FrameSelection, FrameSource, open_source, read_image
 from mien.capture.video import count_frames, probe_video, read_video_frames
 from mien.commands.config_file import ConfigFile
 from mien.commands.options import TrainOptions, with_settings
@@ -38,6 +41,7 @@ from mien.evaluation.image_source import open_pictures, read_picture
 from mien.export import in_world, read_glb, read_ply, write_gaussian_avatars_folder, write_ply
 from mien.face import FaceModel, FaceParams, available_face_models, load_face_model
 from mien.face.flame import flame_face_model
+from mien.inside import is_one_line
 from mien.lab.analysis import AnalysisOptions, run_analysis
 from mien.lab.analysis.study.files import read_all_answers, read_key
 from mien.lab.analysis.study.tally import tally_content, tally_text
@@ -121,6 +125,25 @@ def read_video(root: Path, file: Path) -> None:
     for seconds, frame in itertools.islice(read_video_frames(file, 512), SEEN):
         assert np.isfinite(seconds), seconds
         assert (frame.dtype, frame.ndim) == (np.uint8, 3), (frame.dtype, frame.shape)
+
+
+def read_film(root: Path, file: Path) -> FrameSource:
+    """Read every stream of a film, or a folder of pictures, as a capture does."""
+    source = open_source(file, FrameSelection(), 25.0)
+    for stream in (source.stream, *source.other_streams[:2]):
+        source = open_source(file, FrameSelection(), 25.0, stream=stream)
+        assert source.count() >= 0
+        for frame in itertools.islice(source.frames(48), 3 * SEEN):
+            alpha, (width, height) = frame.alpha(), frame.size()
+            assert alpha is None or (alpha.dtype, alpha.shape) == (np.uint8, (height, width)), (alpha.shape, height)
+            assert (frame.picture().dtype, frame.picture().ndim) == (np.uint8, 3)
+            assert np.isfinite((frame.seconds, frame.combs())).all()
+    return source
+
+
+def read_batch(root: Path, file: Path) -> None:
+    run_line("batch status {root}/batch", root)
+    run_line("batch status {root}/batch --json", root)
 
 
 def read_workspace(root: Path, file: Path) -> Any:
@@ -218,6 +241,52 @@ def use_capture(root: Path, found: Any, dice: Random) -> None:
     found.usable  # noqa: B018
     if dice.random() < 0.3:
         use_run(root, None, dice)
+
+
+def capture_film(root: Path, found: FrameSource, dice: Random) -> None:
+    """Capture a film with landmarks as given, without networks. A refused one leaves hidden files alone, to go on."""
+    points = np.random.default_rng(0).uniform(5, 25, (min(found.count(), 1000), 478, 2)).astype(np.float32)
+    safetensors.numpy.save_file({"landmarks": points}, root / "film.safetensors")
+    mattes = found.path if dice.random() < 0.7 else None
+    given = {"landmarks": root / "film.safetensors", "mattes": mattes, "stream": found.stream, "detector": "litert"}
+    try:
+        captures = capture_video_parts(found.path, root / "S", CaptureSettings(32, "none", shortest_part=0.0, **given))
+    except UserError:
+        left = [path.relative_to(root) for path in root.glob("S/**/*") if path.is_file()]
+        assert all(any(name.startswith(".") for name in path.parts) for path in left), left
+        raise
+    for capture in captures:
+        use_capture(root, capture, Random(0))
+    assert not [path.name for path in (root / "S").rglob(".*")], "leftovers"
+
+
+def drive_by_pictures(root: Path, found: None, dice: Random) -> None:
+    """Drive by a folder of pictures, with landmarks as given, up to the tracking. What was captured is kept whole."""
+    pictures = sum(path.is_file() and not path.name.startswith(".") for path in root.glob("alphas/*"))
+    count = pictures if pictures > 2 else 3 * pictures
+    points = np.random.default_rng(0).uniform(5, 25, (count, 478, 2)).astype(np.float32)
+    safetensors.numpy.save_file({"landmarks": points}, root / "film.safetensors")
+    try:
+        run_line("drive {W} --by {root}/alphas --out {root}/o.mp4 --size 16 --capture.landmarks {root}/film.safetensors"
+                 " --capture.size 32 --capture.crop none", root)  # fmt: skip
+    finally:
+        assert not list(root.glob("*o.*")), "a film"
+        for folder in (root / "cache/drivers").glob("*/sequences/*"):
+            read_capture(folder / "capture")
+
+
+def run_batch(root: Path, found: object, dice: Random) -> None:
+    """Run the table of a batch with a program that fails, and compare its results. Its states are whole."""
+    table, out = next(root.glob("tables/people*")), root / "batch"
+    if dice.random() < 0.2:
+        try:
+            run_line(f"batch {table} --out {out} --retry 0 --jobs 1 --program false", root)
+        finally:
+            read_batch(root, out)
+            for row in Batch(out).read_plan():
+                assert getattr(Batch(out).read_state(row.name), "status", "") in ("failed", "done")
+    if out.exists():
+        run_line("batch table {root}/batch", root)
 
 
 def use_run(root: Path, found: Any, dice: Random) -> None:
@@ -352,12 +421,13 @@ def run_line(line: str, root: Path) -> None:
 def run_words(words: list[str], root: Path) -> None:
     """Run a command in this process. A refusal is raised as a `UserError`, another end as a `CommandError`."""
     os.environ["MIEN_CACHE"] = str(root / "cache")
-    told = io.StringIO()
-    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
+    told, shown = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(shown):
         try:
             code: Any = cli.main(words)
         except SystemExit as stop:
             code = stop.code
+    assert all(map(is_one_line, shown.getvalue().split("\n"))), "control characters on standard output"
     lines = [line for line in told.getvalue().splitlines() if line.startswith("mien: ")]
     if code == cli.EXIT_USER_ERROR and len(lines) == 1:
         raise UserError(lines[0])

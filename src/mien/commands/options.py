@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 import tyro
 
 from mien.avatar import DEFAULT_METHOD, MethodConfig, has_method, method_named, method_names
+from mien.capture import CaptureSettings
 from mien.capture.sound_endings import SOUND_ENDINGS
 from mien.commands.config_file import ConfigFile, read_config_file
 from mien.commands.help_text import Described, OtherValues, subclass_with
@@ -299,12 +300,14 @@ def check_neutral(neutral: str | None) -> None:
         check_driver(Path(neutral), None)
 
 
-def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:
+def check_driver(
+    by: Path, sequence: str | None, fps: float | None = None, capture: CaptureSettings | None = None
+) -> None:
     """Check before any work that the driver exists: a workspace with that sequence, or a file.
 
     Raises:
-        UserError: the driver is missing, does not have that sequence, has no sequences, takes no frame rate, or is
-            neither a recording nor a video.
+        UserError: the driver is missing, does not have that sequence, has no sequences, takes no frame rate, is neither
+            a recording nor a video, or is none that the settings of a capture are for.
     """
     suffix = by.suffix.lower() if by.is_file() else ""
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
@@ -313,10 +316,18 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
         raise UserError(f"{by}: no such file or folder; give {_DRIVERS}")
     if suffix in (".csv", ".json", *SOUND_ENDINGS) and sequence is not None:
         raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
-    if not by.is_file():
-        if not holds_pictures(by):
-            open_workspace(by).pick_sequence(sequence)
-    elif suffix not in (".csv", ".json", *SOUND_ENDINGS):
+    is_film = holds_pictures(by) or (by.is_file() and suffix not in (".csv", ".json", *SOUND_ENDINGS))
+    settings, usual = capture or CaptureSettings(), CaptureSettings()
+    for name in () if is_film else (one.name for one in fields(settings)):
+        value = getattr(settings, name)
+        if value != getattr(usual, name):
+            option = f"--capture.{'no-' * (value is False)}{name.replace('_', '-')}"
+            typed = option if value is False else f"{option} {value}"
+            raise UserError(f"{typed}: is for a video or pictures, and --by is {by}; leave {option} out")
+    settings.check()
+    if not by.is_file() and not is_film:
+        open_workspace(by).pick_sequence(sequence)
+    elif by.is_file() and is_film:
         from mien.capture.video_file import open_video
 
         try:
@@ -324,6 +335,8 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
                 pass
         except UserError as error:
             raise UserError(f"{error}; what drives an avatar is {_DRIVERS}") from None
+        with open_video(by, settings.stream):
+            pass
 
 
 def holds_pictures(folder: Path) -> bool:

@@ -9,6 +9,7 @@ import torch
 
 from mien import runtime
 from mien.avatar import as_array, bake_rig, load_avatar, make_portable
+from mien.capture import CaptureSettings
 from mien.capture.camera_names import CameraName, camera_named
 from mien.capture.live_camera import LiveCamera
 from mien.commands.stages.driving import open_driver
@@ -61,12 +62,18 @@ def person_of(path: Path, portable: PortableAvatar) -> tuple[FaceModel, FacePara
     return model, replace(model.neutral(), **given)
 
 
-def clip_of(viewed: Viewed, by: Path, sequence: str | None, neutral: str | None = None) -> Callable[[], Clip]:
+def clip_of(
+    viewed: Viewed,
+    by: Path,
+    sequence: str | None,
+    neutral: str | None = None,
+    capture: CaptureSettings | None = None,
+) -> Callable[[], Clip]:
     """Return a function that loads a motion, made for the avatar and softly within what was filmed."""
 
     def load() -> Clip:
         model, subject = viewed.person()
-        driver, portable = open_driver(by, sequence, model, neutral=neutral), viewed.portable
+        driver, portable = open_driver(by, sequence, model, None, neutral, capture), viewed.portable
         person = rest_of(subject, model, facing(torch.from_numpy(portable.camera.viewmat))).face
         face = drive(driver.face, driver.at_rest, person, model.expression_bounds, True, str(by))
         if portable.filmed is not None:
