@@ -232,6 +232,7 @@ def test_cells_with_yes_and_no_are_flags(table: Path, column: tuple[str, str], t
 MISTAKES = [
     ("video,stepz\nann.mp4,3", "did you mean 'steps'"),
     ("video\ngone.mp4", "gone.mp4: no such file"),
+    (f"video\n{'x' * 300}", "x: no such file"),
     ("video,method\nann.mp4,nerf", "nerf"),
     ("video,steps\nann.mp4,-3", "row 1: "),
     ("video,steps\nann.mp4,many", "row 1: --steps: give a whole number instead of 'many'; see mien create"),

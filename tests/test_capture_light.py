@@ -58,6 +58,14 @@ def test_exposure_darkness_and_noise_are_told_with_numbers(gains, noise, said):
         assert any(words in hint for hint in report["hints"]), report["hints"]
 
 
+def test_a_white_balance_that_drifts_is_told_with_numbers():
+    for blue, told in ((0.9, ()), (0.7, ("blue is 42% of its red in frame 29, and 60% in frame 0;",))):
+        faces = [np.full((SIDE, SIDE, 3), SKIN) * [1, 1, gain] for gain in np.linspace(1, blue, 30)]
+        report = report_of(*(np.rint(255 * face).astype(np.uint8) for face in faces))
+        assert len(report["hints"]) == len(told)
+        assert all(words in hint for words, hint in zip(told, report["hints"], strict=True)), report["hints"]
+
+
 def test_light_is_measured_where_faces_are():
     assert not is_light_changing(np.full(5, np.nan))
     assert is_light_changing(np.array([np.nan, 0.2, 0.4, np.nan, 0.3]))

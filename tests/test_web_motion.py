@@ -97,6 +97,8 @@ def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> No
     ]
     expect_as_in_python(built, tmp_path, write_json(tmp_path / "task.json", results), 2)
     expect_as_in_python(built, tmp_path, write_csv(tmp_path / "turned.csv", *turned_rows()))
+    slow = write_csv(tmp_path / "slow.csv", *(row(f"0:00:0{second}:00.0", JawOpen=0.5) for second in range(4)))
+    expect_as_in_python(built, tmp_path, slow, 1)
 
 
 def test_a_page_takes_as_long_a_csv_as_python(built: Path, tmp_path: Path) -> None:
@@ -123,6 +125,8 @@ BROKEN = [
     ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:2:0:5,0\n", "has a gap of more than 60 s"),
     ("a.csv", "time,jawOpen,HeadYaw\n0,0.1,2.9\n",
      "has 2.9 for headyaw in line 2; angles are in radians, so divide degrees by 57.3"),
+    ("a.csv", "time,jawOpen,HeadYaw\n0,0,0\n0.04,0,0.1\n0.08,0,1.2\n",
+     "has 1.2 for headyaw right after 0.1; angles are in radians, so divide degrees by 57.3"),
     ("a.json", "[{", "is no json"),
     ("a.json", frames(3, timestamp_ms=lambda i: i / 30),
      'has 30000 frames in a second; give milliseconds, or call seconds "time"'),

@@ -192,7 +192,7 @@ VALUES: dict[str, tuple[Row, ...]] = {
     ),
     "gains": (
         ("gains", fill(np.nan)), ("gains", fill(0)), ("gains", fill(1e3)), ("gains", first(3)), ("gains", GONE),
-        ("gains", typed(bool)),
+        ("gains", typed(bool)), ("+dtype gains", "F8_E4M3"),
     ),
     "crops.json": tuple(("crops.0\\.png", box) for box in (
         [0, 0, HUGE, 4], [-HUGE, 0, 4, 4], [True, 0, 4, 4], [0, 0, 4.0, 4], [0, 0, 4, 10**7])),
