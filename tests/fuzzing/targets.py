@@ -7,7 +7,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from fuzzing import faults, lines, uses
+from fuzzing import commands, faults, lines, uses
 from fuzzing.faults import Place
 from fuzzing.material import ANALYSIS, PIECES, RUN, SEQUENCE, go_on
 from mien.avatar import load_avatar
@@ -127,9 +127,9 @@ _TARGETS = (
     Target("pictures", "pictures/*", uses.read_pictures, weight=5),
     Target("mattes", "given/mattes/*", uses.read_mattes, uses.expect_finite),
     Target("points", "given/points.*", lambda root, file: read_landmarks(file, 3), uses.expect_rows, 2),
-    Target("films", "films/*", uses.read_film, uses.capture_film, 3),
-    Target("alphas", "alphas/*", lambda root, file: uses.read_film(root, file.parent), uses.capture_film, 2),
-    Target("driving pictures", "alphas/*", lambda root, file: None, uses.drive_by_pictures, named=False,
+    Target("films", "films/*", commands.read_film, commands.capture_film, 3),
+    Target("alphas", "alphas/*", lambda root, file: commands.read_film(root, file.parent), commands.capture_film, 2),
+    Target("driving pictures", "alphas/*", lambda root, file: None, commands.drive_by_pictures, named=False,
            fault=faults.any_fault, parts=("W", "cache")),
     Target("crops.json", "given/crops.json", _of(read_crops), uses.expect_finite),
     Target("cameras.json", "given/cameras.json", _of(read_cameras), uses.use_cameras, 1.5, parts=("head.ply",)),
@@ -139,9 +139,10 @@ _TARGETS = (
     Target("take.json", "given/*take.json", uses.read_motion, uses.expect_motion, 2),
     Target("takes", "takes/*", uses.read_motion, uses.expect_motion, 4),
     Target("sounds", "sounds/*", _of(read_speech), uses.expect_motion, 3),
-    Target("tables", "tables/people*", _of(read_table), uses.run_batch, 3),
-    Target("states of a batch", "batch/states/*", uses.read_batch, uses.run_batch, 2, named=False, parts=("tables",)),
-    Target("plan.json", "batch/plan.json", uses.read_batch, uses.run_batch, named=False, parts=("tables",)),
+    Target("tables", "tables/people*", _of(read_table), commands.run_batch, 3),
+    Target("states of a batch", "batch/states/*", commands.read_batch, commands.run_batch, 2, named=False,
+           parts=("tables",)),
+    Target("plan.json", "batch/plan.json", commands.read_batch, commands.run_batch, named=False, parts=("tables",)),
     Target("tiny.npz", "flame/tiny.npz", _of(read_flame), uses.use_face_model, 2),
     Target("tiny.pkl", "flame/tiny.pkl", _of(read_flame), uses.use_face_model, 2),
     Target("point_cloud.ply", "gaussian_avatars/point_cloud.ply", **_FOLDER, weight=2),

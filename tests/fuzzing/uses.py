@@ -14,7 +14,6 @@ from random import Random
 from typing import Any
 
 import numpy as np
-import safetensors.numpy
 import torch
 from torch import Tensor, nn
 
@@ -22,13 +21,11 @@ from fuzzing.material import ANALYSIS, CONFIG, GROWTH, QUICK, RUN, SEQUENCE, SET
 from mien import cli
 from mien.avatar import METHODS, load_avatar
 from mien.avatar.baking import make_portable
-from mien.batch import Batch
-from mien.capture import CaptureSettings, capture_video_parts, read_capture
 from mien.capture.calibration import CalibratedCamera
 from mien.capture.crop import whole_picture
 from mien.capture.given import GivenMattes
 from mien.capture.readings import readings_of
-from mien.capture.source import FrameSelection, FrameSource, open_source, read_image
+from mien.capture.source import FrameSelection, open_source, read_image
 from mien.capture.video import count_frames, probe_video, read_video_frames
 from mien.commands.config_file import ConfigFile
 from mien.commands.options import TrainOptions, with_settings
@@ -127,25 +124,6 @@ def read_video(root: Path, file: Path) -> None:
         assert (frame.dtype, frame.ndim) == (np.uint8, 3), (frame.dtype, frame.shape)
 
 
-def read_film(root: Path, file: Path) -> FrameSource:
-    """Read every stream of a film, or a folder of pictures, as a capture does."""
-    source = open_source(file, FrameSelection(), 25.0)
-    for stream in (source.stream, *source.other_streams[:2]):
-        source = open_source(file, FrameSelection(), 25.0, stream=stream)
-        assert source.count() >= 0
-        for frame in itertools.islice(source.frames(48), 3 * SEEN):
-            alpha, (width, height) = frame.alpha(), frame.size()
-            assert alpha is None or (alpha.dtype, alpha.shape) == (np.uint8, (height, width)), (alpha.shape, height)
-            assert (frame.picture().dtype, frame.picture().ndim) == (np.uint8, 3)
-            assert np.isfinite((frame.seconds, frame.combs())).all()
-    return source
-
-
-def read_batch(root: Path, file: Path) -> None:
-    run_line("batch status {root}/batch", root)
-    run_line("batch status {root}/batch --json", root)
-
-
 def read_workspace(root: Path, file: Path) -> Any:
     workspace = open_workspace(root / "W")
     read_sequence(workspace.sequence_dir(workspace.pick_sequence(None)))
@@ -241,52 +219,6 @@ def use_capture(root: Path, found: Any, dice: Random) -> None:
     found.usable  # noqa: B018
     if dice.random() < 0.3:
         use_run(root, None, dice)
-
-
-def capture_film(root: Path, found: FrameSource, dice: Random) -> None:
-    """Capture a film with landmarks as given, without networks. A refused one leaves hidden files alone, to go on."""
-    points = np.random.default_rng(0).uniform(5, 25, (min(found.count(), 1000), 478, 2)).astype(np.float32)
-    safetensors.numpy.save_file({"landmarks": points}, root / "film.safetensors")
-    mattes = found.path if dice.random() < 0.7 else None
-    given = {"landmarks": root / "film.safetensors", "mattes": mattes, "stream": found.stream, "detector": "litert"}
-    try:
-        captures = capture_video_parts(found.path, root / "S", CaptureSettings(32, "none", shortest_part=0.0, **given))
-    except UserError:
-        left = [path.relative_to(root) for path in root.glob("S/**/*") if path.is_file()]
-        assert all(any(name.startswith(".") for name in path.parts) for path in left), left
-        raise
-    for capture in captures:
-        use_capture(root, capture, Random(0))
-    assert not [path.name for path in (root / "S").rglob(".*")], "leftovers"
-
-
-def drive_by_pictures(root: Path, found: None, dice: Random) -> None:
-    """Drive by a folder of pictures, with landmarks as given, up to the tracking. What was captured is kept whole."""
-    pictures = sum(path.is_file() and not path.name.startswith(".") for path in root.glob("alphas/*"))
-    count = pictures if pictures > 2 else 3 * pictures
-    points = np.random.default_rng(0).uniform(5, 25, (count, 478, 2)).astype(np.float32)
-    safetensors.numpy.save_file({"landmarks": points}, root / "film.safetensors")
-    try:
-        run_line("drive {W} --by {root}/alphas --out {root}/o.mp4 --size 16 --capture.landmarks {root}/film.safetensors"
-                 " --capture.size 32 --capture.crop none", root)  # fmt: skip
-    finally:
-        assert not list(root.glob("*o.*")), "a film"
-        for folder in (root / "cache/drivers").glob("*/sequences/*"):
-            read_capture(folder / "capture")
-
-
-def run_batch(root: Path, found: object, dice: Random) -> None:
-    """Run the table of a batch with a program that fails, and compare its results. Its states are whole."""
-    table, out = next(root.glob("tables/people*")), root / "batch"
-    if dice.random() < 0.2:
-        try:
-            run_line(f"batch {table} --out {out} --retry 0 --jobs 1 --program false", root)
-        finally:
-            read_batch(root, out)
-            for row in Batch(out).read_plan():
-                assert getattr(Batch(out).read_state(row.name), "status", "") in ("failed", "done")
-    if out.exists():
-        run_line("batch table {root}/batch", root)
 
 
 def use_run(root: Path, found: Any, dice: Random) -> None:
