@@ -22,6 +22,7 @@ from fuzzing.targets import TARGETS, present, spread
 from fuzzing.values import SANE, VALUES, concrete, edit
 from shared_things import MadeOnce
 
+MAY_BE_MISSING = ("analysis.json:missing:0", "gains:missing:0")
 CHECKS = {
     **{f"damage: {kind}": ("check_damage", kind) for kind in FIXED},
     **{f"values: {name}": ("check_values", name) for name in VALUES},
@@ -47,7 +48,7 @@ def results_of(cases: Iterable[str], folder: str, material: str) -> list[Result]
 
 
 def check_damage(folder: str, material: str, kind: str) -> None:
-    """Damage the file of every reader. Readers of exact content refuse it; only an analysis that is missing is made."""
+    """Damage the file of every reader. Readers of exact content refuse it. A missing analysis is made; few runs have gains."""
     names = [name for name in present(Path(material)) if "**" not in TARGETS[name].files]
     cases = []
     for name in names:
@@ -55,7 +56,7 @@ def check_damage(folder: str, material: str, kind: str) -> None:
         amount = len(list(Path(material).glob(files))) if files.endswith("/*") else 1
         cases += [f"{name}:{kind}:{number}" for number in range(min(amount, 6))]
     silent = [result.case for result in results_of(cases, folder, material) if result.outcome != "refused"]
-    silent = [case for case in silent if TARGETS[case.split(":")[0]].exact and case != "analysis.json:missing:0"]
+    silent = [case for case in silent if TARGETS[case.split(":")[0]].exact and case not in MAY_BE_MISSING]
     assert not silent, silent
 
 

@@ -131,7 +131,7 @@ def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]
         UserError: they are damaged, or of other sequences.
     """
     path = run_dir / GAINS
-    if not path.exists():
+    if not path.exists() and not path.is_symlink():
         return []
     gains = read_tensors(path).get("gains", torch.zeros(0))
     is_whole = gains.shape == (sum(lengths), 3) and gains.dtype in (torch.float32, torch.float64)
