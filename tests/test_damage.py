@@ -22,6 +22,7 @@ from fuzzing.targets import TARGETS, present, spread
 from fuzzing.values import SANE, VALUES, concrete, edit
 from shared_things import MadeOnce
 
+# A missing analysis is made, and few runs have gains.
 MAY_BE_MISSING = ("analysis.json:missing:0", "gains:missing:0")
 CHECKS = {
     **{f"damage: {kind}": ("check_damage", kind) for kind in FIXED},
@@ -48,7 +49,7 @@ def results_of(cases: Iterable[str], folder: str, material: str) -> list[Result]
 
 
 def check_damage(folder: str, material: str, kind: str) -> None:
-    """Damage the file of every reader. Readers of exact content refuse it. A missing analysis is made; few runs have gains."""
+    """Damage the file of every reader. Readers of exact content refuse it, unless a file may be missing."""
     names = [name for name in present(Path(material)) if "**" not in TARGETS[name].files]
     cases = []
     for name in names:
