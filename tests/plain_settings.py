@@ -29,11 +29,9 @@ def plain_run(**changes: Any) -> TrainSettings:
 def plain_config(method: str, **changes: Any) -> MethodConfig:
     """Plain settings of a method. Those of a method without any here are its defaults."""
     plain = {
-        "gaussian_avatars": plain_gaussian_avatars,
-        "mono_gaussian_avatar": plain_mono_gaussian_avatar,
-        "point_avatar": plain_point_avatar,
-        "textured_mesh": plain_textured_mesh,
-    }
+        "gaussian_avatars": plain_gaussian_avatars, "mono_gaussian_avatar": plain_mono_gaussian_avatar,
+        "point_avatar": plain_point_avatar, "textured_mesh": plain_textured_mesh,
+    }  # fmt: skip
     return replace(plain.get(method, METHODS[method].config)(), **changes)
 
 

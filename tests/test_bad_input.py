@@ -127,9 +127,7 @@ def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_pa
             load_avatar(tmp_path)
 
 
-def test_a_damaged_run_is_trained_again_as_advised(
-    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_run_is_trained_again_as_advised(run_dir: Path, tmp_path: Path, capsys) -> None:
     """A damaged avatar is made again, and a damaged checkpoint is replaced by the older one, which is said."""
     copy = shutil.copytree(run_dir, tmp_path / "copy")
     (copy / "avatar" / "face_model.safetensors").unlink()
@@ -152,16 +150,11 @@ def test_a_damaged_run_is_trained_again_as_advised(
             assert (copy / "avatar" / name).read_bytes() == (run_dir / "avatar" / name).read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (OSError(errno.ENOSPC, "No space left on device", "/x/a.png"), "/x/a.png: No space left"),
-        (MemoryError("8 GiB"), "not enough memory"),
-    ],
-)
-def test_a_full_disk_or_memory_anywhere_is_no_bug(
-    error: Exception, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize(("error", "words"), [
+    (OSError(errno.ENOSPC, "No space left on device", "/x/a.png"), "/x/a.png: No space left"),
+    (MemoryError("8 GiB"), "not enough memory"),
+])  # fmt: skip
+def test_a_full_disk_or_memory_anywhere_is_no_bug(error: Exception, words: str, tmp_path, monkeypatch, capsys) -> None:
     def fail(_: object) -> None:
         raise error
 
@@ -310,9 +303,7 @@ def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_an_export_on_a_full_disk_keeps_the_earlier_file(
-    name: str, given: Path, disk: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_export_on_a_full_disk_keeps_the_earlier_file(name: str, given, disk: Any, capsys, monkeypatch) -> None:
     """Write once, then on a disk that is filled at a random place, then again."""
     monkeypatch.setattr(write_glb, "__defaults__", (128,))  # the usual size takes ten seconds
     folder, filled = disk

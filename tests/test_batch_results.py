@@ -198,31 +198,25 @@ def test_options_of_create_count_for_all_rows_and_a_cell_goes_first(table: Path,
     assert bob == ("create", str(tmp_path / "bob.mp4"), *made, "textured_mesh", "--steps", "30", *more)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("--preset best", "row 1: --preset: give one of 'draft', "),
-        ("--view", "'view' cannot be set; nobody watches"),
-        ("--steps 3 --steps 4", "--steps is given twice"),
-        ("--capture.sizes 3", "row 1: unknown: --capture.sizes; did you mean --capture.size"),
-        ("--name ann", "unknown: --name"),
-    ],
-)
+@pytest.mark.parametrize(("options", "words"), [
+    ("--preset best", "row 1: --preset: give one of 'draft', "),
+    ("--view", "'view' cannot be set; nobody watches"),
+    ("--steps 3 --steps 4", "--steps is given twice"),
+    ("--capture.sizes 3", "row 1: unknown: --capture.sizes; did you mean --capture.size"),
+    ("--name ann", "unknown: --name"),
+])  # fmt: skip
 def test_wrong_options_of_all_rows_are_named(table: Path, capsys: Any, options: str, words: str):
     assert main(["batch", str(table), "--out", str(table.parent / "out"), *options.split()]) == 2
     assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("column", "typed"),
-    [
-        (("face_tuning", "no"), ("--no-face-tuning",)),
-        (("face_tuning", "yes"), ()),
-        (("capture.cuts", "no"), ("--capture.no-cuts",)),
-        (("track_apart", "no"), ()),
-        (("method.face-tuning.enabled", "no"), ("--method.face-tuning.enabled", "False")),
-    ],
-)
+@pytest.mark.parametrize(("column", "typed"), [
+    (("face_tuning", "no"), ("--no-face-tuning",)),
+    (("face_tuning", "yes"), ()),
+    (("capture.cuts", "no"), ("--capture.no-cuts",)),
+    (("track_apart", "no"), ()),
+    (("method.face-tuning.enabled", "no"), ("--method.face-tuning.enabled", "False")),
+])  # fmt: skip
 def test_cells_with_yes_and_no_are_flags(table: Path, column: tuple[str, str], typed: tuple[str, ...]):
     table.write_text(f"video,{column[0]}\nann.mp4,{column[1]}\n")
     (row,) = read_table(table)

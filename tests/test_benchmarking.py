@@ -70,14 +70,11 @@ def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.Monkey
     assert _native.rasterize_isa() == best
 
 
-@pytest.mark.parametrize(
-    ("line", "told"),
-    [
-        ("scaling --plot chart.jpg", ".png, .svg, .pdf"),
-        ("train-step --parts --method headgas", "--parts --method headgas"),
-        ("train-step --seconds=0", "--seconds 0: give a positive number"),
-    ],
-)
+@pytest.mark.parametrize(("line", "told"), [
+    ("scaling --plot chart.jpg", ".png, .svg, .pdf"),
+    ("train-step --parts --method headgas", "--parts --method headgas"),
+    ("train-step --seconds=0", "--seconds 0: give a positive number"),
+])  # fmt: skip
 def test_what_cannot_be_measured_is_told_at_once(line: str, told: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", *line.split()]) == 2
     assert told in capsys.readouterr().err

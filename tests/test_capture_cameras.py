@@ -33,12 +33,10 @@ def camera_at(x: float, y: float, z: float, focal: float) -> Camera:
 
 
 CAMERAS = {
-    "left": camera_at(-0.25, 0.05, 1.2, 520.0),
-    "middle": camera_at(0.0, 0.0, 1.0, 430.0),
-    "right": camera_at(0.3, -0.04, 1.1, 480.0),
-    "top": camera_at(0.0, 0.3, 1.1, 480.0),
+    "left": camera_at(-0.25, 0.05, 1.2, 520.0), "middle": camera_at(0.0, 0.0, 1.0, 430.0),
+    "right": camera_at(0.3, -0.04, 1.1, 480.0), "top": camera_at(0.0, 0.3, 1.1, 480.0),
     "back": camera_at(0.1, 0.0, -1.2, 500.0),
-}
+}  # fmt: skip
 
 
 def corners_at(timestep: int) -> torch.Tensor:

@@ -34,19 +34,16 @@ def report_of(*faces: np.ndarray) -> dict:
     return quality_report("clip", relative_quality(measured), measured)
 
 
-@pytest.mark.parametrize(
-    ("gains", "noise", "said"),
-    [
-        (np.ones(30), 0.01, {}),
-        (np.linspace(1, 1.2, 30), 0.0, {}),
-        (np.where(np.arange(30) == 7, 0.3, 1.0), 0.0, {}),  # one flash is no light that changes
-        (np.linspace(1, 0.4, 30), 0.0, {"changing_light": "factor of 2.3 (mean level 25% in frame 29, 63%"}),
-        (np.where(np.arange(30) < 15, 1.0, 0.6), 0.0, {"changing_light": "factor of 1.7"}),
-        (np.full(30, 0.2), 0.0, {"dark": "the face is dark (mean level 13%)"}),
-        (np.full(30, 0.9), 0.06, {"noisy": "deviation of 10."}),
-        (np.full(30, 0.2), 0.06, {"dark": "mean level 13%", "noisy": "more light on the face"}),
-    ],
-)
+@pytest.mark.parametrize(("gains", "noise", "said"), [
+    (np.ones(30), 0.01, {}),
+    (np.linspace(1, 1.2, 30), 0.0, {}),
+    (np.where(np.arange(30) == 7, 0.3, 1.0), 0.0, {}),  # one flash is no light that changes
+    (np.linspace(1, 0.4, 30), 0.0, {"changing_light": "factor of 2.3 (mean level 25% in frame 29, 63%"}),
+    (np.where(np.arange(30) < 15, 1.0, 0.6), 0.0, {"changing_light": "factor of 1.7"}),
+    (np.full(30, 0.2), 0.0, {"dark": "the face is dark (mean level 13%)"}),
+    (np.full(30, 0.9), 0.06, {"noisy": "deviation of 10."}),
+    (np.full(30, 0.2), 0.06, {"dark": "mean level 13%", "noisy": "more light on the face"}),
+])  # fmt: skip
 def test_exposure_darkness_and_noise_are_told_with_numbers(gains, noise, said):
     faces = [np.full((SIDE, SIDE, 3), SKIN) * gain for gain in gains]
     grain = np.random.default_rng(0)

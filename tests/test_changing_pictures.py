@@ -77,14 +77,11 @@ def test_frames_that_are_left_out_are_counted(test_data, tmp_path, capsys):
 
 FACE = np.array([0.4, 0.3, 0.6, 0.7])
 OVERLAYS = {
-    "a caption": (np.s_[14:17, 3:29], False),
-    "a band over a third": (np.s_[12:, :], False),
-    "a title": (np.s_[:4, :], False),
-    "a window": (np.s_[8:, 20:], False),
-    "a logo on the chin": (np.s_[11:14, 13:19], False),
-    "another place": (np.s_[:, :], True),
+    "a caption": (np.s_[14:17, 3:29], False), "a band over a third": (np.s_[12:, :], False),
+    "a title": (np.s_[:4, :], False), "a window": (np.s_[8:, 20:], False),
+    "a logo on the chin": (np.s_[11:14, 13:19], False), "another place": (np.s_[:, :], True),
     "another face in the same place": (np.s_[5:13, 12:20], True),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("level", [0, 255])

@@ -68,30 +68,25 @@ def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
 PROTOCOLS = "'insta', 'imavatar', 'nersemble', 'nersemble-benchmark', 'vhap', 'nerface', 'nerf-blendshape'"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("create a.mp4 --uot here", ("did you mean --out?",)),
-        ("export --webcm here --out a.html", ("did you mean --webcam?",)),  # tyro takes the folder for its value
-        ("train here --training.step 3", ("did you mean --steps?",)),
-        ("create --method headgas --step 3 --out here a.mp4", ("did you mean --steps?",)),
-        ("render here --out a.mp4 --siez 3", ("--siez", "did you mean --size?", "see mien render --help")),
-        ("create", ("--out DIR", "see mien create --help")),
-        ("render DIR --out a.png --set jawOpen=1 --set=eyeBlinkLeft=1", ("--set is given twice",)),
-        ("demo --out demo --out=", ("--out= is empty",)),  # as a path, the current folder (found by the fuzzer, seed 5)
-        ("train here --method.appearance nonsense", ("nonsense", "features", "see mien train --help-all")),
-        ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
-        ("create none.mp4 --out here --method nerf", ("instead of 'nerf'",)),
-        ("track here --tracking.keyframes -1", ("--tracking.keyframes -1",)),
-        ("bench nothing", ("nothing", "render, train-step, scaling, quality, compare")),
-        # Choices in the order of their declaration, without None, which cannot be typed.
-        ("evaluate x --protocol None", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'None'; see mien",)),
-        ("capture x --out y --capture.turn 45", ("--capture.turn: give one of '0', '90', '180', '270' instead of",)),
-    ],
-)
-def test_wrong_arguments_are_told_in_one_line(
-    arguments: str, words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Told
-) -> None:
+@pytest.mark.parametrize(("arguments", "words"), [
+    ("create a.mp4 --uot here", ("did you mean --out?",)),
+    ("export --webcm here --out a.html", ("did you mean --webcam?",)),  # tyro takes the folder for its value
+    ("train here --training.step 3", ("did you mean --steps?",)),
+    ("create --method headgas --step 3 --out here a.mp4", ("did you mean --steps?",)),
+    ("render here --out a.mp4 --siez 3", ("--siez", "did you mean --size?", "see mien render --help")),
+    ("create", ("--out DIR", "see mien create --help")),
+    ("render DIR --out a.png --set jawOpen=1 --set=eyeBlinkLeft=1", ("--set is given twice",)),
+    ("demo --out demo --out=", ("--out= is empty",)),  # as a path, the current folder (found by the fuzzer, seed 5)
+    ("train here --method.appearance nonsense", ("nonsense", "features", "see mien train --help-all")),
+    ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
+    ("create none.mp4 --out here --method nerf", ("instead of 'nerf'",)),
+    ("track here --tracking.keyframes -1", ("--tracking.keyframes -1",)),
+    ("bench nothing", ("nothing", "render, train-step, scaling, quality, compare")),
+    # Choices in the order of their declaration, without None, which cannot be typed.
+    ("evaluate x --protocol None", (f"mien: --protocol: give one of {PROTOCOLS} instead of 'None'; see mien",)),
+    ("capture x --out y --capture.turn 45", ("--capture.turn: give one of '0', '90', '180', '270' instead of",)),
+])  # fmt: skip
+def test_wrong_arguments_are_told_in_one_line(arguments: str, words: tuple[str, ...], tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     message = complaint(capsys, *arguments.split())
     assert all(word in message for word in words), message

@@ -140,12 +140,8 @@ def test_the_matte_beside_the_head_is_whole_within_a_margin() -> None:
 def test_places_that_can_and_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "there.png").write_bytes(b"old")
     for name, folder in (
-        ("there.png", False),
-        ("new.png", False),
-        ("a/b/new.png", False),
-        (".", True),
-        ("a/new", True),
-    ):
+        ("there.png", False), ("new.png", False), ("a/b/new.png", False), (".", True), ("a/new", True),
+    ):  # fmt: skip
         check_writable(tmp_path / name, folder=folder)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["there.png"]
     os.mkfifo(tmp_path / "pipe")

@@ -120,9 +120,7 @@ def test_no_command_needs_a_network(offline: Path, fork_server: ForkServer, tmp_
     run_all(fork_server, OF_A_VIDEO, video=video, out=tmp_path, table=table, stub=stub)
 
 
-def test_no_command_needs_a_network_once_there_is_a_run(
-    offline: Path, fork_server: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_command_needs_a_network_once_there_is_a_run(offline, fork_server, tmp_path, monkeypatch) -> None:
     toy, exported = tmp_path / "toy", tmp_path / "exported"
     write_toy_workspace(toy, timesteps=20)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))

@@ -143,9 +143,7 @@ def test_lists_of_json_have_a_bound(tmp_path: Path) -> None:
         parse_json(f'{{{names}, "0": 1}}', unique_names=True)
 
 
-def test_a_message_shows_the_beginning_and_the_remedy(
-    made_once: MadeOnce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_message_shows_the_beginning_and_the_remedy(made_once: MadeOnce, tmp_path: Path, capsys) -> None:
     """A shape of thirty thousand sides would fill the terminal."""
     shutil.copytree(toy_workspace(made_once), tmp_path / "W")
     track = tmp_path / "W" / "runs" / "toy" / "face_track.safetensors"

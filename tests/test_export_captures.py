@@ -261,9 +261,7 @@ def test_what_a_layout_cannot_hold_is_told_or_refused(
         assert not [file for file in folder.rglob("*") if file.suffix in (".frame", ".npz")]
 
 
-def test_the_command(
-    single: Sequence, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(single: Sequence, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     workspace, out = tmp_path / "W", tmp_path / "out"
     folder = workspace / "sequences" / "clip"
     write_capture(folder / "capture", single.capture)

@@ -122,9 +122,7 @@ def refused(page: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
 
 
 @pytest.mark.unchecked
-def test_the_command_needs_nothing_but_what_comes_with_mien(
-    page: Path, monkeypatch: pytest.MonkeyPatch, test_data: Path
-) -> None:
+def test_the_command_needs_nothing_but_what_comes_with_mien(page: Path, monkeypatch, test_data: Path) -> None:
     """A page with a webcam has the same bytes each time, and a page without one has nothing of it."""
     tasks_vision()
     for variable in ("MIEN_FACE_LANDMARKER", "MIEN_TASKS_VISION"):
@@ -153,9 +151,7 @@ def test_the_model_is_the_published_one_and_one_version_is_pinned() -> None:
     assert f"@mediapipe/tasks-vision@{VERSION}\n" in (WEB.parent / "Makefile").read_text()
 
 
-def test_a_model_without_its_second_part_is_explained(
-    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_model_without_its_second_part_is_explained(page: Path, monkeypatch, capsys, tmp_path: Path) -> None:
     """mien from a source distribution lacks the network for blend shapes. A model that is given serves."""
     monkeypatch.setenv("MIEN_TASKS_VISION", str(tasks_vision()))
     monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
@@ -171,9 +167,7 @@ def test_a_model_without_its_second_part_is_explained(
     assert "mien has one" not in refused(page, capsys, "--webcam-model", str(model))
 
 
-def test_a_wrong_model_is_explained(
-    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_wrong_model_is_explained(page: Path, monkeypatch: pytest.MonkeyPatch, capsys, tmp_path: Path) -> None:
     tasks_vision()
     model = tmp_path / "any.task"
     monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))

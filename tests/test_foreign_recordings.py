@@ -187,9 +187,7 @@ def cameras() -> list[CalibratedCamera]:
     (("a.png", "b.png"), lambda folder: list(open_pictures(folder).files.values())),
     (("a.obj", "b.obj"), lambda folder: listed(folder, "*.obj")),
 ])  # fmt: skip
-def test_what_systems_leave_is_skipped(
-    tmp_path: Path, names: tuple[str, ...], read: Callable[[Path], list[Path]]
-) -> None:
+def test_what_systems_leave_is_skipped(tmp_path, names: tuple[str, ...], read: Callable[[Path], list[Path]]) -> None:
     assert [path.name for path in read(given(tmp_path / "people", *names))] == list(names)
 
 
@@ -218,9 +216,7 @@ def test_a_folder_whose_own_name_is_hidden_is_read(tmp_path: Path) -> None:
     ("names", "count"), [(("a.png",), 3), (("a.png", "b.png"), 6), (("a.png", "b.png", "c.png"), 3)]
 )
 @pytest.mark.parametrize("whole", [True, False])
-def test_pictures_drive_an_avatar(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...], count: int, whole: bool
-) -> None:
+def test_pictures_drive_an_avatar(tmp_path: Path, monkeypatch, names: tuple[str, ...], count: int, whole: bool) -> None:
     """A picture, or a folder of few, is repeated, because tracking needs three frames."""
     captured: list[Path] = []
     monkeypatch.setattr(driving, "run_capture_stage", lambda _, source, *__: captured.extend(list_images(source)))

@@ -77,9 +77,7 @@ def put(link: Path, target: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["sequences/clip/capture/cache", "runs/toy/avatar/avatar.safetensors", "a pipe"])
-def test_no_command_follows_a_link(
-    place: str, workspace: Path, victim: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_follows_a_link(place: str, workspace: Path, victim: Path, tmp_path: Path, capsys) -> None:
     """Nor waits for a pipe."""
     out, told, began = tmp_path / "out", f"{workspace / place}: is a link", time.monotonic()
     if place == "a pipe":
@@ -261,9 +259,7 @@ def test_parts_of_a_sequence_have_to_be_of_the_same_pictures(workspace: Path) ->
         read_sequence(clip)
 
 
-def test_kept_pieces_of_a_tracking_that_are_of_no_use(
-    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_kept_pieces_of_a_tracking_that_are_of_no_use(workspace: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     """Tracking starts again, once, if the kept files are whole but hold something else."""
     keep, seen = tmp_path / ".tracking-0123", []
     keep.mkdir()

@@ -224,13 +224,10 @@ def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=words):
             load_avatar(tmp_path)
     for damage, words in (
-        ({"kind": None}, "lacks \\['kind'\\]"),
-        ({"config": "default"}, "config"),
-        ({"gaussians": -1}, "-1 Gaussians"),
-        ({"gaussians": 10**12}, "does not fit its settings"),
-        ({"face_model": 7}, "face_model"),
+        ({"kind": None}, "lacks \\['kind'\\]"), ({"config": "default"}, "config"), ({"gaussians": -1}, "-1 Gaussians"),
+        ({"gaussians": 10**12}, "does not fit its settings"), ({"face_model": 7}, "face_model"),
         ({"surprise": 1}, "unknown entries \\['surprise'\\]"),
-    ):
+    ):  # fmt: skip
         damaged = {name: value for name, value in (json.loads(content) | damage).items() if value is not None}
         description.write_text(json.dumps(damaged))
         with pytest.raises(UserError, match=words):

@@ -89,9 +89,7 @@ ODD = [
 
 
 @pytest.mark.parametrize(("line", "words"), ODD, ids=[line[:60] for line, _ in ODD])
-def test_odd_command_lines_are_told_in_one_line(
-    line: str, words: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_odd_command_lines_are_told_in_one_line(line: str, words: str, place: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(place)
     before = sorted(place.rglob("*"))
     assert main(shlex.split(line)) == 2
@@ -102,9 +100,7 @@ def test_odd_command_lines_are_told_in_one_line(
     assert sorted(place.rglob("*")) == before
 
 
-def test_a_current_tracking_and_landmarks_of_no_face_are_said(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_current_tracking_and_landmarks_of_no_face_are_said(place: Path, monkeypatch, capsys) -> None:
     """The landmarks of the toy capture are all at one point."""
     monkeypatch.chdir(place)
     assert main(["track", "W", "--again"]) == 2
@@ -126,9 +122,7 @@ def test_the_same_video_twice_is_warned_of(place: Path) -> None:
     assert list(doubled_videos(videos[1:], names[1:], ())) == []
 
 
-def test_an_avatar_of_another_version_says_train_again(
-    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_avatar_of_another_version_says_train_again(place: Path, tmp_path: Path, capsys) -> None:
     changes: dict[str, Callable[[dict[str, Any]], object]] = {
         "version 2, expected 'mien.avatar' version 1": lambda content: content.update(version=2),
         "lacks ['photometric']": lambda content: content["config"].pop("photometric"),

@@ -235,9 +235,7 @@ ODD = {
 
 
 @pytest.mark.parametrize("kind", ODD)
-def test_what_is_said_of_odd_footage(
-    kind: str, test_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_said_of_odd_footage(kind: str, test_data: Path, tmp_path: Path, capsys) -> None:
     odd, face, out = ODD[kind], partial(face_picture, test_data), tmp_path / "out"
     words = ["capture", str(odd.write(tmp_path, face)), "--out", str(out), "--capture.no-cuts", *odd.options]
     assert main(words) == 0

@@ -105,9 +105,7 @@ def assert_imported(folder: Path, path: str, arrays: dict[str, np.ndarray]) -> N
     assert len(settings["fingerprint"]) == 16
 
 
-def test_footage_is_imported_an_avatar_trained_and_exported(
-    cached: Mien, fork_server: ForkServer, tmp_path: Path
-) -> None:
+def test_footage_is_imported_an_avatar_trained_and_exported(cached: Mien, fork_server, tmp_path: Path) -> None:
     arrays, out, me = puppet(), str(tmp_path / "out"), tmp_path / "me.xyz9"
     path = write(tmp_path / "me.puppet9", arrays)
     export, of_file = ("export", out, "--out"), ("export", str(tmp_path / "me.mien"), "--out")

@@ -83,9 +83,7 @@ def remedies(arguments: list[str], message: str) -> Iterator[list[str]]:
     ("create photo.jpg --out N", 2),
     ("capture photo.jpg --out N", 2),
 ])  # fmt: skip
-def test_each_remedy_is_accepted(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], typed: str, count: int
-) -> None:
+def test_each_remedy_is_accepted(place: Path, monkeypatch: pytest.MonkeyPatch, capsys, typed: str, count: int) -> None:
     monkeypatch.chdir(place)
     for name in COMMANDS:
         monkeypatch.setattr(importlib.import_module(f"mien.commands.{name}").Command, "run", lambda self: None)

@@ -64,9 +64,7 @@ def shots(test_data: Path) -> Callable[..., list[np.ndarray]]:
 
 @pytest.mark.unchecked
 @pytest.mark.footage
-def test_an_interview_becomes_the_avatar_of_one_person(
-    shots: Callable[..., list[np.ndarray]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interview_becomes_the_avatar_of_one_person(shots: Callable[..., list[np.ndarray]], tmp_path, capsys):
     one, other = shots("wojtek", 2 * FRAMES), shots("d18", FRAMES)
     write_video(tmp_path / "talk.mp4", iter(one[:FRAMES] + other + one[FRAMES:]), 25.0)
     write_video(tmp_path / "stranger.mp4", iter(other), 25.0)

@@ -209,11 +209,9 @@ def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.Capt
     (runs / "a" / "config.json").touch()
     for path, words in (
         (workspace / "gone.json", "gone.json: no such file"),
-        (runs / "a", f"is a folder; give {runs / 'a' / 'config.json'}"),
-        (runs, "is a folder; give a file"),
-        ("/dev/null", "is not an ordinary file"),
-        ("", "--config= is empty"),
-    ):
+        (runs / "a", f"is a folder; give {runs / 'a' / 'config.json'}"), (runs, "is a folder; give a file"),
+        ("/dev/null", "is not an ordinary file"), ("", "--config= is empty"),
+    ):  # fmt: skip
         assert words in complaint(capsys, ["train", str(workspace), f"--config={path}"])
 
 

@@ -77,13 +77,10 @@ def expect_near(found: Gaussians, expected: Gaussians, loss: Loss) -> None:
     same = [multiply_quaternions(wanted, half.expand_as(wanted)) for half in torch.eye(4, dtype=torch.float64)]
     cosines = torch.stack([(turns * one).sum(-1).abs() for one in same]).amax(0)
     differences = {
-        "meters": found.means - expected.means,
-        "radians": 2 * torch.arccos(cosines.clamp(max=1)),
-        "log_scale": found.scales.log() - expected.scales.log(),
-        "opacity": found.opacities - expected.opacities,
-        "color": found.sh[:, 0] - expected.sh[:, 0],
-        "higher": found.sh[:, 1:] - expected.sh[:, 1:],
-    }
+        "meters": found.means - expected.means, "radians": 2 * torch.arccos(cosines.clamp(max=1)),
+        "log_scale": found.scales.log() - expected.scales.log(), "opacity": found.opacities - expected.opacities,
+        "color": found.sh[:, 0] - expected.sh[:, 0], "higher": found.sh[:, 1:] - expected.sh[:, 1:],
+    }  # fmt: skip
     for name, difference in differences.items():
         most = float(difference.abs().max()) if difference.numel() else 0.0
         assert most <= getattr(loss, name) + 1e-6, f"{name}: {most:.3g}"

@@ -171,19 +171,15 @@ def test_extras_bring_what_error_messages_say_and_the_base_install_asks_for_five
 
 
 WORKING = {
-    "still.png": "render {file} --out {out}/still.png --size 48",
-    "f": "render {file} --out {out}/f --frames 3",
-    "again.html": "export {file} --out {out}/again.html",
-    "again.packed": "export {file} --out {out}/again.packed",
+    "still.png": "render {file} --out {out}/still.png --size 48", "f": "render {file} --out {out}/f --frames 3",
+    "again.html": "export {file} --out {out}/again.html", "again.packed": "export {file} --out {out}/again.packed",
     "again.mien": "export {file} --out {out}/again.mien",
-}
+}  # fmt: skip
 LACKING = {
-    "export {file} --out {out}/me.ply": ("torch", "create"),
-    "render {file} --out {out}/me.mp4": ("av", "video"),
-    "capture {file} --out {out}/me": ("av", "create"),
-    "view {file}": ("viser", "viewer"),
+    "export {file} --out {out}/me.ply": ("torch", "create"), "render {file} --out {out}/me.mp4": ("av", "video"),
+    "capture {file} --out {out}/me": ("av", "create"), "view {file}": ("viser", "viewer"),
     "demo --out {out}/demo": ("torch", "create"),
-}
+}  # fmt: skip
 
 
 def test_a_file_is_drawn_and_exported_without_any_extra_and_what_is_missing_is_named(exported: Path, tmp_path: Path):
@@ -276,11 +272,8 @@ def test_a_head_that_the_filmed_frame_cuts_off_is_shown_whole(tmp_path: Path, mo
 def test_a_file_refuses_what_only_a_run_has(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     render = ["render", str(exported), "--out", str(tmp_path / "a.png")]
     for option, told in (
-        ("--timestep 0", "a file"),
-        ("--own-motion", "a file"),
-        ("--sheet turntable", "a file"),
-        ("--run x", "a file"),
+        ("--timestep 0", "a file"), ("--own-motion", "a file"), ("--sheet turntable", "a file"), ("--run x", "a file"),
         ("--set dorp=1", "did you mean drop?"),
-    ):
+    ):  # fmt: skip
         assert main([*render, *option.split()]) == 2
         assert told in capsys.readouterr().err

@@ -201,9 +201,7 @@ def content(path: Path) -> list[bytes]:
     ("a_%06d.png", signal.SIGTERM),
     ("pictures", signal.SIGKILL),
 ])  # fmt: skip
-def test_stopped_rendering_ends_alike_the_next_time(
-    name: str, how: signal.Signals, fork_server: ForkServer, workspace: Path, tmp_path: Path
-) -> None:
+def test_stopped_rendering_ends_alike_the_next_time(name: str, how: signal.Signals, fork_server, workspace, tmp_path):
     """A stopped rendering leaves the old file until the new one is whole. Every numbered picture is whole."""
     command = ["render", str(workspace), *LOOK, "--out"]
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"

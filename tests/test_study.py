@@ -210,12 +210,10 @@ def test_bad_answers_are_told_in_one_line(page: Path, tmp_path: Path, capsys: py
         refused(capsys, told, "tally", key, tmp_path / "good.json", bad)
     bad.write_text(json.dumps(good))
     for key_file, answers, told in (
-        (key, tmp_path, "is of participant 00000001"),
-        (key, gone, "gone.json: no such file"),
-        (gone, tmp_path, "gone.json: missing"),
-        (tmp_path / "good.json", tmp_path, "expected 'mien.study_key'"),
+        (key, tmp_path, "is of participant 00000001"), (key, gone, "gone.json: no such file"),
+        (gone, tmp_path, "gone.json: missing"), (tmp_path / "good.json", tmp_path, "expected 'mien.study_key'"),
         (key, page.parent, "has no answer file"),
-    ):
+    ):  # fmt: skip
         refused(capsys, told, "tally", key_file, answers)
 
 

@@ -239,13 +239,10 @@ def test_a_log_has_a_line_at_each_stage_and_now_and_then(clock: Clock, capsys) -
     ending = " left of the whole command"
     lines = [line.removesuffix(ending) for line in capsys.readouterr().err.splitlines() if line.endswith(ending)]
     assert lines == [
-        "stage 1 of 2 (capture), about 3 min",
-        "stage 2 of 2 (training), about 3 min",
-        "stage 2 of 2 (training), about 4 min",
-        "stage 2 of 2 (training), about 2 min",
-        "stage 2 of 2 (training), about 70 s",
-        "stage 2 of 2 (training), less than 10 s",
-    ]
+        "stage 1 of 2 (capture), about 3 min", "stage 2 of 2 (training), about 3 min",
+        "stage 2 of 2 (training), about 4 min", "stage 2 of 2 (training), about 2 min",
+        "stage 2 of 2 (training), about 70 s", "stage 2 of 2 (training), less than 10 s",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("durations", "status", "told"), [

@@ -30,18 +30,15 @@ from toy_scene import toy_sequence
 from train_toy import stopped_at
 
 
-@pytest.mark.parametrize(
-    ("timesteps", "split", "expected"),
-    [
-        (120, "blocks", [*range(40, 50), *range(90, 100)]),  # every fifth block of ten
-        (5, "blocks", [4]),
-        (30, "blocks", [*range(24, 30)]),
-        (49, "blocks", [*range(36, 45)]),
-        (101, "tail", [*range(81, 101)]),
-        (104, "tail", [*range(83, 104)]),  # 20.8 timesteps are rounded, not cut
-        (101, "none", []),
-    ],
-)
+@pytest.mark.parametrize(("timesteps", "split", "expected"), [
+    (120, "blocks", [*range(40, 50), *range(90, 100)]),  # every fifth block of ten
+    (5, "blocks", [4]),
+    (30, "blocks", [*range(24, 30)]),
+    (49, "blocks", [*range(36, 45)]),
+    (101, "tail", [*range(81, 101)]),
+    (104, "tail", [*range(83, 104)]),  # 20.8 timesteps are rounded, not cut
+    (101, "none", []),
+])  # fmt: skip
 def test_splits(timesteps: int, split: Split, expected: list[int]) -> None:
     assert held_out(timesteps, split).nonzero()[:, 0].tolist() == expected
 

@@ -96,9 +96,7 @@ def test_readers_go_on_beside_every_lock(other: Holder, studio: Studio, tmp_path
             assert main(words.split()) == 0, (words, capsys.readouterr().err)
 
 
-def test_a_run_that_is_being_trained_cannot_be_rendered_yet(
-    other: Holder, studio: Studio, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_is_being_trained_cannot_be_rendered_yet(other: Holder, studio: Studio, tmp_path, capsys) -> None:
     run = studio.root / "runs" / "begun"
     run.mkdir()
     shutil.copy(studio.root / "runs" / "alone" / "config.json", run)

@@ -250,9 +250,7 @@ def test_videos_hold_the_motion_or_a_turn(session: Session, tmp_path: Path) -> N
     np.testing.assert_allclose(around(half, center, np.pi).viewmat, view.viewmat, atol=1e-6)
 
 
-def test_mistakes_are_told_in_one_line(
-    tmp_path: Path, made_once: MadeOnce, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_are_told_in_one_line(tmp_path: Path, made_once: MadeOnce, capsys, monkeypatch) -> None:
     workspace, file, cut = str(toy_workspace(made_once)), tmp_path / "a.mien", tmp_path / "cut.mien"
     runtime.write_portable(file, drawn_head(10))
     cut.write_bytes(file.read_bytes()[:5000])

@@ -201,9 +201,7 @@ def test_files_wait_until_a_browser_takes_them(serving: Serving, monkeypatch: py
     assert serving.failures == []
 
 
-def test_a_failure_is_told_and_the_viewer_goes_on(
-    serving: Serving, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failure_is_told_and_the_viewer_goes_on(serving: Serving, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def fail(*arguments: object) -> None:
         raise ArithmeticError("a bug")
 

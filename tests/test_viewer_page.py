@@ -161,9 +161,7 @@ def test_the_first_picture_is_that_of_the_filmed_camera(serving: Serving, sessio
     asyncio.run(talk())
 
 
-def test_a_missing_package_is_named_and_no_bug(
-    session: Session, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named_and_no_bug(session: Session, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     def draw(*_: object) -> None:
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 

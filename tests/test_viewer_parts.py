@@ -256,9 +256,7 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
     assert len(started) == 1
 
 
-def test_a_watched_training_has_the_same_bytes(
-    started: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_watched_training_has_the_same_bytes(started: list[Path], tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(live_view, "LEAST_SECONDS", 0.0)
     face_model, sequence = toy_sequence(5, 32)
     live, seen, settings = LiveView("toy", toy_camera(32)), [], replace(train_toy.SETTINGS, steps=12)

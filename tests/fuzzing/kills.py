@@ -33,12 +33,9 @@ TRACK = (
 )  # fmt: skip
 TRAIN = ("--preset", "draft", "--steps", "30", "--training.checkpoint-every", "4")
 STAGES = {
-    "capture": ("capture", CLIP, "--out", "W"),
-    "track": ("track", "W", *TRACK),
-    "train": ("train", "W", *TRAIN),
-    "evaluate": ("evaluate", "W"),
-    "export": ("export", "W", "--out", "me.mien"),
-}
+    "capture": ("capture", CLIP, "--out", "W"), "track": ("track", "W", *TRACK), "train": ("train", "W", *TRAIN),
+    "evaluate": ("evaluate", "W"), "export": ("export", "W", "--out", "me.mien"),
+}  # fmt: skip
 """Name of a stage -> its command, in the order of a user."""
 SIGNALS = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 143, signal.SIGINT: 130}
 """Signal -> exit code of a command that has begun its work."""
