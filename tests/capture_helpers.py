@@ -86,24 +86,16 @@ Codes = tuple[int, int, int, int]
 
 
 def encode(
-    path: Path,
-    frames: Sequence[np.ndarray | list[np.ndarray] | av.VideoFrame],
-    codec: str = "libx264",
-    pixels: str = "yuv420p",
-    *,
-    rate: int = 25,
-    options: dict[str, str] | None = None,
-    colors: Codes | None = None,
-    tags: Codes | None = None,
-    ticks: Sequence[int] | None = None,
+    path: Path, frames: Sequence[np.ndarray | list[np.ndarray] | av.VideoFrame], codec: str = "libx264",
+    pixels: str = "yuv420p", *, rate: int = 25, options: dict[str, str] | None = None, colors: Codes | None = None,
+    tags: Codes | None = None, ticks: Sequence[int] | None = None,
     prepare: Callable[[Any], object] = lambda stream: None,
-) -> None:
+) -> None:  # fmt: skip
     """Encode a video with FFmpeg, whose names of codecs and pixel formats are given.
 
     Frames are RGB pictures [h, w, 3], lists of planes of the pixel format, or as PyAV has them. `ticks` are their times
     in units of the rate. `colors` are stated by the codec's header and the frames, `tags` by the container. Without
-    options, libx264 keeps nearly every level. `prepare` changes the stream before anything is encoded.
-    """
+    options, libx264 keeps nearly every level. `prepare` changes the stream before anything is encoded."""
     given = [_frame_of(frame, pixels) for frame in frames]
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate, options=options or ({"crf": "1"} if codec == "libx264" else {}))

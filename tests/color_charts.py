@@ -1,7 +1,6 @@
 """Corrections of a camera's colours by the formula of Cheung 2004, and what a camera films that needs one.
 
-Nothing here calls mien.
-"""
+Nothing here calls mien."""
 
 import numpy as np
 

@@ -1,7 +1,6 @@
 """Cases of the fuzzer of datasets: a small dataset of each layout, one fault in it, and what may come of that.
 
-A case is a layout and a number; the number decides the fault and the way in which the dataset is read.
-"""
+A case is a layout and a number; the number decides the fault and the way in which the dataset is read."""
 
 import shutil
 import time
@@ -213,8 +212,7 @@ class Campaign:
         """Read and write a dataset as `mien import` does.
 
         Raises:
-            UserError: it is damaged.
-        """
+            UserError: it is damaged."""
         known = [each for each in datasets() if each.recognises(path) is not None]
         if not known:
             raise UserError(f"{path}: is no dataset")

@@ -23,8 +23,7 @@ METRES = 1e-5
 CAMERA = 1e-6
 """Largest error of a camera: of rotations, of places in metres, and of intrinsics as a part of each.
 
-Captures hold float32, whose neighbours at 150 pixels are 1.5e-5 apart, so no absolute bound of 1e-6 can hold there.
-"""
+Captures hold float32, whose neighbours at 150 pixels are 1.5e-5 apart, so no absolute bound of 1e-6 can hold there."""
 LANDMARKS = 4e-5
 """Largest error of a landmark, as a part of the height of the picture."""
 _SURE = 99
@@ -63,8 +62,7 @@ def check_projection(
     """Check the imported face and camera against some of the writer's vertices, and the writer's camera.
 
     Where a moving camera became a moving head, what is compared is the motion from the writer's world to the camera.
-    The writer's world is `scale` times as large.
-    """
+    The writer's world is `scale` times as large."""
     K, rotation, translation = view
     found = sequence.tracking.cameras[camera]
     stored = filmed_camera(sequence, camera)

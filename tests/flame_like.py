@@ -1,8 +1,7 @@
 """Make a head in FLAME's schema from the anny model, with other vertices, other joints and other bases.
 
 Identity and expression are linear bases without names. The jaw is a joint that moves skin. Through pose correctives
-the lids follow the eyes, and the lips follow the jaw. It contains nothing of FLAME's own.
-"""
+the lids follow the eyes, and the lips follow the jaw. It contains nothing of FLAME's own."""
 
 import pickle
 import sys
@@ -174,8 +173,7 @@ def posed_as_flame(
     """Return vertices [v, 3] by the formulas of GaussianAvatars (methods.md A.1), in float64.
 
     `pose` [5, 3] holds the axis-angles of root, neck, jaw and eyes; `shape` holds all coefficients. Joints are
-    regressed from the shaped vertices: identity, expression and static offsets [v, 3].
-    """
+    regressed from the shaped vertices: identity, expression and static offsets [v, 3]."""
     shaped = shaped_as_flame(arrays, shape, offsets)
     joints = arrays["J_regressor"] @ shaped
     turns = matrix_from_axis_angle(torch.from_numpy(pose)).numpy()

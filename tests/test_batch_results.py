@@ -18,6 +18,7 @@ from mien.cli import main
 from mien.commands import batch as batch_command
 from mien.commands.stages.batch_table import for_all_rows, read_table
 from mien.errors import UserError
+from refusals import refuses
 from test_startup import HEAVY, modules_after
 from web_case import violations
 
@@ -54,8 +55,7 @@ def test_results_have_all_figures_and_paired_differences(tmp_path: Path):
     ]
     assert markdown_table(table).splitlines()[1] == "|---|---|---|---|"
     assert r"30.50 $\pm$ 0.71" in latex_table(table)
-    with pytest.raises(UserError, match="no such column"):
-        means_by(rows, "gone", ["psnr"])
+    refuses("no such column", means_by, rows, "gone", ["psnr"])
 
 
 @pytest.mark.slow
@@ -180,11 +180,9 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
         ('[{"video": "ann.mp4", "capture": {"size": 9}}]', "column 'capture' holds an object"),
     ):
         path.write_text(content)
-        with pytest.raises(UserError, match=words):
-            read_table(path)
+        refuses(words, read_table, path)
     table.write_bytes("name,video\nJosé,ann.mp4\n".encode("latin-1"))
-    with pytest.raises(UserError, match="save it as UTF-8"):
-        read_table(table)
+    refuses("save it as UTF-8", read_table, table)
 
 
 def test_options_of_create_count_for_all_rows_and_a_cell_goes_first(table: Path, tmp_path: Path):

@@ -1,7 +1,6 @@
 """`mien bench quality` measures no error if the tracking is the truth, and the right amount if it is not.
 
-Known lags, losses of amplitude and jitter are found.
-"""
+Known lags, losses of amplitude and jitter are found."""
 
 from dataclasses import replace
 from typing import get_args

@@ -19,6 +19,7 @@ from capture_helpers import (
 from mien.capture import CaptureSettings, capture_video, capture_video_parts, process, read_capture
 from mien.capture.video import write_video
 from mien.errors import UserError
+from refusals import refuses
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +66,7 @@ def test_a_damaged_capture_is_captured_again(face_clip, tmp_path, capsys):
     before = tree_bytes(tmp_path)
     file = tmp_path / "wandering/capture/frames/0/000003.png"
     file.write_bytes(file.read_bytes()[:-30])
-    with pytest.raises(UserError, match="`mien capture`"):
-        read_capture(tmp_path / "wandering" / "capture")
+    refuses("`mien capture`", read_capture, tmp_path / "wandering" / "capture")
     (mended,) = capture_video_parts(face_clip, tmp_path, settings)
     assert f"{file}: " in (said := capsys.readouterr().err)
     assert "it is captured again" in said
@@ -95,8 +95,7 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
     calls = interrupt_at(2, monkeypatch, process.PartProcessor, "process")
     with pytest.raises(KeyboardInterrupt):
         capture_video(face_clip, out, settings)
-    with pytest.raises(UserError, match="no capture there"):
-        read_capture(out)
+    refuses("no capture there", read_capture, out)
     capture_video(face_clip, out, settings)
     assert [start for _, start, *_ in calls] == [0, 3, 3]
     assert tree_bytes(out) == tree_bytes(tmp_path / "straight" / "capture")
@@ -117,11 +116,9 @@ def test_folder_of_images_in_natural_order(test_data, tmp_path):
     np.testing.assert_allclose(capture.timestamps, [0, 0.1, 0.2])
     assert capture.images.shape[2:4] == (128, 128)  # not enlarged
     cv2.imwrite(str(folder / "3.png"), face[:100])
-    with pytest.raises(UserError, match="3.png: is 128x100"):
-        capture_video(folder, tmp_path / "other")
+    refuses("3.png: is 128x100", capture_video, folder, tmp_path / "other")
     (folder / "3.png").write_bytes(b"no image")
-    with pytest.raises(UserError, match="3.png: cannot be read as an image"):
-        capture_video(folder, tmp_path / "other")
+    refuses("3.png: cannot be read as an image", capture_video, folder, tmp_path / "other")
 
 
 @pytest.mark.parametrize(("turn", "lies"), [(90, "on its side"), (180, "upside down"), (270, "on its side")])
@@ -148,9 +145,8 @@ def test_nobody_there_is_said_and_why(tmp_path):
         (128, 5, "no face found in any of its 5 frames"),
     ):
         write_video(path, [np.full((120, 160, 3), level, np.uint8)] * frames, 25)
-        with pytest.raises(UserError, match=remedy) as error:
-            capture_video(path, tmp_path / "capture")
-        assert str(path) in str(error.value)
+        error = refuses(remedy, capture_video, path, tmp_path / "capture")
+        assert str(path) in error
         assert not (tmp_path / "capture").exists()
 
 
@@ -170,9 +166,7 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
         (face_clip, "out", CaptureSettings(start=0.08, end=0.04), "--capture.end 0.04: give a time after"),
         (face_clip, "out", CaptureSettings(stride=0), "--capture.stride 0: give 1 for every frame"),
     ):  # fmt: skip
-        with pytest.raises(UserError, match=message) as error:
-            capture_video(tmp_path / source, tmp_path / out, settings)
-        assert "\n" not in str(error.value)
+        refuses(message, capture_video, tmp_path / source, tmp_path / out, settings)
 
 
 @pytest.mark.unchecked

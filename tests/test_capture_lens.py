@@ -24,6 +24,7 @@ from mien.cli import main
 from mien.commands.stages import import_footage
 from mien.errors import UserError
 from mien.render.camera_paths import read_cameras
+from refusals import refuses
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = Camera(
@@ -121,9 +122,7 @@ def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> No
     ({"distortion": [0.1, 0, 0, 0], "model": "OPENCV_FISHEYE"}, "model describes a lens"),
 ])  # fmt: skip
 def test_other_descriptions_are_refused(tmp_path: Path, change: dict, message: str) -> None:
-    with pytest.raises(UserError, match=message) as error:
-        read_calibration(write_rig(tmp_path / "rig.json", {**ENTRY, **change}))
-    assert "\n" not in str(error.value)
+    refuses(message, read_calibration, write_rig(tmp_path / "rig.json", {**ENTRY, **change}))
 
 
 def test_distortion_of_all_cameras_and_of_camera_paths_is_refused(tmp_path: Path) -> None:
@@ -188,8 +187,7 @@ def test_pictures_and_plates_are_corrected_and_mattes_are_not(tmp_path: Path) ->
 ])  # fmt: skip
 def test_other_matrices_are_refused(tmp_path: Path, given: object, told: str) -> None:
     rig = write_rig(tmp_path / "rig.json", {**SMALL, "color_correction": given})
-    with pytest.raises(UserError, match=rf"camera 0 \(a\): color_correction.* {told}"):
-        read_calibration(rig)
+    refuses(rf"camera 0 \(a\): color_correction.* {told}", read_calibration, rig)
 
 
 def test_the_option_leaves_colors_as_filmed(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -18,6 +18,7 @@ from mien.capture.tone import srgb_signal
 from mien.capture.video import read_lazily, write_video
 from mien.errors import UserError
 from mien.storage import write_arrays
+from refusals import refuses
 
 
 def boxed(center_x: float, center_y: float, side: float, width: int, height: int) -> np.ndarray:
@@ -107,10 +108,8 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
     assert capture.valid[:, 0].tolist() == [True, False, True]
     assert (capture.mattes == matte).all()
     (mattes / "2.png").unlink()
-    with pytest.raises(UserError, match="has 2 mattes, .* has 3 frames"):
-        capture_video_parts(clip, tmp_path / "other", settings)
-    with pytest.raises(UserError, match=r"expected \[4, 478, 2\]"):
-        read_landmarks(tmp_path / "points.csv", 4)
+    refuses("has 2 mattes, .* has 3 frames", capture_video_parts, clip, tmp_path / "other", settings)
+    refuses(r"expected \[4, 478, 2\]", read_landmarks, tmp_path / "points.csv", 4)
     cv2.imwrite(str(tmp_path / "plate.png"), matte[:100])
     with pytest.raises(UserError, match="plate.png: is 160x100, but the video's pictures are 160x160"):
         capture_video_parts(clip, tmp_path / "other", CaptureSettings(clean_plate=tmp_path / "plate.png"))
@@ -138,8 +137,7 @@ def test_mattes_may_be_a_video(test_data, tmp_path):
         (320, 4, "has 4 mattes, .* has 5 frames"),
     ):
         write_video(mattes, [np.zeros((side, side, 3), np.uint8)] * count, 25.0)
-        with pytest.raises(UserError, match=refusal):
-            capture_video_parts(clip, tmp_path / "other", settings)
+        refuses(refusal, capture_video_parts, clip, tmp_path / "other", settings)
 
 
 @pytest.mark.unchecked

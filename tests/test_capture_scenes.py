@@ -1,7 +1,6 @@
 """Videos with cuts or several people are divided into parts, and each face is followed by itself.
 
-Drawn people stand in front of plain walls, so that the true landmarks are known.
-"""
+Drawn people stand in front of plain walls, so that the true landmarks are known."""
 
 import re
 from collections.abc import Callable

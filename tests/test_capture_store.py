@@ -28,6 +28,7 @@ from mien.capture.frame_files import FrameLayout
 from mien.capture.room import capture_bytes, check_room
 from mien.cli import main
 from mien.errors import UserError
+from refusals import refuses
 
 
 @pytest.fixture
@@ -118,13 +119,10 @@ def test_every_damage_is_named(stored, tmp_path):
         path = tmp_path / str(index) / "capture"
         shutil.copytree(stored, path)
         damage(path)
-        with pytest.raises(UserError, match=message) as error:
-            read_capture(path)
-        assert str(path) in str(error.value), message
-        assert "`mien capture`" in str(error.value), message
-        assert "\n" not in str(error.value), message
-    with pytest.raises(UserError, match="no capture there"):
-        read_capture(tmp_path / "nowhere")
+        error = refuses(message, read_capture, path)
+        assert str(path) in error, message
+        assert "`mien capture`" in error, message
+    refuses("no capture there", read_capture, tmp_path / "nowhere")
 
 
 def test_only_captures_are_replaced(stored, tmp_path):
@@ -137,8 +135,7 @@ def test_only_captures_are_replaced(stored, tmp_path):
     for place, refusal in (
         (chapter.parent, "not part of a capture"), (chapter, "is a file"), (chapter / "below", "cannot be written")
     ):  # fmt: skip
-        with pytest.raises(UserError, match=refusal):
-            write_capture(place, replacement)
+        refuses(refusal, write_capture, place, replacement)
     assert chapter.read_text() == "do not delete"
 
 
@@ -147,8 +144,7 @@ def test_interrupted_writing_leaves_the_old_capture(stored, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("mien.capture.frame_files.encode_picture", full_disk)
-    with pytest.raises(UserError, match="No space left"):
-        write_capture(stored, random_capture(seed=1))
+    refuses("No space left", write_capture, stored, random_capture(seed=1))
     monkeypatch.undo()
     assert_same_capture(random_capture(), read_capture(stored))
 
@@ -177,8 +173,7 @@ def test_the_estimate_is_above_what_noise_without_pngs_takes(tmp_path: Path, mon
     leave(monkeypatch, capture_bytes(layout) - 10**6)
     with (cache / "hole.u8").open("wb") as file:
         file.truncate(10**8)
-    with pytest.raises(UserError, match="left"):
-        check_room(layout, "s", out)
+    refuses("left", check_room, layout, "s", out)
     (cache / "frames.u8").write_bytes(bytes(range(256)) * 8000)
     check_room(layout, "s", out)
 

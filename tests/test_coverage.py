@@ -10,7 +10,6 @@ import torch
 from known import known
 from mien.avatar import METHODS, Avatar, Photometric, Progress, SurfacePrior
 from mien.avatar.density import GradientDensity
-from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.render import rasterize
@@ -23,6 +22,7 @@ from mien.training.footage.frames import training_frames
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
+from refusals import refuses
 from sh_colors import rgb_from_sh
 from toy_scene import surface_of, toy_face, toy_sequence
 
@@ -273,8 +273,7 @@ def test_damaged_coverage_is_named(toy: Toy, tmp_path: Path) -> None:
     write_coverage(tmp_path, found)
     assert torch.equal(known(read_coverage(tmp_path, toy[0])).colors, found.colors)
     write_coverage(tmp_path, replace(found, seen=found.seen + 1))
-    with pytest.raises(UserError, match=FILE):
-        read_coverage(tmp_path, toy[0])
+    refuses(FILE, read_coverage, tmp_path, toy[0])
 
 
 def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.synthetic.detector_calibration import Sightings, fit_response
 from mien.rotation import matrix_from_axis_angle
@@ -16,6 +15,7 @@ from mien.tracking.landmarks.detector_response import unknown_response
 from mien.tracking.landmarks.shared_fit import fit_shared
 from mien.tracking.landmarks.term import move_subject, unknown_subject
 from mien.tracking.settings import TrackingSettings
+from refusals import refuses
 from small_face_model import make_small_face_model
 from tracking_case import still_camera
 
@@ -77,8 +77,7 @@ def test_the_response_is_found_from_sightings():
     left = found.by_person.flatten(1).T - basis @ (basis.T @ found.by_person.flatten(1).T)
     assert left.norm() < 0.2 * found.by_person.norm(), "the same components, in some mixture"
     assert found.rest_sigma < 0.0004
-    with pytest.raises(UserError, match="draw more"):
-        fit_response(_people(_some_response(2), 4))
+    refuses("draw more", fit_response, _people(_some_response(2), 4))
 
 
 def test_derivatives_by_the_person_match_finite_differences():

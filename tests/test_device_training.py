@@ -1,8 +1,7 @@
 """Training works without the native core: on a GPU if there is one, and with the same code in PyTorch on the CPU.
 
 Tensors that are not float32 on a CPU use the plain PyTorch twins of all native operations, and the reference rasterizer
-instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels.
-"""
+instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -22,7 +21,6 @@ from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render
 from mien.devices import choose_device, like_on
-from mien.errors import UserError
 from mien.face import FaceModel
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
@@ -34,6 +32,7 @@ from mien.training.trainer import TrainingData, start, step
 from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.hair_surface import HairSurface
 from plain_settings import plain_config, plain_run
+from refusals import refuses
 from shared_things import toy_workspace
 from toy_scene import toy_sequence
 from train_toy import silence, stopped_at
@@ -94,8 +93,7 @@ def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, capsys
     needs = "needs a CUDA GPU and gsplat.*uv pip install"
     for gsplat, words in ((None, needs), (object(), "torch .*nvidia-smi")):
         monkeypatch.setattr(mien.devices, "find_spec", lambda name, gsplat=gsplat: gsplat)
-        with pytest.raises(UserError, match=f"--device cuda: {words}"):
-            choose_device("cuda")
+        refuses(f"--device cuda: {words}", choose_device, "cuda")
     assert choose_device("auto").type == choose_device("cpu").type == "cpu"
     assert "using the processor" in capsys.readouterr().err
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)

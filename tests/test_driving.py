@@ -33,6 +33,7 @@ from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import Tracking
 from mien.workspace import Workspace
 from recordings import LAYOUTS, row, write_csv
+from refusals import refuses
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model, toy_sequence
 from toy_workspace import write_sequence, write_toy_workspace
@@ -56,8 +57,7 @@ def test_driving_an_avatar_with_itself_changes_nothing() -> None:
     torch.testing.assert_close(free.expression, avatar.expression + face.expression - neutral.expression)
     torch.testing.assert_close(bounded.expression, free.expression.clamp(0, 1))
     few = _face(3, expressions=5)
-    with pytest.raises(UserError, match="different face models"):
-        drive(few, neutral_of(few), avatar)
+    refuses("different face models", drive, few, neutral_of(few), avatar)
     # The face at rest ignores talking and a bad frame.
     talking, rest = _face(100), torch.tensor([0.3, 0.0, 0.0, 0.1, 0.0, 0.0])
     talking.expression[40:60] = rest
@@ -152,8 +152,7 @@ def test_one_part_of_a_video_can_be_chosen(video: Path, tmp_path: Path) -> None:
         assert shown == [10 * number for number in expected]
         # All parts share one neutral face, with the head where it mostly is.
         assert float(driver.at_rest.head_rotation[0, 0]) == pytest.approx(0.02)
-    with pytest.raises(UserError, match="no sequence 'clip-3'; there are: clip-1, clip-10, clip-2"):
-        open_driver(video, "clip-3", toy_face_model())
+    refuses("no sequence 'clip-3'; there are: clip-1, clip-10, clip-2", open_driver, video, "clip-3", toy_face_model())
     write_toy_workspace(tmp_path / "w")
     run_driving_stage(tmp_path / "w/runs/toy", video, tmp_path / "driven.mp4")
     assert probe_video(tmp_path / "driven.mp4").frames == len(numbers)
@@ -168,10 +167,8 @@ def test_the_rate_of_a_csv_can_be_given(tmp_path: Path) -> None:
         assert driver.fps == pytest.approx(expected)
         assert len(driver.face) == 4
     for by, fps in ((take, -1.0), (take, float("nan")), (tmp_path, 25.0)):
-        with pytest.raises(UserError, match="--fps"):
-            open_driver(by, None, model, fps)
-    with pytest.raises(UserError, match=r"--sequence a: .*a\.csv has no sequences"):
-        open_driver(take, "a", model)
+        refuses("--fps", open_driver, by, None, model, fps)
+    refuses(r"--sequence a: .*a\.csv has no sequences", open_driver, take, "a", model)
 
 
 PERFORMERS = [name for pair in PAIRS for name in pair]

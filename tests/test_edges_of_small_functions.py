@@ -26,6 +26,7 @@ from mien.ranges import Range
 from mien.render.camera_paths import sway
 from mien.tracking.fitting.views import Views
 from mien.tracking.scoring import cut_matte
+from refusals import refuses
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera, toy_face
 
@@ -74,8 +75,7 @@ def test_numbers_of_faces_and_face_models_have_limits_on_either_side() -> None:
         face = with_expression(rest, model, (f"{name}={value}",))
         found = face.expression[:, 0] if name == "move0" else face.joints[:, model.free_joint_names.index("neck"), 0]
         assert found.tolist() == [value] * 2
-        with pytest.raises(UserError, match=f"--set {name}={beyond}: {name} goes from"):
-            with_expression(rest, model, (f"{name}={beyond}",))
+        refuses(f"--set {name}={beyond}: {name} goes from", with_expression, rest, model, (f"{name}={beyond}",))
 
 
 def test_an_archive_may_have_a_comment(tmp_path: Path) -> None:
@@ -146,8 +146,7 @@ def test_places_that_can_and_cannot_be_written(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["there.png"]
     os.mkfifo(tmp_path / "pipe")
     for odd in (tmp_path / "pipe", Path("/dev/null")):
-        with pytest.raises(UserError, match="not an ordinary file"):
-            check_writable(odd)
+        refuses("not an ordinary file", check_writable, odd)
     assert (tmp_path / "there.png").read_bytes() == b"old"
     longest = tmp_path / ("n" * 250 + ".bin")
     check_writable(longest)

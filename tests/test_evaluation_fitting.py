@@ -31,11 +31,9 @@ def astray(experiment: Experiment) -> Experiment:
     """Return the experiment with face parameters that are a little wrong."""
     (face,) = experiment.faces
     wrong = replace(
-        face,
-        expression=(face.expression + 0.1).clamp(0, 1),
-        head_rotation=face.head_rotation + 0.02,
+        face, expression=(face.expression + 0.1).clamp(0, 1), head_rotation=face.head_rotation + 0.02,
         head_translation=face.head_translation + torch.tensor([0.004, -0.004, 0.0]),
-    )
+    )  # fmt: skip
     return replace(experiment, faces=(wrong,), face_source="corrected")
 
 

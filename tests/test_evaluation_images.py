@@ -11,13 +11,13 @@ import torch
 from evaluation_case import make_experiment, write_run, write_sequence
 from mien.capture.video import write_video
 from mien.cli import main
-from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate
 from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import ScoreSettings
 from mien.storage import read_json
 from plain_settings import plain_run
+from refusals import refuses
 
 pytestmark = pytest.mark.unchecked
 PLAIN = ScoreSettings(perceptual=False)
@@ -97,30 +97,24 @@ def test_crops_beside_the_truth_are_found(folders: ImageFolders) -> None:
         ({name: (99, 4, 20, 20) for name in "abc"}, "is outside the picture"),
     ):
         write_crops(path, crops)
-        with pytest.raises(UserError, match=words):
-            score_folders(folders, PLAIN)
+        refuses(words, score_folders, folders, PLAIN)
     path.write_text('{"format": "mien.crops", "version": 1, "crops": {"a": [1, 2, 3]}}')
-    with pytest.raises(UserError, match="'a' has no box"):
-        read_crops(path)
+    refuses("'a' has no box", read_crops, path)
 
 
 def test_names_and_sizes_that_do_not_match(folders: ImageFolders, tmp_path: Path) -> None:
     (folders.images / "b.png").rename(folders.images / "z.png")
-    with pytest.raises(UserError, match=r"lacks 1 of the 3 pictures.*\(b; it has a, c, z\)"):
-        score_folders(folders, PLAIN)
+    refuses(r"lacks 1 of the 3 pictures.*\(b; it has a, c, z\)", score_folders, folders, PLAIN)
     write_pictures(folders.images, "b", size=(20, 20))
-    with pytest.raises(UserError, match="b has 20x20 pixels, and its truth has 36x40"):
-        score_folders(folders, PLAIN)
+    refuses("b has 20x20 pixels, and its truth has 36x40", score_folders, folders, PLAIN)
 
 
 def test_damaged_pictures_are_named(folders: ImageFolders) -> None:
     path = folders.images / "b.png"
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(UserError, match=r"b\.png: is not a complete picture"):
-        score_folders(folders, PLAIN)
+    refuses(r"b\.png: is not a complete picture", score_folders, folders, PLAIN)
     cv2.imwrite(str(path), np.zeros((40, 36, 3), np.uint16))
-    with pytest.raises(UserError, match="8 bits"):
-        score_folders(folders, PLAIN)
+    refuses("8 bits", score_folders, folders, PLAIN)
 
 
 def test_videos_are_matched_by_order(folders: ImageFolders, tmp_path: Path) -> None:
@@ -132,8 +126,7 @@ def test_videos_are_matched_by_order(folders: ImageFolders, tmp_path: Path) -> N
     assert scores["psnr"] > 40
     assert score_folders(ImageFolders(folders.truth, tmp_path / "mine.mp4"), PLAIN)["psnr"] > 40
     (folders.truth / "c.png").unlink()
-    with pytest.raises(UserError, match=r"has 3 pictures, .* has 2"):
-        score_folders(ImageFolders(tmp_path / "mine.mp4", folders.truth), PLAIN)
+    refuses(r"has 3 pictures, .* has 2", score_folders, ImageFolders(tmp_path / "mine.mp4", folders.truth), PLAIN)
 
 
 def test_command(folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

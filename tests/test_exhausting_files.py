@@ -1,7 +1,6 @@
 """Files that would take gigabytes or minutes, hold huge numbers, or were findings of the fuzzers: refused in one line.
 
-Each is refused before memory is taken, and the line names the file.
-"""
+Each is refused before memory is taken, and the line names the file."""
 
 import io
 import json
@@ -45,6 +44,7 @@ from mien.picture_files import decode_png, png_fits
 from mien.runtime.checks import check
 from mien.training import train
 from recordings import row, write_csv, write_json
+from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 from test_glb_avatar import rewritten, written
 from test_splat_files import needs_usd, some
@@ -237,8 +237,7 @@ def test_huge_numbers_lines_and_gaps_of_recordings(tmp_path: Path, monkeypatch: 
 def test_pictures_that_are_too_few_or_not_whole(tmp_path: Path) -> None:
     path = tmp_path / "0.png"
     assert cv2.imwrite(str(path), np.zeros((8, 8), np.uint8))
-    with pytest.raises(UserError, match="ends before its frame 1"):
-        GivenMattes(tmp_path, (8, 8)).matte(1, whole_picture(8, 8, 8))
+    refuses("ends before its frame 1", GivenMattes(tmp_path, (8, 8)).matte, 1, whole_picture(8, 8, 8))
     data = path.read_bytes()
     assert png_fits(data)
     assert png_fits(data + b"whatever other programs add")
@@ -246,8 +245,7 @@ def test_pictures_that_are_too_few_or_not_whole(tmp_path: Path) -> None:
     assert not png_fits(data[:chunk] + b"\xff\xff\xff\xf0" + data[chunk + 4 :]), "a decoder would allocate 4 GB"
     assert not png_fits(data[:-12])
     path.write_bytes(b"\x89PNG\r\n\x1a\nIEND\xaeB`\x82")
-    with pytest.raises(UserError, match=r"0\.png: damaged"):
-        decode_png(path, (8, 8), "capture again")
+    refuses(r"0\.png: damaged", decode_png, path, (8, 8), "capture again")
 
 
 def test_faces_of_another_type_or_size_are_named(tmp_path: Path) -> None:
@@ -259,16 +257,14 @@ def test_faces_of_another_type_or_size_are_named(tmp_path: Path) -> None:
         drive(replace(face, joints=face.joints[:, :0]), face, face, who="take.csv")
     tracking = replace(sequence.tracking, face=replace(face, identity=torch.zeros(0)))
     other = replace(sequence, tracking=tracking, folder=tmp_path / "clip")
-    with pytest.raises(UserError, match=r"clip: identity is \[0\]"):
-        train([other], model, train_toy.CONFIG, train_toy.SETTINGS, tmp_path / "run")
+    refuses(r"clip: identity is \[0\]", train, [other], model, train_toy.CONFIG, train_toy.SETTINGS, tmp_path / "run")
 
 
 def test_triangles_that_face_nowhere(tmp_path: Path) -> None:
     arrays = tiny_flame()
     turned: dict[str, Any] = {**arrays, "f": arrays["f"][:, ::-1]}
     np.savez(tmp_path / "tiny.npz", **turned)
-    with pytest.raises(UserError, match=r"tiny\.npz: 'f' has no triangle that faces outwards"):
-        read_flame(tmp_path / "tiny.npz")
+    refuses(r"tiny\.npz: 'f' has no triangle that faces outwards", read_flame, tmp_path / "tiny.npz")
 
 
 def test_a_prim_of_usd_without_a_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -286,8 +282,7 @@ def test_a_prim_of_usd_without_a_name(monkeypatch: pytest.MonkeyPatch, tmp_path:
             pytest.fail("USD would end the process here")
 
     monkeypatch.setattr(Sdf.Layer, "FindOrOpen", lambda path: Damaged())
-    with pytest.raises(UserError, match="is damaged, or not a USD file"):
-        read_usd(tmp_path / "head.usda")
+    refuses("is damaged, or not a USD file", read_usd, tmp_path / "head.usda")
 
 
 # Matrices, which hold a rotation and a translation. `fuzzing.values` has those of cameras -----------------------------
@@ -317,16 +312,13 @@ def test_bad_matrices_and_numbers_of_ply_files(tmp_path: Path, monkeypatch: pyte
         assert told in str(rigid_fault(matrix))
         own = " ".join(str(value) for value in matrix.flatten()).encode()
         path.write_bytes(head + words + own + b"\n" + rest)
-        with pytest.raises(UserError, match="has a damaged frame comment"):
-            read_ply(path)
+        refuses("has a damaged frame comment", read_ply, path)
     start = whole.index(b"end_header\n") + len(b"end_header\n")
     path.write_bytes(whole[:start] + np.float32(np.nan).tobytes() + whole[start + 4 :])
-    with pytest.raises(UserError, match="position of some Gaussians is NaN"):
-        read_ply(path)
+    refuses("position of some Gaussians is NaN", read_ply, path)
     path.write_bytes(head + words + line + b"\n" + rest)
     monkeypatch.setattr(ply, "MAX_GAUSSIANS", 4)
-    with pytest.raises(UserError, match=r"a\.ply: has 5 Gaussians, more than 4"):
-        read_ply(path)
+    refuses(r"a\.ply: has 5 Gaussians, more than 4", read_ply, path)
 
 
 def test_poses_of_mien_files() -> None:
@@ -338,5 +330,4 @@ def test_poses_of_mien_files() -> None:
     posed = replace(baked, still_weights=weights, still_pose=TURN.astype(np.float32))
     check(replace(portable, baked=posed), "a.mien")
     for matrix, words in BAD[:4]:
-        with pytest.raises(UserError, match=words):
-            check(replace(portable, baked=replace(posed, still_pose=matrix.astype(np.float32))), "a.mien")
+        refuses(words, check, replace(portable, baked=replace(posed, still_pose=matrix.astype(np.float32))), "a.mien")

@@ -30,6 +30,7 @@ from mien.render import rasterize
 from mien.render.camera_paths import read_cameras, sway, write_cameras
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.storage import write_json
+from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 from test_splat_files import some
 from web_case import drawn_head
@@ -82,8 +83,7 @@ def test_a_local_frame_is_kept_and_gaussians_in_world_look_the_same(tmp_path: Pa
 
 def test_damaged_and_foreign_files(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    with pytest.raises(UserError, match="cannot be read"):
-        read_ply(path)
+    refuses("cannot be read", read_ply, path)
     write_ply(path, some(5, 1))
     content = path.read_bytes()
     for message, damaged in {
@@ -95,8 +95,7 @@ def test_damaged_and_foreign_files(tmp_path: Path) -> None:
         "first element": content.replace(b"element vertex", b"element corner"),
     }.items():
         path.write_bytes(damaged)
-        with pytest.raises(UserError, match=message):
-            read_ply(path)
+        refuses(message, read_ply, path)
 
 
 def test_a_ply_can_have_coefficients_of_degree_3(tmp_path: Path, made_once: MadeOnce) -> None:
@@ -116,8 +115,7 @@ def test_a_ply_can_have_coefficients_of_degree_3(tmp_path: Path, made_once: Made
     assert torch.equal(found.sh[:, : own.sh.shape[1]], own.sh)
     assert not found.sh[:, own.sh.shape[1] :].any()
     assert torch.equal(found.means, own.means)
-    with pytest.raises(UserError, match="--sh 1: the avatar has degree 3; give 3 or more, or leave it out"):
-        write_ply(tmp_path / "b.ply", found, 1)
+    refuses("--sh 1: the avatar has degree 3; give 3 or more, or leave it out", write_ply, tmp_path / "b.ply", found, 1)
 
 
 def test_options_that_do_not_fit_the_output_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -197,13 +195,11 @@ def test_films_and_sequences(tmp_path: Path) -> None:
         ("a.mp4", 5, True, "cannot be transparent"), ("file/a.mp4", 5, False, "not a folder|Not a directory"),
         ("file", 5, False, "is a file"), ("frames", 2, False, "longer sequence"),
     ):  # fmt: skip
-        with pytest.raises(UserError, match=part):
-            plan_output(tmp_path / name, frames, transparent)
+        refuses(part, plan_output, tmp_path / name, frames, transparent)
     assert PictureOptions(background="#3060a0").color() == (48 / 255, 96 / 255, 160 / 255)
     wrong = (PictureOptions(size=8193), PictureOptions(width=5), PictureOptions(background="pinkish"))
     for options, part in zip(wrong, ("--size 8193", "--width 5", "--background pinkish"), strict=True):
-        with pytest.raises(UserError, match=part):
-            options.plan(tmp_path / "a.png", 1)
+        refuses(part, options.plan, tmp_path / "a.png", 1)
 
 
 def test_one_view_over_every_background() -> None:
@@ -241,8 +237,7 @@ def test_cameras_sway_around_the_head_and_come_from_a_file(tmp_path: Path) -> No
         ([entry | {"K": "big"}], "needs K"),
     ):  # fmt: skip
         write_json(path, "mien.cameras", 1, {"cameras": wrong})
-        with pytest.raises(UserError, match=part):
-            read_cameras(path)
+        refuses(part, read_cameras, path)
 
 
 # As other programs write them -----------------------------------------------------------------------------------------
@@ -292,8 +287,7 @@ def test_other_plys_are_named(tmp_path: Path, types: dict[str, str], extra: str,
     path = tmp_path / "a.ply"
     written(path, types, "\n")
     path.write_bytes(path.read_bytes().replace(b"end_header", extra.encode() + b"end_header", 1))
-    with pytest.raises(UserError, match=words):
-        read_ply(path)
+    refuses(words, read_ply, path)
 
 
 def spz(path: Path, version: int, quats: list[tuple[int, int, int]], degree: int = 0) -> Path:

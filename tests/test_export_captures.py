@@ -1,9 +1,9 @@
 """Captures in the layouts of INSTA, IMavatar, NeRFace and NeRSemble: importers read them, and others' formulas fit.
 
 The importers are tested with writers that call nothing of mien. What they do not read, or read in several ways, is
-checked by matrices from the description of the layout.
-"""
+checked by matrices from the description of the layout."""
 
+from known import known
 import json
 import re
 from dataclasses import replace
@@ -34,6 +34,7 @@ from mien.face import FaceModel
 from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import Sequence, TrainSettings
 from mien.workspace import Workspace
+from refusals import refuses
 from toy_workspace import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
@@ -98,8 +99,7 @@ def filmed(sequence: Sequence, scene: Scene, **settings: Any) -> Filmed:
 
 
 def export(folder: Path, name: str, content: Filmed) -> Path:
-    layout = find_layout(name)
-    assert layout is not None
+    layout = known(find_layout(name))
     write_layout(folder, content, layout)
     return folder
 
@@ -141,8 +141,7 @@ def test_insta_by_its_own_conventions(folders: dict[str, Path], single: Sequence
         drawn = projected(scene.vertices(timestep), UNEQUAL, *view(0))
         assert np.abs(projected(mesh, K, seen[:3, :3], seen[:3, 3]) - drawn).max() < PIXELS
         np.testing.assert_allclose(np.loadtxt(folder / frame["exp_path"]), scene.expr[timestep], rtol=0, atol=1e-6)
-        depth = cv2.imread(str(folder / frame["depth_path"]), cv2.IMREAD_UNCHANGED)
-        assert depth is not None
+        depth = known(cv2.imread(str(folder / frame["depth_path"]), cv2.IMREAD_UNCHANGED))
         assert ((depth > 0) == (single.capture.mattes[timestep, 0] > 127)).mean() > 0.99
         assert 0.7e3 < np.median(depth[depth > 0]) < 1.2e3
 
@@ -167,8 +166,7 @@ def test_nerface_is_read_back(folders: dict[str, Path], single: Sequence, scene:
     train, test = read(folders["nerface"], "nerface", scene.model)
     fx, fy, *_ = json.loads((folders["nerface"] / "transforms_test.json").read_text())["intrinsics"]
     assert fx < 0 < fy, "the world is mirrored, as in the published files"
-    unit = re.search(r"unit is (\S+) m\.", (folders["nerface"] / "README.txt").read_text())
-    assert unit is not None
+    unit = known(re.search(r"unit is (\S+) m\.", (folders["nerface"] / "README.txt").read_text()))
     for sequence, timesteps in ((train, TRAINED), (test, HELD_OUT)):
         over_white = np.stack([filmed(single, scene).over_white(timestep) for timestep in timesteps])
         assert np.array_equal(sequence.capture.images[:, 0], over_white)
@@ -243,8 +241,7 @@ def test_what_a_layout_cannot_hold_is_told_or_refused(
             export(tmp_path / name, name, filmed(both, scene))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").touch()
-    with pytest.raises(UserError, match="full: is not empty"):
-        export(tmp_path / "full", "nersemble", filmed(both, scene))
+    refuses("full: is not empty", export, tmp_path / "full", "nersemble", filmed(both, scene))
     with pytest.raises(UserError, match=f"{tmp_path}/my_images: programs of this layout replace every 'image'"):
         export(tmp_path / "my_images", "imavatar", filmed(single, scene))
     other = replace(single, tracking=replace(single.tracking, face=anny.neutral(TIMESTEPS), face_model="anny"))
@@ -297,5 +294,4 @@ def test_a_run_decides_what_is_held_out(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path)
     assert settings_of(workspace, "clip", "toy", None).split == "tail"
     assert settings_of(workspace, "clip", None, None).split == "blocks"
-    with pytest.raises(UserError, match="--run toy: was trained on clip, not on other"):
-        settings_of(workspace, "other", "toy", None)
+    refuses("--run toy: was trained on clip, not on other", settings_of, workspace, "other", "toy", None)

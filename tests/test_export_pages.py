@@ -19,6 +19,7 @@ from mien.export import find_webcam_files, unpacked, write_packed, write_page
 from mien.export.rows import with_rows
 from mien.export.thinning import contributions
 from mien.export.webcam import OWN, POLICY, VERSION, own_model
+from refusals import refuses
 from test_runtime import SIZE, new_avatar
 from toy_scene import toy_camera
 from web_case import WEB, drawn_head, faces_of, tasks_vision
@@ -205,5 +206,4 @@ def test_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
     cut = compressed.read_bytes()[:-100]
     for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
         compressed.write_bytes(content)
-        with pytest.raises(UserError, match=told):
-            find_webcam_files()
+        refuses(told, find_webcam_files)

@@ -1,7 +1,6 @@
 """Changes of gaussian_avatars with the expression: their formulas, and what of them is kept and refused.
 
-`test_methods` trains, resumes, saves and bakes them, as the configuration `gaussian_avatars-features`.
-"""
+`test_methods` trains, resumes, saves and bakes them, as the configuration `gaussian_avatars-features`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,12 +21,12 @@ from mien.avatar.ops.expression_changes import (
     within_seen,
 )
 from mien.avatar.ops.feature_network import Layers, feature_network_reference
-from mien.errors import UserError
 from mien.export.packed import pack
 from mien.gaussians import Gaussians
 from mien.runtime.checks import baked_fault
 from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
+from refusals import refuses
 from toy_scene import random, runtime_face, toy_camera, toy_face, toy_face_model
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
@@ -154,12 +153,9 @@ def test_impossible_changes_are_refused() -> None:
 
 RANK, DIRECTIONS = 3, 5
 CONFIG = plain_gaussian_avatars(
-    expression_rank=RANK,
-    expression_color_rate=Rate(0.0),
-    appearance="features",
-    appearance_directions=DIRECTIONS,
+    expression_rank=RANK, expression_color_rate=Rate(0.0), appearance="features", appearance_directions=DIRECTIONS,
     appearance_features=6,
-)
+)  # fmt: skip
 
 
 def with_features(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True) -> GaussianAvatars:
@@ -249,6 +245,5 @@ def test_features_have_their_own_number_of_activations() -> None:
     alone.check()
     assert baked_fault(with_features(alone).bake()) is None
     few = replace(GaussianAvatarsConfig(), appearance_directions=3, expression_rank=4)
-    with pytest.raises(UserError, match=r"--method.appearance-directions 3: .* --method.expression-rank 4"):
-        few.check()
+    refuses(r"--method.appearance-directions 3: .* --method.expression-rank 4", few.check)
     replace(few, appearance_directions=4).check()

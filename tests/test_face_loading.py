@@ -10,8 +10,8 @@ import torch
 
 from mien.cli import main
 from mien.commands.stages import driving
-from mien.errors import UserError
 from mien.face import available_face_models, cache, listing, load_face_model, loading
+from refusals import refuses
 from small_face_model import make_small_face_model
 
 
@@ -81,11 +81,9 @@ def test_damaged_or_old_files_are_baked_again(bakes, tmp_path):
 
 
 def test_unknown_names_and_landmarks_of_another_mesh_are_refused():
-    with pytest.raises(UserError, match="'flame2077'.*anny"):
-        load_face_model("flame2077")
+    refuses("'flame2077'.*anny", load_face_model, "flame2077")
     model = make_small_face_model()
-    with pytest.raises(UserError, match="another mesh"):
-        loading.read_landmarks("anny", model)
+    refuses("another mesh", loading.read_landmarks, "anny", model)
     # Hashes tell what changed.
     moved = replace(model, template=model.template + 1e-6)
     assert moved.content_hash != model.content_hash

@@ -1,8 +1,7 @@
 """One suite over face models of all schemas: mesh, regions, joints, landmarks, tracking, driving.
 
 `make test` tracks the model in FLAME's schema alone: its bases have no names, its jaw is a joint, and its landmarks and
-regions are embedded, so that most can break there. `test_user_face_models` trains an avatar on it.
-"""
+regions are embedded, so that most can break there. `test_user_face_models` trains an avatar on it."""
 
 from dataclasses import replace
 
@@ -115,8 +114,7 @@ def _moving(model: FaceModel, timesteps: int) -> FaceParams:
 def _as_detected(model: FaceModel, face: FaceParams) -> Tensor:
     """Landmarks in the world, with the offsets that the detector was measured to have on this model.
 
-    Only anny was measured. Its fit takes these offsets away, so landmarks without them are not those of a picture.
-    """
+    Only anny was measured. Its fit takes these offsets away, so landmarks without them are not those of a picture."""
     response, double = read_response(model, TrackingSettings.bias_sigma), face.to(torch.zeros((), dtype=torch.float64))
     offsets = response.mean + response.of_turns(double.head_rotation)
     offsets = offsets + torch.einsum("be,elc->blc", double.expression, response.by_expression)
@@ -181,8 +179,7 @@ def test_names_of_arkit_drive_it(model: FaceModel) -> None:
 RETURNED = {"anny": 1e-5, "flame": 1.4e-4, "gnm": 7.2e-5, "ict": 1e-5}
 """Largest mean distance of a landmark in metres, after a face of anny went to a model and back.
 
-It is 1.5 times what was measured; anny and ICT have all of ARKit's names, so that nothing is lost there.
-"""
+It is 1.5 times what was measured; anny and ICT have all of ARKit's names, so that nothing is lost there."""
 
 
 def test_there_and_back(model: FaceModel, anny: FaceModel) -> None:

@@ -1,5 +1,6 @@
 """Driving keeps softly to the expressions and poses that training saw; sheets show every expression or side once."""
 
+from known import known
 import math
 import shutil
 from dataclasses import replace
@@ -26,7 +27,6 @@ from mien.commands.stages.sheets import (
 )
 from mien.commands.stages.viewing import viewed_file
 from mien.driving import ARKIT_NAMES, keep_to_filmed
-from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.render.camera_paths import orbit
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -35,6 +35,7 @@ from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_in
 from mien.training import read_coverage
 from mien.training.footage.filmed import FILE
 from plain_settings import plain_config
+from refusals import refuses
 from shared_things import toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera, toy_face_model, toy_sequence
@@ -147,10 +148,8 @@ def test_it_is_kept_in_a_run_and_in_a_mien_file_and_checked(tmp_path: Path) -> N
     ):
         avatar.filmed = replace(good, **change)
         write_avatar(tmp_path / "a", avatar)
-        with pytest.raises(UserError, match="filmed"):
-            load_avatar(tmp_path / "a")
-        with pytest.raises(UserError, match="filmed"):
-            _written(tmp_path / "a.mien", avatar)
+        refuses("filmed", load_avatar, tmp_path / "a")
+        refuses("filmed", _written, tmp_path / "a.mien", avatar)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -163,8 +162,7 @@ def test_a_confidence_that_does_not_fit_is_refused(method: str, tmp_path: Path) 
     wrong = [good + 1, good - 1, good * np.float32("nan")]
     wrong += [good[1:], good[:0]] if isinstance(found.baked, runtime.MeshBound) else []
     for confidence in wrong:
-        with pytest.raises(UserError, match="confidence"):
-            _written(tmp_path / "a.mien", avatar, confidence=confidence)
+        refuses("confidence", _written, tmp_path / "a.mien", avatar, confidence=confidence)
 
 
 @pytest.mark.unchecked
@@ -172,13 +170,11 @@ def test_a_mien_file_and_the_viewer_have_the_confidence_of_the_run(tmp_path: Pat
     monkeypatch.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, steps=2, unseen="filled"))
     write_toy_workspace(tmp_path / "me")
     run, path = tmp_path / "me" / "runs" / "toy", tmp_path / "me.mien"
-    covered = read_coverage(run, load_avatar(run).face_model)
-    assert covered is not None
+    covered = known(read_coverage(run, load_avatar(run).face_model))
     assert covered.seen.unique().numel() > 1
     export = ["export", str(tmp_path / "me"), "--out", str(path)]
     assert main(export) == 0
-    mesh = viewed_file(path).mesh
-    assert mesh is not None
+    mesh = known(viewed_file(path).mesh)
     for found in (runtime.read_portable(path).confidence, mesh.seen):
         assert found is not None
         assert np.array_equal(found, covered.seen.numpy())
@@ -256,8 +252,7 @@ def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:
 def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: list[str]) -> None:
     out = tmp_path / "sheet.png"
     assert main(["render", str(workspace), "--out", str(out), "--size", "32", "--sheet", *options]) == 0
-    sheet = cv2.imread(str(out))
-    assert sheet is not None
+    sheet = known(cv2.imread(str(out)))
     assert sheet.shape[1] % 36 == 32 or sheet.shape[1] == 32
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
 

@@ -21,6 +21,7 @@ from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.fitting import layout_of
 from mien.tracking.landmarks import with_regions_by_landmarks
 from mien.tracking.pixels import texture_space
+from refusals import refuses
 
 arrays = pytest.fixture(scope="module")(lambda: flame_like.flame_like(load_face_model("anny")))
 
@@ -41,8 +42,7 @@ def model(arrays, tmp_path_factory) -> FaceModel:
 def test_poses_as_flame_does(moved, arrays, model):
     """Jaw, eyes and correctives move as in FLAME; its root and neck become the head's pose and an inverse neck.
 
-    Joints follow identity, expression and offsets.
-    """
+    Joints follow identity, expression and offsets."""
     random = np.random.default_rng(1)
     columns = arrays["shapedirs"].shape[2]
     identities = len(model.identity_basis)
@@ -85,8 +85,7 @@ def test_it_is_posed_by_number_on_the_command_line(model):
         ("expression_003=4", "-3 to 3; 1 is strong"),
         ("smile=1", "there are: expression_000.*joint angles in radians: neck_x"),
     ):
-        with pytest.raises(UserError, match=message):
-            with_expression(face, model, (assignment,))
+        refuses(message, with_expression, face, model, (assignment,))
     # The fit knows jaw and scale: FLAME's coefficients are standard deviations, ARKit's 0..1.
     layout = layout_of(model)
     column = layout.names.index("jaw_x")
@@ -123,8 +122,7 @@ def test_a_pickle_runs_nothing(arrays, model, tmp_path):
     assert not harmed.exists()
     for damage in (b"", b"no pickle", b"\x80\x02]q\x00.", b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f."):
         path.write_bytes(damage)
-        with pytest.raises(UserError, match=r"model\.pkl"):
-            read_flame(path)
+        refuses(r"model\.pkl", read_flame, path)
     # Like FLAME's own files, in chumpy's variables, it gives what an archive gives.
     own = flame_face_model(read_flame(flame_like.write_pickle(path, arrays)), "head")
     assert own.content_hash == model.content_hash
@@ -161,8 +159,7 @@ def test_what_is_missing_is_named_with_a_remedy(arrays, tmp_path):
     with pytest.raises(UserError, match="landmark embedding: give the model itself"):
         read_flame(flame_like.write_npz(path, {"lmk_face_idx": np.zeros(3)}))
     np.savez(path, allow_pickle=True, weights=np.array([_Harm(os.system, "true")], dtype=object))
-    with pytest.raises(UserError, match=r"numpy\.savez"):
-        read_flame(path)
+    refuses(r"numpy\.savez", read_flame, path)
 
 
 # Regions and texture --------------------------------------------------------------------------------------------------

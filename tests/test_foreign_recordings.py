@@ -16,11 +16,11 @@ from mien.commands.stages import driving
 from mien.commands.stages.batch_table import read_table
 from mien.datasets.live_link_face_take import LIVE_LINK_FACE
 from mien.driving import ARKIT_NAMES, Motion, read_blendshape_json, read_live_link_face
-from mien.errors import UserError
 from mien.evaluation.image_source import open_pictures
 from mien.inside import listed
 from mien.workspace import Workspace
 from recordings import live_link_face, row, write_csv, write_json
+from refusals import refuses
 from toy_scene import toy_camera
 
 
@@ -50,14 +50,12 @@ def turning(*yaws: float, times: str = "0:00:00:{:02d}.0", **others: float) -> l
     (turning(0, JawOpen=-45), "line 2: JawOpen is -45; .* correct or delete the row"),
 ])  # fmt: skip
 def test_units_that_cannot_be_are_named(tmp_path: Path, rows: list[list[str]], words: str) -> None:
-    with pytest.raises(UserError, match=words):
-        read_live_link_face(write_csv(tmp_path / "a.csv", *rows))
+    refuses(words, read_live_link_face, write_csv(tmp_path / "a.csv", *rows))
 
 
 def test_percent_in_json_are_named(tmp_path: Path) -> None:
     path = write_json(tmp_path / "a.json", [{"time": 0, "blendshapes": {"jawOpen": 60}}])
-    with pytest.raises(UserError, match="frame 0: jawOpen is 60; coefficients go from 0 to 1; divide percent by 100"):
-        read_blendshape_json(path)
+    refuses("frame 0: jawOpen is 60; coefficients go from 0 to 1; divide percent by 100", read_blendshape_json, path)
 
 
 def test_fast_heads_that_are_no_degrees_are_read(tmp_path: Path) -> None:
@@ -92,8 +90,7 @@ def test_encodings_of_spreadsheets_are_read(tmp_path: Path, encoding: str) -> No
     assert jaw(read_live_link_face(take)) == [0, 0.1]
     assert jaw(read_blendshape_json(plain)) == [0.5]
     take.write_bytes("Timecode,JawOpen,\u00fc\n0:0:0:0,1\n".encode("latin-1"))
-    with pytest.raises(UserError, match="it is no text in UTF-8 or UTF-16; save it as UTF-8"):
-        read_live_link_face(take)
+    refuses("it is no text in UTF-8 or UTF-16; save it as UTF-8", read_live_link_face, take)
 
 
 def table(path: Path, *columns: str, rows: int = 4, step: float = 1.0) -> Path:
@@ -127,8 +124,7 @@ def test_tables_of_other_programs(tmp_path: Path, key: str, step: float, fps: fl
     (("time", "jawOpen"), float("nan"), "line 2: time is 'nan'; give every row a number"),
 ])  # fmt: skip
 def test_tables_that_cannot_be_read(tmp_path: Path, columns: tuple[str, ...], step: float, words: str) -> None:
-    with pytest.raises(UserError, match=words):
-        read_live_link_face(table(tmp_path / "a.csv", *columns, step=step))
+    refuses(words, read_live_link_face, table(tmp_path / "a.csv", *columns, step=step))
 
 
 def piece(first: Any, *rows: Any) -> dict[str, Any]:
@@ -154,8 +150,7 @@ def test_pieces_of_azures_speech(tmp_path: Path) -> None:
         ({"FrameIndex": 0, "BlendShapes": 3}, 'piece 0: "BlendShapes" is not a list of frames'),
         ([piece(0, rows[0]), piece(9, ["wide", *rows[0][1:]])], "frame 1: eyeBlinkLeft is 'wide'"),
     ):
-        with pytest.raises(UserError, match=words):
-            read_blendshape_json(write_json(path, content))
+        refuses(words, read_blendshape_json, write_json(path, content))
 
 
 # Folders that users give ----------------------------------------------------------------------------------------------
@@ -236,8 +231,6 @@ def test_a_calibration_of_nerfstudio_is_named(tmp_path: Path, name: str) -> None
     path = tmp_path / name
     frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
     path.write_text(json.dumps({"fl_x": 500, "frames": frames}))
-    with pytest.raises(UserError, match=rf"{name}: is nerfstudio's transforms.json, .*matrices are camera-to-world"):
-        read_calibration(path)
+    refuses(rf"{name}: is nerfstudio's transforms.json, .*matrices are camera-to-world", read_calibration, path)
     path.write_text(json.dumps({"frames": 3}))
-    with pytest.raises(UserError, match="write it as described in docs/using.md"):
-        read_calibration(path)
+    refuses("write it as described in docs/using.md", read_calibration, path)

@@ -10,7 +10,6 @@ import torch
 from evaluation_case import make_experiment
 from mien.avatar.schedules import Progress
 from mien.capture import FrameQuality
-from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.fitting import fit_face
 from mien.evaluation.metrics import l1
@@ -22,6 +21,7 @@ from mien.training.alignment import align_faces
 from mien.training.footage import training_frames
 from mien.training.frame_gains import FrameGains, frame_gains_part, lit
 from plain_settings import plain_gaussian_avatars, plain_run
+from refusals import refuses
 from toy_scene import toy_sequence
 
 SETTINGS = plain_run(steps=8, split="blocks", checkpoint_every=4, record_every=1)
@@ -127,8 +127,7 @@ def test_a_run_in_steady_light_keeps_no_gains(tmp_path: Path):
 @pytest.mark.parametrize("found", [torch.ones(4, 3), torch.full((5, 3), float("nan")), torch.zeros(5, 3)])
 def test_damaged_gains_are_refused(found: torch.Tensor, tmp_path: Path):
     write_tensors(tmp_path / "gains.safetensors", {"gains": found})
-    with pytest.raises(UserError, match=r"gains.safetensors: does not hold gains of 5 timesteps"):
-        read_gains(tmp_path, [5])
+    refuses(r"gains.safetensors: does not hold gains of 5 timesteps", read_gains, tmp_path, [5])
 
 
 def relit(experiment: Experiment, gain: torch.Tensor) -> Experiment:

@@ -1,7 +1,6 @@
 """`mien import` on the command line: what is told before, the workspace, its split, and mistakes.
 
-An exported GaussianAvatars folder is imported, posed at any frame, rendered, and exported again.
-"""
+An exported GaussianAvatars folder is imported, posed at any frame, rendered, and exported again."""
 
 import json
 import shutil

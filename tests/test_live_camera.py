@@ -1,8 +1,8 @@
 """Names of cameras for `mien drive --by`, and cameras that are read while they film.
 
-Time is an argument: the clock of a `Stage` goes on when a test lets it.
-"""
+Time is an argument: the clock of a `Stage` goes on when a test lets it."""
 
+from known import known
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +14,7 @@ from mien.capture.camera_names import CameraName, camera_named, is_camera
 from mien.capture.live_camera import LiveCamera
 from mien.capture.video import write_video
 from mien.errors import UserError
+from refusals import refuses
 from web_case import until
 
 FPS = 25
@@ -50,15 +51,13 @@ def test_names_of_cameras_and_devices_that_are_none(tmp_path: Path, monkeypatch:
     assert camera_named("camera:rtsp://host/live", None).is_stream
     assert camera_named("camera:0", "avfoundation") == CameraName("0", "avfoundation")
     for name, words in (("", "names no camera"), (str(tmp_path), "is a folder")):
-        with pytest.raises(UserError, match=words):
-            camera_named(f"camera:{name}", None)
+        refuses(words, camera_named, f"camera:{name}", None)
     with pytest.raises(UserError, match="there is no /dev/video99.*camera:clip.mp4|there is no /dev/video99.*these"):
         camera_named("camera:/dev/video99", "v4l2")
     monkeypatch.setattr("mien.capture.camera_names.DEVICES", tmp_path)
     for name in ("video10", "video2", "null"):
         (tmp_path / name).touch()
-    with pytest.raises(UserError, match=f"one of these: {tmp_path}/video2, {tmp_path}/video10$"):
-        camera_named("camera:/dev/video99", "v4l2")
+    refuses(f"one of these: {tmp_path}/video2, {tmp_path}/video10$", camera_named, "camera:/dev/video99", "v4l2")
     no_camera = LiveCamera(camera_named("camera:/dev/null", "v4l2"), False)
     with pytest.raises(UserError, match="camera:/dev/null: cannot be opened"), no_camera:
         pass
@@ -69,13 +68,11 @@ def test_a_file_plays_in_real_time_and_only_the_newest_frame_is_kept(tmp_path: P
     write_video(clip, [np.zeros((32, 48, 3), np.uint8)] * every, FPS)
     with stage.camera(camera_named(f"camera:{clip}", None), again=False) as camera:
         camera.start()
-        first = camera.newest(-1, 120.0)
-        assert first is not None
+        first = known(camera.newest(-1, 120.0))
         assert (first.number, first.seconds, first.picture.shape) == (0, 100.0, (32, 48, 3))
         stage.turns.release(10)
         until(lambda: camera.frames == 11)
-        later = camera.newest(first.number, 120.0)
-        assert later is not None
+        later = known(camera.newest(first.number, 120.0))
         assert (later.number, later.seconds) == (10, pytest.approx(100.4))
         assert camera.newest(later.number + 1000, 0.01) is None
         assert stage.waits[1:] == pytest.approx([1 / FPS] * 10)

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from mien.capture.source import read_image
 from mien.cli import main
-from mien.errors import UserError
 from mien.evaluation import scoring
 from mien.evaluation.metrics import MAX_PSNR, Windows, crop_to, l1, psnr, ssim, ssim_map
 from mien.perceptual import distance, load_perceptual, lpips, weights
 from mien.storage import read_json
+from refusals import refuses
 
 
 def test_psnr_and_l1() -> None:
@@ -80,8 +80,7 @@ def test_first_map_in_one_step_equals_two(size: tuple[int, int]) -> None:
 def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path) -> None:
     load_perceptual.cache_clear()
     monkeypatch.setattr(weights, "PACKAGE", "no_such_package_here")
-    with pytest.raises(UserError, match="pip install stlpips-pytorch"):
-        load_perceptual()
+    refuses("pip install stlpips-pytorch", load_perceptual)
     path = tmp_path / "alex.pth"
     monkeypatch.setattr(weights, "weights_path", lambda backbone: path)
     for content, words in (
@@ -91,8 +90,7 @@ def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path
             path.write_bytes(content)
         elif content is not None:
             torch.save(content, path)
-        with pytest.raises(UserError, match=words):
-            load_perceptual()
+        refuses(words, load_perceptual)
     load_perceptual.cache_clear()
 
 
@@ -164,15 +162,11 @@ def test_it_is_the_published_formula(backbone: str, tmp_path: Path) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     files = _write(tmp_path, "lpips-alex")
-    with pytest.raises(UserError, match="is not the file that torchvision published; give alexnet"):
-        lpips.load_lpips(files[0])
-    with pytest.raises(UserError, match="no such file"):
-        lpips.load_lpips(tmp_path / "none.pth")
-    with pytest.raises(UserError, match=r"damaged weights .*lpips==0\.1\.4"):
-        lpips.build_lpips(lpips.TRUNKS[1], *files)
+    refuses("is not the file that torchvision published; give alexnet", lpips.load_lpips, files[0])
+    refuses("no such file", lpips.load_lpips, tmp_path / "none.pth")
+    refuses(r"damaged weights .*lpips==0\.1\.4", lpips.build_lpips, lpips.TRUNKS[1], *files)
     (tmp_path / "bad.pth").write_bytes(b"no weights")
-    with pytest.raises(UserError, match="damaged weights"):
-        lpips.build_lpips(lpips.TRUNKS[0], tmp_path / "bad.pth", files[1])
+    refuses("damaged weights", lpips.build_lpips, lpips.TRUNKS[0], tmp_path / "bad.pth", files[1])
 
 
 def test_the_command_shows_it_beside_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -26,6 +26,7 @@ from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.named import LOOK_ANGLE
 from recordings import COLUMNS, LAYOUTS, STILL, Frames, row, write_csv, write_json
+from refusals import refuses
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model
 
@@ -93,13 +94,11 @@ def test_bad_csv_files(tmp_path: Path) -> None:
         ([[*good[:1], "0"]], COLUMNS, "no row has a face"),
         ([], COLUMNS, "has no frames"),
     ):
-        with pytest.raises(UserError, match=part):
-            read_live_link_face(write_csv(tmp_path / "a.csv", *rows, columns=columns))
+        refuses(part, read_live_link_face, write_csv(tmp_path / "a.csv", *rows, columns=columns))
     with pytest.raises(UserError, match="--fps 24: its frame numbers go up to 29; give more"):
         read_rows(tmp_path, *rows_of("1:0:0:28", "1:0:0:29", "1:0:1:0"), fps=24.0)
     (tmp_path / "b.csv").write_bytes(b"\x81\xff" * 9)
-    with pytest.raises(UserError, match="cannot be read as csv"):
-        read_live_link_face(tmp_path / "b.csv")
+    refuses("cannot be read as csv", read_live_link_face, tmp_path / "b.csv")
 
 
 def test_face_landmarker_results(tmp_path: Path) -> None:
@@ -141,11 +140,9 @@ def test_bad_json_files(tmp_path: Path) -> None:
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}], "layout of a FaceLandmarker"),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
     ):
-        with pytest.raises(UserError, match=part):
-            read_blendshape_json(write_json(tmp_path / "a.json", content))
+        refuses(part, read_blendshape_json, write_json(tmp_path / "a.json", content))
     (tmp_path / "a.json").write_text("[{")
-    with pytest.raises(UserError, match="cannot be read as json"):
-        read_blendshape_json(tmp_path / "a.json")
+    refuses("cannot be read as json", read_blendshape_json, tmp_path / "a.json")
 
 
 def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
@@ -166,8 +163,7 @@ def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     # The head's rest pose is where it mostly is: the middle of the turn, which goes to the right.
     torch.testing.assert_close(driven.head_rotation[:, 1], torch.tensor([0.1, 0, -0.1]), atol=1e-5, rtol=0)
     torch.testing.assert_close(driven.head_translation, rest.head_translation.expand(3, -1))
-    with pytest.raises(UserError, match="no landmarks, by which expressions are transferred"):
-        face_of_motion(motion, toy_face_model())
+    refuses("no landmarks, by which expressions are transferred", face_of_motion, motion, toy_face_model())
 
 
 def test_eyes_that_look_up_and_down_stay_open() -> None:
@@ -262,8 +258,7 @@ def test_units_of_times(tmp_path: Path) -> None:
         ("time", 33.3, 'goes up by 33.3 a frame, so a frame would last 33 s; .*or call milliseconds "timestamp_ms"'),
         ("time", 1e-4, "10,000 frames in a second; give seconds"),
     ):
-        with pytest.raises(UserError, match=words):
-            read(key, step)
+        refuses(words, read, key, step)
 
 
 def test_missing_times_are_said(tmp_path: Path) -> None:
@@ -296,8 +291,7 @@ def test_names_that_are_not_arkits(tmp_path: Path) -> None:
         ({"names": 3, "frames": [{}]}, "has no list of names"),
         ({"weightMat": []}, '"weightMat" is not a list of frames'),
     ):
-        with pytest.raises(UserError, match=words):
-            read_blendshape_json(write_json(path, content))
+        refuses(words, read_blendshape_json, write_json(path, content))
     turned = {**good, "frames": [{"weights": [0.5], "time": 0.0, "rotation": [0.1, 0.2, 0.3]}]}
     assert '"rotation" is not read' in read_blendshape_json(write_json(path, turned)).notes[0]
 
@@ -325,5 +319,4 @@ def test_transposed_matrices_are_read_and_others_refused(tmp_path: Path) -> None
     wrong = moved.copy()
     wrong[3] = [0, 0, 0.5, 1]
     for second in (wrong, moved.T):
-        with pytest.raises(UserError, match="frame 1: the last row of its facial .* not 0 0 0 1"):
-            read(moved, second)
+        refuses("frame 1: the last row of its facial .* not 0 0 0 1", read, moved, second)

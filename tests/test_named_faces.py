@@ -12,12 +12,12 @@ import torch
 from mien import runtime
 from mien.commands.expression import tell_of_unfilmed, with_expression
 from mien.commands.stages.sheets import expression_tiles
-from mien.errors import UserError
 from mien.export.glb import morph_targets
 from mien.face import FaceModel, load_face_model
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.named import EYES, GAZE_NAMES, MOST_UP, presets, presets_for
 from mien.runtime.posing import rig_points
+from refusals import refuses
 from toy_scene import toy_camera
 from web_case import WEB, drawn_head, node
 
@@ -59,8 +59,7 @@ def test_the_table_has_only_names_of_arkit_and_shares(model: FaceModel) -> None:
         ("smlie=0.4", "no expression 'smlie'; did you mean smile"),
         ("tongueOut=0.4", "tongueOut does nothing with the face model 'anny'"),
     ):
-        with pytest.raises(UserError, match=message):
-            with_expression(model.neutral(), model, (assignment,))
+        refuses(message, with_expression, model.neutral(), model, (assignment,))
 
 
 def test_the_command_line_and_the_runtime_agree(portable: runtime.PortableAvatar, model: FaceModel) -> None:

@@ -20,6 +20,7 @@ from mien.tracking import write_tracking
 from mien.training import PRESETS, TrainSettings, doubly_held_out, split_by_name, with_benchmark_split, with_named_split
 from mien.training.footage.frames import training_frames
 from mien.training.footage.named_split import SEQUENCES, driving_sequences
+from refusals import refuses
 from toy_scene import toy_face_model, toy_sequence, toy_tracking
 
 FOLDERS = (
@@ -86,10 +87,8 @@ def test_either_name_of_the_camera_is_held_out() -> None:
         (replace(NAMED, held_out_sequences=("EMO-1",)), None, "--hold-out EMO-1: --split gaussian-avatars decides"),
         (replace(NAMED, held_out_cameras=("03",)), None, "--hold-out-cameras 03: --split gaussian-avatars decides"),
     ):
-        with pytest.raises(UserError, match=words):
-            with_named_split(settings, split, cameras)
-    with pytest.raises(UserError, match="are not filled in"):
-        training_frames([toy_sequence(6, 16)[1]], NAMED)
+        refuses(words, with_named_split, settings, split, cameras)
+    refuses("are not filled in", training_frames, [toy_sequence(6, 16)[1]], NAMED)
 
 
 def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:

@@ -13,9 +13,9 @@ import pytest
 from damage import edit_json
 from mien.cli import main
 from mien.commands.stages.names import doubled_videos
-from mien.errors import UserError
 from mien.tracking import TrackingSettings, read_tracking
 from mien.workspace import Workspace
+from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 
 SKEWED = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": (2 * np.eye(4)).tolist(), "width": 32, "height": 32}
@@ -142,8 +142,7 @@ def test_an_avatar_of_another_version_says_train_again(place: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("value", ["-3", "0", "nan", "inf"])
 def test_a_senseless_focal_length_is_refused_before_work(value: str) -> None:
-    with pytest.raises(UserError, match=f"--tracking.focal {value}: give the focal length in pixels"):
-        TrackingSettings(focal=float(value)).check()
+    refuses(f"--tracking.focal {value}: give the focal length in pixels", TrackingSettings(focal=float(value)).check)
 
 
 def test_unfinished_and_compared_runs_do_not_ask_for_a_name(tmp_path: Path) -> None:
@@ -151,8 +150,7 @@ def test_unfinished_and_compared_runs_do_not_ask_for_a_name(tmp_path: Path) -> N
     for run in ("good", "stopped"):
         workspace.run_dir(run).mkdir(parents=True)
         (workspace.run_dir(run) / "config.json").touch()
-    with pytest.raises(UserError, match="has several runs"):
-        workspace.pick_run(None)
+    refuses("has several runs", workspace.pick_run, None)
     (workspace.run_dir("good") / "avatar").mkdir()
     shutil.copytree(workspace.run_dir("good"), workspace.run_dir("compare-headgas-4min"))
     assert workspace.pick_run(None) == "good"

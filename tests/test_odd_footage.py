@@ -3,8 +3,7 @@
 A new kind of footage is a function that writes a small video, and a row of `ODD`. Videos that are refused are rows of
 `test_capture_from_video::test_nobody_there_is_said_and_why` and `test_bad_requests_are_refused` there.
 
-Of several streams in a file, every reader takes the one that is the video, and the user may choose another.
-"""
+Of several streams in a file, every reader takes the one that is the video, and the user may choose another."""
 
 import json
 import re

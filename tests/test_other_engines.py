@@ -126,8 +126,7 @@ def test_playcanvas_shows_the_same_head(sh: int, tmp_path: Path) -> None:
     """A drawn head, from in front, in version 4. The reader refuses version 3.
 
     The engine lets each Gaussian fade to nothing at the edge of its square, so pictures differ by more than what .spz
-    loses: 37.5 and 35.8 dB here, and 36.1 dB on a filmed head. Mirrored heads have less than 25.
-    """
+    loses: 37.5 and 35.8 dB here, and 36.1 dB on a filmed head. Mirrored heads have less than 25."""
     package("fzstd")
     bundle(WEB / "tests/playcanvas.mjs", tmp_path / "playcanvas.js", "--log-level=error")
     (tmp_path / "page.html").write_text(CANVAS)

@@ -26,6 +26,7 @@ from mien.errors import UserError
 from mien.face import Landmarks, add_face_model
 from mien.tracking import scoring_exists
 from mien.training import read_sequence
+from refusals import refuses
 from shared_things import toy_workspace
 from toy_package import blocks, entry_points, help_of, install, mien
 from toy_scene import toy_face_model, toy_sequence
@@ -297,10 +298,7 @@ def methods_are_found_by_name() -> None:
     assert (has_method("toy"), has_method("nerf")) == (True, False)
     assert method_named("toy") == Method("nowhere:Toy", "nowhere:ToyConfig")
     for part in ("config", "avatar"):
-        with pytest.raises(UserError, match="^nowhere:Toy(Config)?: cannot be imported .*; update or uninstall"):
-            getattr(method_named("toy"), part)
+        refuses("^nowhere:Toy(Config)?: cannot be imported .*; update or uninstall", getattr, method_named("toy"), part)
     assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
-    with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'twice' to mien.methods; uninstall"):
-        method_named("twice")
-    with pytest.raises(UserError, match="no method 'nerf'; give one of gaussian_avatars, .*, toy, twice, or"):
-        method_named("nerf")
+    refuses("mien-toys-. and mien-toys-. both add 'twice' to mien.methods; uninstall", method_named, "twice")
+    refuses("no method 'nerf'; give one of gaussian_avatars, .*, toy, twice, or", method_named, "nerf")

@@ -12,12 +12,12 @@ from mien.avatar import PointAvatar, PointAvatarConfig, Progress
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.point_avatar.avatar import was_drawn
 from mien.avatar.point_avatar.networks import SurfaceNet
-from mien.errors import UserError
 from mien.face import FaceParams, head_poses
 from mien.gaussians import Gaussians
 from mien.render import close_holes, rasterize
 from mien.training import PRESETS
 from plain_settings import plain_point_avatar
+from refusals import refuses
 from sh_colors import rgb_from_sh
 from toy_scene import toy_camera, toy_face, toy_face_model
 
@@ -85,8 +85,7 @@ def test_light_follows_deformed_normals_as_the_head_turns() -> None:
     avatar, still, face = new_avatar(replace(SMALL, normals="deformed")), new_avatar(), toy_face(5)[2]
     turned = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.0, 0.0]))
     assert (colors(avatar, face) - colors(avatar, turned)).abs().max() > 1e-3
-    with pytest.raises(UserError, match=r"^the setting normals deformed of point_avatar: .*export a \.ply"):
-        avatar.bake()
+    refuses(r"^the setting normals deformed of point_avatar: .*export a \.ply", avatar.bake)
     torch.testing.assert_close(colors(still, face), colors(still, turned))
     # Points on rigid bones have normals that turn with them.
     last = avatar.deformation.skinning

@@ -1,7 +1,6 @@
 """The native rasterizer agrees with the float64 reference, forward and backward, and the reference with differences.
 
-All draw the same picture as another program (gsplat).
-"""
+All draw the same picture as another program (gsplat)."""
 
 import math
 from collections.abc import Iterator

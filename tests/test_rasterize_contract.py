@@ -18,6 +18,7 @@ from mien.render.rasterize import Backend, choose_backend
 from mien.render.validation import drawable
 from rasterize_scenes import GSPLAT, Scene, random_scene
 from rasterize_scenes import rasterize_anywhere as rasterize
+from refusals import refuses
 
 BACKENDS = ["native", "reference", GSPLAT]
 
@@ -25,12 +26,10 @@ BACKENDS = ["native", "reference", GSPLAT]
 def one_gaussian(depth: float = 1.0, opacity: float = 0.8, scale: float = 0.02) -> Gaussians:
     """Return an orange ball on the optical axis."""
     return Gaussians(
-        means=torch.tensor([[0.0, 0.0, float(depth)]]),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        scales=torch.full((1, 3), scale),
-        opacities=torch.tensor([float(opacity)]),
+        means=torch.tensor([[0.0, 0.0, float(depth)]]), quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), scale), opacities=torch.tensor([float(opacity)]),
         sh=sh_from_rgb(torch.tensor([[[1.0, 0.5, 0.1]]])),
-    )
+    )  # fmt: skip
 
 
 def front_camera(width: int = 21, height: int = 15) -> Camera:
@@ -193,8 +192,7 @@ def test_a_forked_child_renders() -> None:
 
 def test_gsplat_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(UserError, match="pip install gsplat=="):
-        rasterize_in_place(one_gaussian(), front_camera(), torch.zeros(3), "gsplat")
+    refuses("pip install gsplat==", rasterize_in_place, one_gaussian(), front_camera(), torch.zeros(3), "gsplat")
 
 
 def test_more_pairs_than_can_be_counted_are_refused():

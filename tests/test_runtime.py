@@ -12,9 +12,9 @@ import torch
 
 from mien import runtime
 from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, make_portable
-from mien.errors import UserError
 from mien.runtime.posing import run_network
 from plain_settings import plain_config
+from refusals import refuses
 from toy_scene import runtime_face, toy_camera, toy_sequence
 
 SIZE = 64
@@ -91,8 +91,7 @@ def test_the_features_network_equals_its_reference_in_numpy_and_has_directions_t
         (None, "the input features, which does not fit its directions"),
     ):
         baked = replace(whole.baked, network=replace(network, along=wrong))
-        with pytest.raises(UserError, match=part):
-            runtime.write_portable(tmp_path / "a.mien", replace(whole, baked=baked))
+        refuses(part, runtime.write_portable, tmp_path / "a.mien", replace(whole, baked=baked))
 
 
 def test_files_with_other_content_are_told(tmp_path: Path) -> None:
@@ -111,14 +110,12 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
         (replace(whole, baked=replace(bound, rig=replace(bound.rig, joint_parents=(2, 0, 0)))), "before its parent"),
         (replace(whole, baked=replace(bound, rig=many)), "300 expressions and 1 free joints, more than can be posed"),
     ):
-        with pytest.raises(UserError, match=part):
-            runtime.write_portable(path, wrong)
+        refuses(part, runtime.write_portable, path, wrong)
     arrays = safetensors.numpy.load_file(path)
     for version in (0, 2, "1", None):
         safetensors.numpy.save_file(arrays, path, {"mien": json.dumps({"format": "mien.baked", "version": version})})
         told = f"version {version!r}, expected 'mien.baked' version 1; export it again with `mien export`"
-        with pytest.raises(UserError, match=re.escape(told)):
-            runtime.load(path)
+        refuses(re.escape(told), runtime.load, path)
     safetensors.numpy.save_file(arrays, path)
     (tmp_path / "b.mien").write_text("{}")
     for name, told in (
@@ -126,12 +123,10 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
         ("b.mien", r"is damaged, or not a \.mien file .*"),
         ("none.mien", "no such file"),
     ):
-        with pytest.raises(UserError, match=f"{told}; write one with `mien export"):
-            runtime.load(tmp_path / name)
+        refuses(f"{told}; write one with `mien export", runtime.load, tmp_path / name)
 
 
 def test_face_models_that_may_not_be_passed_on_are_not() -> None:
     avatar = new_avatar(DEFAULT_METHOD)
     avatar.face_model = replace(avatar.face_model, name="flame", shareable=False)
-    with pytest.raises(UserError, match="not known to allow"):
-        make_portable(avatar, toy_camera(SIZE), "toy")
+    refuses("not known to allow", make_portable, avatar, toy_camera(SIZE), "toy")

@@ -44,13 +44,11 @@ def talking_face(model: FaceModel) -> FaceParams:
     low, high = model.expression_bounds.unbind(-1)
     chance = torch.rand(still.expression.shape, generator=torch.Generator().manual_seed(1))
     return FaceParams(
-        identity=0.5 * noise(2, *still.identity.shape),
-        expression=low + 0.4 * chance * (high - low),
-        joints=0.1 * noise(3, *still.joints.shape),
-        head_rotation=0.2 * noise(4, TIMESTEPS, 3),
+        identity=0.5 * noise(2, *still.identity.shape), expression=low + 0.4 * chance * (high - low),
+        joints=0.1 * noise(3, *still.joints.shape), head_rotation=0.2 * noise(4, TIMESTEPS, 3),
         head_translation=torch.tensor([0.0, 0.0, -0.5]) + 0.01 * noise(5, TIMESTEPS, 3),
         vertex_offsets=0.001 * noise(6, *model.template.shape),
-    )
+    )  # fmt: skip
 
 
 def grown_avatar(model: FaceModel, face: FaceParams, config: MethodConfig, count: int) -> Avatar:

@@ -15,6 +15,7 @@ from mien.commands.settings_options import leaves
 from mien.errors import UserError
 from mien.ranges import FRACTION, NotBelow, Range, check_ranges
 from mien.training import MAIN_SETTINGS, PRESETS, TrainSettings, train, trainer
+from refusals import refuses
 from test_settings import help_of, with_file
 from toy_scene import toy_sequence
 
@@ -85,8 +86,7 @@ def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
         (train_toy.CONFIG, TrainSettings(record_every=0), "--training.record-every 0"),
         (replace(train_toy.CONFIG, sh_degree=4), train_toy.SETTINGS, "--method.sh-degree 4"),
     ):
-        with pytest.raises(UserError, match=words):
-            train([sequence], face_model, config, settings, tmp_path / "run")
+        refuses(words, train, [sequence], face_model, config, settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

@@ -1,5 +1,6 @@
 """Side views, which no camera took, and the soft cut: opacities fade towards the neck cut."""
 
+from known import known
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -92,8 +93,7 @@ def test_a_head_in_other_colors_than_the_mesh_costs_and_so_do_transparent_sides(
     other = _opaque_avatar(anny, 0.9)
     held = replace(face, head_translation=face.head_translation.clone().requires_grad_())
     _loss(views, other, held, 0).backward()
-    gradient = other.store["sh_constant"].grad
-    assert gradient is not None
+    gradient = known(other.store["sh_constant"].grad)
     assert float(gradient.abs().sum()) > 0
     assert held.head_translation.grad is None, "gradients do not reach the face"
     costs = {step: float(_loss(views, avatar, face, step).detach()) for step in (0, 4)}
@@ -115,8 +115,7 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     assert float(turned) == 0
     # The random numbers raise coefficients until the activations, 2 alike, have the length that they approach.
     assert 0 < float(raised) <= 8 * 3 * 2 * 1.1**2
-    surface = avatar.surface()
-    assert surface is not None
+    surface = known(avatar.surface())
     hair = ~views.compared[surface.triangles()]
     assert 0.1 < float(hair.float().mean()) < 0.9
     kept = torch.where(hair[:, None, None], 0.0, avatar.store["offset_basis"])

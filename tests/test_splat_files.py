@@ -26,6 +26,7 @@ from mien.export.sog import cells_of
 from mien.gaussians import Gaussians
 from mien.rotation import multiply_quaternions
 from needs import NO_PACKAGE, NO_SPLAT_TRANSFORM
+from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 from web_case import WEB, drawn_head, node
 
@@ -55,8 +56,7 @@ class Loss:
     """Largest differences that a format may make; `color` is the first SH coefficient, and `higher` are the others.
 
     By default there are none. Rotations agree to float32: their angle is the arc cosine of a number next to 1, which
-    has half of the digits.
-    """
+    has half of the digits."""
 
     meters: float = 0
     radians: float = 2e-3
@@ -175,8 +175,7 @@ def test_usd_keeps_poses_and_follows_its_schema(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "b.usda").write_text("solid cube")
     for name in ("a.usda", "b.usda", "gone.usda"):
-        with pytest.raises(UserError, match=f"{name}: is missing, damaged, or has no Gaussians"):
-            read_usd(tmp_path / name)
+        refuses(f"{name}: is missing, damaged, or has no Gaussians", read_usd, tmp_path / name)
     Usd, UsdGeom, UsdValidation, UsdVol = (
         importlib.import_module(f"pxr.{n}") for n in ("Usd", "UsdGeom", "UsdValidation", "UsdVol")
     )
@@ -202,8 +201,7 @@ def test_usd_keeps_poses_and_follows_its_schema(tmp_path: Path) -> None:
         assert ((low <= poses[1].means.numpy()) & (poses[1].means.numpy() <= high)).all()
         for time, pose in enumerate(poses):
             expect_near(read_usd(path, float(time)), pose, Loss())
-    with pytest.raises(UserError, match="has no Gaussians at time None"):
-        read_usd(tmp_path / "s.usda")
+    refuses("has no Gaussians at time None", read_usd, tmp_path / "s.usda")
 
 
 @needs_usd
@@ -211,22 +209,19 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     bad = some(5, 1)
     bad.means[3, 1] = math.nan
     for ending in (".ply", ".spz", ".sog", ".usda"):
-        with pytest.raises(UserError, match="1 of 5 Gaussians are NaN or infinite"):
-            WRITERS[ending](tmp_path / f"a{ending}", bad)
+        refuses("1 of 5 Gaussians are NaN or infinite", WRITERS[ending], tmp_path / f"a{ending}", bad)
     assert list(tmp_path.iterdir()) == []
 
 
 def expect_refused(path: Path, read: Callable[[Path], Gaussians], *cases: tuple[bytes, str]) -> None:
     for damaged, reason in cases:
         path.write_bytes(damaged)
-        with pytest.raises(UserError, match=reason):
-            read(path)
+        refuses(reason, read, path)
 
 
 def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     path, cannot, many = tmp_path / "a.spz", r"a\.spz: cannot be read as \.spz", (2**31).to_bytes(4, "little")
-    with pytest.raises(UserError, match="No such file"):
-        read_spz(path)
+    refuses("No such file", read_spz, path)
     write_spz(path, some(50, 4), version=3)
     content = path.read_bytes()
     plain = gzip.decompress(content)

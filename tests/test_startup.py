@@ -1,5 +1,6 @@
 """Nothing heavy is imported before it is needed, and the base install works without what an extra brings."""
 
+from known import known
 import importlib
 import json
 import subprocess
@@ -67,8 +68,7 @@ study make w --out a.html --side 100; study tally gone.json gone.json; demo --se
 def modules_after(lines: list[list[str]], folder: Path) -> list[tuple[int, set[str]]]:
     """Return exit code and imported modules after each of some command lines, run in turn in a new process.
 
-    Torch is imported at the end, and has to have one thread.
-    """
+    Torch is imported at the end, and has to have one thread."""
     words = [sys.executable, "-c", SCRIPT, json.dumps(lines)]
     done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=folder)
     *ended, (threads, _) = json.loads(done.stdout.splitlines()[-1])
@@ -228,8 +228,7 @@ def test_a_missing_library_of_the_system_is_named_and_what_no_extra_brings_is_a_
 @pytest.mark.parametrize("channels", [3, 4])
 def test_a_png_is_read_as_it_was_written(channels: int):
     picture = np.random.default_rng(0).integers(0, 256, (33, 47, channels), np.uint8)
-    read = cv2.imdecode(np.frombuffer(png_bytes(picture), np.uint8), cv2.IMREAD_UNCHANGED)
-    assert read is not None
+    read = known(cv2.imdecode(np.frombuffer(png_bytes(picture), np.uint8), cv2.IMREAD_UNCHANGED))
     assert (read[..., [2, 1, 0, 3][:channels]] == picture).all()
 
 
@@ -258,8 +257,7 @@ def test_a_head_that_the_filmed_frame_cuts_off_is_shown_whole(tmp_path: Path, mo
         for zoom in ([], ["--zoom", "1"]):
             line = ["render", str(file), "--out", str(tmp_path / "a.png"), "--size", "64", *zoom]
             assert main(line) == 0
-            picture = cv2.imread(str(tmp_path / "a.png"))
-            assert picture is not None
+            picture = known(cv2.imread(str(tmp_path / "a.png")))
             edges = np.concatenate([picture[0], picture[:, 0], picture[:, -1]])
             assert bool(edges.min() < 200) is (cut and bool(zoom))
             assert picture.min() < 150

@@ -1,5 +1,6 @@
 """`mien study`: a page shows runs blind and in random order, saves answers, and the tally counts them."""
 
+from known import known
 import base64
 import json
 import re
@@ -16,13 +17,13 @@ import train_toy
 from mien.avatar import METHODS
 from mien.capture.video import read_video_frames
 from mien.cli import main
-from mien.errors import UserError
 from mien.lab.analysis.study import StudySettings, read_key
 from mien.lab.analysis.study.clips import spans
 from mien.lab.analysis.study.drawing import encode
 from mien.lab.analysis.study.files import QUESTIONS, read_all_answers
 from mien.lab.analysis.study.shuffling import shuffled
 from mien.training import read_sequence, train
+from refusals import refuses
 from toy_scene import toy_face_model
 from toy_workspace import write_toy_workspace
 from web_case import browse, expect_usable, picture
@@ -57,8 +58,7 @@ def page(workspace: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def content_of(page: Path) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="study">(.*?)</script>', page.read_text())
-    assert found is not None
+    found = known(re.search(r'<script type="application/json" id="study">(.*?)</script>', page.read_text()))
     return json.loads(found[1])
 
 
@@ -122,8 +122,7 @@ def frames_of(page: Path, clip: str, folder: Path) -> np.ndarray:
 
 def head_square(path: Path) -> np.ndarray:
     """Return the square around the toy's head box, with its margin of 1 pixel, as the study scales it."""
-    picture = cv2.imread(str(path))
-    assert picture is not None
+    picture = known(cv2.imread(str(path)))
     cut = picture[3:25, 3:25, ::-1]
     return cv2.resize(np.ascontiguousarray(cut), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC).astype(np.float64)
 
@@ -137,8 +136,7 @@ def test_the_budget_is_kept(workspace: Path, tmp_path: Path, capsys: pytest.Capt
     best, small = encode(noise, 25.0, 1 << 20, "it"), encode(noise, 25.0, 30_000, "it")
     assert best.crf < small.crf
     assert len(small.data) <= 30_000
-    with pytest.raises(UserError, match="it: does not fit into the page even at the lowest quality"):
-        encode(noise, 25.0, 1_000, "it")
+    refuses("it: does not fit into the page even at the lowest quality", encode, noise, 25.0, 1_000, "it")
 
 
 def test_spans_are_cut_into_equal_parts_and_ordered_by_chance() -> None:

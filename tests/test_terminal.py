@@ -16,13 +16,13 @@ from forked import ForkServer
 from mien import progress, runtime
 from mien.cli import main
 from mien.commands.stages.expected import count_scored, expected_pieces
-from mien.errors import UserError
 from mien.overall import Overall, Piece
 from mien.progress import progress_bar, say, whole_command
 from mien.terminal import plain_name, printable, show
 from mien.threads import MAX_THREADS, asked_threads, thread_count
 from mien.tracking import TrackingSettings
 from mien.training import TrainSettings
+from refusals import refuses
 
 NASTY = "\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\udcff.mp4"
 SHOWN = r"\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\xff.mp4"
@@ -133,8 +133,7 @@ def test_a_closed_output_is_not_taken_by_the_next_file(tmp_path: Path) -> None:
 def test_threads_that_cannot_be_are_told(text: str, monkeypatch, capsys) -> None:
     monkeypatch.setenv("MIEN_THREADS", text)
     for ask in (thread_count, partial(runtime.load, Path("none.mien"))):
-        with pytest.raises(UserError, match="give a number from 1 to 1024, or unset it"):
-            ask()
+        refuses("give a number from 1 to 1024, or unset it", ask)
     assert main(["face-models"]) == 2
     told = capsys.readouterr().err
     assert told.startswith(f"mien: MIEN_THREADS={printable(text)[:40]}")

@@ -10,13 +10,13 @@ from torch import Tensor
 from known import known
 from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, move_avatar
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
-from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.mirror import triangle_geometry
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
 from mono_avatars import pictured
 from plain_settings import plain_textured_mesh
+from refusals import refuses
 from sh_colors import rgb_from_sh
 from toy_scene import toy_camera, toy_face, toy_face_model
 
@@ -185,8 +185,7 @@ def test_light_in_the_world_stays_as_the_head_turns() -> None:
             continue
         # The sheet looks along +x now, where the first channel has no lamp and the second has one.
         torch.testing.assert_close(after[..., [1, 0]], before[..., [0, 1]], atol=1e-5, rtol=0)
-        with pytest.raises(UserError, match=r"^the setting light world of textured_mesh: .*export a \.ply"):
-            avatar.bake()
+        refuses(r"^the setting light world of textured_mesh: .*export a \.ply", avatar.bake)
 
 
 @pytest.mark.parametrize("light", ["head", "world"])

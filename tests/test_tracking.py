@@ -8,7 +8,6 @@ import torch
 
 from mien.camera import look_at
 from mien.capture import Capture
-from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle, rigid_transform
 from mien.tracking import Tracking, TrackingSettings, read_tracking, residual_report, track, track_subject
@@ -17,6 +16,7 @@ from mien.tracking.fitting.shot import initial_camera
 from mien.tracking.landmarks.groups import landmark_weights
 from mien.tracking.report.overlay import frontal_camera
 from mien.tracking.settings import PaperSettings, PhotometricSettings
+from refusals import refuses
 from small_face_model import make_small_face_model
 from tracking_case import FOCAL, FPS, SIZE, capture_of, make_tracking_case, still_camera
 
@@ -135,8 +135,7 @@ def test_what_cannot_be_tracked_is_refused():
         (case.capture, model, "found in 2 frames"),
         (make_tracking_case(timesteps=4).capture, replace(model, landmarks={}), "no MediaPipe landmarks"),
     ):
-        with pytest.raises(UserError, match=reason):
-            track(capture, tracked_with)
+        refuses(reason, track, capture, tracked_with)
 
 
 def test_anny_lips_and_lids_part():

@@ -32,6 +32,7 @@ from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.neck_line import bottom_vertices, fit_neck_lines
 from mien.tracking.report.overlay import OverlayPainter
 from mien.tracking.scoring import cut_matte, head_crop
+from refusals import refuses
 from small_face_model import make_small_face_model
 from tracking_case import SIZE, capture_of, still_camera
 
@@ -234,8 +235,7 @@ def test_wrong_content(tmp_path, change, message):
     write_tensors(file, tensors)
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     edit_json(tmp_path / "tracking.json", lambda content: content.update(tensors_sha256=digest))
-    with pytest.raises(UserError, match=message):
-        read_tracking(tmp_path)
+    refuses(message, read_tracking, tmp_path)
 
 
 def _scoring(value: int = 200) -> Scoring:
@@ -273,8 +273,7 @@ def test_masks_keep_their_cut(tmp_path):
     with pytest.raises(UserError, match=r"--scoring.cut plane: .*give --scoring.cut line, or delete that folder"):
         check_scoring_cut(folder, ScoringSettings("plane"), "a1")
     edit_json(folder / "scoring.json", lambda content: content.update(cut="circle"))
-    with pytest.raises(UserError, match=r"cut 'circle' is neither plane nor line; delete the folder"):
-        read_scoring(folder)
+    refuses(r"cut 'circle' is neither plane nor line; delete the folder", read_scoring, folder)
     edit_json(folder / "scoring.json", lambda content: content.pop("cut"))
     assert read_scoring(folder).cut == "plane", "masks from before there was a choice"
 
@@ -290,6 +289,5 @@ def test_damaged_scoring(tmp_path):
         mask.unlink()
         if content:
             mask.write_bytes(content)
-        with pytest.raises(UserError, match=refusal):
-            read_scoring(tmp_path / "s")
+        refuses(refusal, read_scoring, tmp_path / "s")
         mask.touch()

@@ -37,8 +37,7 @@ LAYOUTS: dict[str, tuple[Callable[[Path, Scene], Path], str, str, int]] = {
 """Writer, method and split of each layout that has a tracking, and how many pictures the split holds out.
 
 VHAP holds out one timestep seen by two cameras, and five seen by one. The last two have coefficients without a basis,
-which suffice for HeadGaS. NeRFBlendShape's own split needs more than 500 frames.
-"""
+which suffice for HeadGaS. NeRFBlendShape's own split needs more than 500 frames."""
 MODELS = {"nerf-blendshape": "coefficients-46", "nerface": "coefficients-76"}
 """Face models of the layouts that do not have FLAME's parameters."""
 SMALL = {"gaussian_avatars": ("--steps", "30"), "headgas": ("--steps", "40", "--method.points", "400")}

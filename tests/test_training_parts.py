@@ -13,7 +13,6 @@ import train_toy
 from bounded_memory import MIB, allocating_at_most
 from mien import _native
 from mien.avatar import GaussianStore, Moments, ParameterGroup, Photometric, Progress, Rate, store_group
-from mien.errors import UserError
 from mien.render.rendering import Rendering
 from mien.training import Sequence, held_out, train
 from mien.training.adam import Adam
@@ -25,6 +24,7 @@ from mien.training.photometric import photometric_loss
 from mien.training.settings import Split
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
+from refusals import refuses
 from sh_colors import rgb_from_sh
 from toy_scene import toy_sequence
 from train_toy import stopped_at
@@ -63,8 +63,7 @@ def test_what_is_held_out_has_to_be_there() -> None:
         (plain_run(held_out_sequences=("toy",)), "leaves no sequence to train on"),
         (plain_run(held_out_cameras=("front",)), "no frame is left to train on"),
     ):
-        with pytest.raises(UserError, match=words):
-            training_frames([sequence], settings)
+        refuses(words, training_frames, [sequence], settings)
 
 
 def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:

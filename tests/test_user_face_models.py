@@ -16,7 +16,6 @@ from mien.avatar import load_avatar
 from mien.capture import Capture, write_capture
 from mien.cli import main
 from mien.commands.stages import face_models as stage
-from mien.errors import UserError
 from mien.face import FaceModel, Landmarks, available_face_models, load_face_model
 from mien.face.cache import cache_folder
 from mien.face.checks import check_face_model
@@ -26,6 +25,7 @@ from mien.storage import file_digest, write_json
 from mien.tracking import TrackingSettings, read_tracking, track
 from mien.tracking.landmarks import EmbeddingSettings, embedding
 from mien.tracking.settings import PaperSettings, PhotometricSettings
+from refusals import refuses
 
 pytestmark = pytest.mark.unchecked
 
@@ -73,8 +73,7 @@ def test_it_is_added_once_and_then_goes_by_its_name(added, capsys):
     source = cache_folder() / "face_models/added/my_head.source.json"
     write_json(source, "mien.face_model_source", 1, {"path": str(path), "sha256": file_digest(path), "recipe": 1})
     assert "my_head" not in [info.name for info in available_face_models()]
-    with pytest.raises(UserError, match="there is no face model 'my_head'"):
-        load_face_model("my_head")
+    refuses("there is no face model 'my_head'", load_face_model, "my_head")
     for _ in range(2):
         assert main(["face-models", "--add", str(path)]) == 0
         assert "my_head" in [info.name for info in available_face_models()]
@@ -94,10 +93,8 @@ def test_choices_that_lead_nowhere(added, tmp_path, capsys):
         (own, "one of mien's own"),
         (bare, "has no 'v_template'"),
     ):
-        with pytest.raises(UserError, match=message):
-            stage.face_model_of(str(choice))
-    with pytest.raises(UserError, match="letters, digits"):
-        stage.add_face_model_file(path, "../up")
+        refuses(message, stage.face_model_of, str(choice))
+    refuses("letters, digits", stage.add_face_model_file, path, "../up")
     assert main(["face-models", "--name", "x"]) != 0
     assert "--add FILE" in capsys.readouterr().err
     assert main(["face-models", "--add", str(tmp_path)]) == 2

@@ -1,5 +1,6 @@
 """The viewer's server: real connections, two clients, clients that vanish, the door, and a real browser."""
 
+from known import known
 import asyncio
 import contextlib
 import gzip
@@ -79,8 +80,7 @@ class Client:
         while True:
             for message in await self.told():
                 if message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None:
-                    picture = cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), cv2.IMREAD_COLOR)
-                    assert picture is not None
+                    picture = known(cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), cv2.IMREAD_COLOR))
                     if len(picture) == height:
                         return picture
 
@@ -339,6 +339,5 @@ def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
 
 
 def read(path: Path) -> np.ndarray:
-    picture = cv2.imread(str(path))
-    assert picture is not None
+    picture = known(cv2.imread(str(path)))
     return picture

@@ -1,5 +1,6 @@
 """The viewer's door, loop and worker, and a viewer that shows an avatar while it trains."""
 
+from known import known
 import os
 import signal
 import subprocess
@@ -22,11 +23,11 @@ from mien import runtime
 from mien.avatar import make_portable
 from mien.commands.stages import live_view, viewing
 from mien.commands.stages.live_view import LiveView
-from mien.errors import UserError
 from mien.training import train
 from mien.viewer import Door, DrawingLoop, Session, View, is_loopback
 from mien.viewer.loop import STILL_SECONDS
 from mien.viewer.work import Worker
+from refusals import refuses
 from test_runtime import new_avatar
 from toy_scene import toy_camera, toy_sequence
 from web_case import until
@@ -39,8 +40,7 @@ def test_only_loopback_goes_without_a_token_and_strange_hosts_and_origins_are_re
     for host in ("0.0.0.0", "example.org", "192.168.1.2"):
         assert not is_loopback(host), host
         assert Door.of(host).token is not None
-        with pytest.raises(UserError, match=f"--no-token: other machines can reach --host {host}"):
-            Door.of(host, with_token=False)
+        refuses(f"--no-token: other machines can reach --host {host}", Door.of, host, with_token=False)
     door = Door.of("127.0.0.1", with_token=False)
     assert door.answer("/", {"Host": "127.0.0.1:80"}) is None
     assert door.answer("/", {"Host": "localhost:80", "Origin": "http://localhost:80"}) is None
@@ -57,14 +57,12 @@ def test_a_proxy_with_a_path_of_its_own() -> None:
     """The redirect and the cookie stay below that path, and other hosts are fine with the token."""
     door = Door.of("127.0.0.1")
     there = {"Host": "me.example", "Origin": "https://me.example"}
-    first = door.answer(f"/?token={door.token}", there)
-    assert first is not None
+    first = known(door.answer(f"/?token={door.token}", there))
     onward = urljoin("https://me.example/mien/?token=x", first.headers["Location"])
     assert onward == "https://me.example/mien/index.html"
     assert "Path" not in first.headers["Set-Cookie"]
     assert door.answer("/index.html", {**there, "Cookie": door.cookie}) is None
-    lost = door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie})
-    assert lost is not None
+    lost = known(door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie}))
     assert "page of https://me.example, and its Host is 127.0.0.1:80" in lost.body
     assert "let the proxy pass on the browser's Host header" in lost.body
 
@@ -75,8 +73,7 @@ def test_a_token_becomes_a_cookie() -> None:
     assert len(door.token) >= 20
     assert door.token != Door.of("0.0.0.0").token
     here = {"Host": "me.example:80"}
-    first = door.answer(f"/?token={door.token}", here)
-    assert first is not None
+    first = known(door.answer(f"/?token={door.token}", here))
     assert (first.status, first.headers["Location"]) == (303, "index.html")
     cookie = first.headers["Set-Cookie"]
     given, *attributes = cookie.split("; ")

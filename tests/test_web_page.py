@@ -9,9 +9,9 @@ import pytest
 
 from mien import runtime
 from mien.cli import main
-from mien.errors import UserError
 from mien.export import Described, write_page
 from mien.export.page_head import POSTER, check_address
+from refusals import refuses
 from web_case import browse, drawn_head, expect_usable, faces_of, motion_of
 
 portable = pytest.fixture(scope="module")(lambda: drawn_head(300, rank=2))
@@ -197,8 +197,7 @@ def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.P
     assert "og:" not in (tmp_path / "b.html").read_text()
     assert not (tmp_path / "b.jpg").exists()
     for address in ("me.html", "javascript:alert(1)", "https://"):
-        with pytest.raises(UserError, match="is no address; give one such as"):
-            check_address(address)
+        refuses("is no address; give one such as", check_address, address)
     runtime.write_portable(tmp_path / "c.mien", replace(drawn_head(10), filmed=None))
     given = ["--title", "Ada", "--address", "https://example.org/c.html"]
     assert main(["export", str(tmp_path / "c.mien"), "--out", str(tmp_path / "c.html"), *given]) == 0
