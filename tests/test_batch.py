@@ -1,6 +1,5 @@
 """`mien batch`: rows run once, failures stay alone, lost processes are taken up, and strangers' tables do no harm."""
 
-from known import known
 import csv
 import json
 import os
@@ -16,6 +15,7 @@ import pytest
 
 from batch_stub import PROGRAM, do_stub, driver, ended, stub_row, wait_for_begin
 from forked import ForkServer
+from known import known
 from mien.batch import (
     Batch,
     Driver,

@@ -134,7 +134,7 @@ def found_in(values: np.ndarray) -> following.Following:
     return found
 
 
-def test_delay_and_height_are_found():
+def test_delay_and_height_are_found_in_coefficients_and_in_turns():
     for delay, height in [(-1.3, 0.8), (0.0, 1.0), (0.6, 1.1), (2.0, 0.8)]:
         found = found_in(5 + bumps(delay, height))
         assert found.lag_frames == pytest.approx(delay, abs=0.1)
@@ -145,6 +145,18 @@ def test_delay_and_height_are_found():
     gap = bumps()
     gap[28:33] = np.nan
     assert found_in(gap).events == 1
+    _, truth = exact_of(turns())
+    off = matrix_from_axis_angle(torch.tensor([0.05, 0.1, -0.08]))
+    late = axis_angle_from_matrix(matrix_from_axis_angle(turns(1.5, 0.9)) @ off.T)
+    found = following.turn_following(exact_of(late)[0], truth, FPS)
+    assert found is not None
+    assert found.lag_frames == pytest.approx(1.5, abs=0.1)
+    assert found.loss_percent == pytest.approx(10, abs=2)
+    assert following.turn_following(exact_of(turns())[0], exact_of(0 * turns())[1], FPS) is None
+    # A mean rotation is in the middle.
+    vectors = torch.tensor([[0.0, 0.3, 0.0], [0.0, -0.1, 0.0]])
+    middle = axis_angle_from_matrix(following.mean_rotation(matrix_from_axis_angle(vectors)))
+    torch.testing.assert_close(middle, torch.tensor([0.0, 0.1, 0.0]).double(), atol=1e-6, rtol=0)
 
 
 def exact_of(rotations: torch.Tensor) -> tuple[Tracking, Truth]:
@@ -162,21 +174,6 @@ def turns(delay: float = 0.0, share: float = 1.0) -> torch.Tensor:
     """Return pitch and yaw that turn and come back, at 60 degrees a second at most."""
     angle = share * np.stack([0.1 * bumps(delay, width=5.0), 0.4 * bumps(delay, width=5.0), 0 * TIME], axis=1)
     return torch.from_numpy(angle).float()
-
-
-def test_turns_that_come_late_are_found_beside_a_constant_error():
-    _, truth = exact_of(turns())
-    off = matrix_from_axis_angle(torch.tensor([0.05, 0.1, -0.08]))
-    late = axis_angle_from_matrix(matrix_from_axis_angle(turns(1.5, 0.9)) @ off.T)
-    found = following.turn_following(exact_of(late)[0], truth, FPS)
-    assert found is not None
-    assert found.lag_frames == pytest.approx(1.5, abs=0.1)
-    assert found.loss_percent == pytest.approx(10, abs=2)
-    assert following.turn_following(exact_of(turns())[0], exact_of(0 * turns())[1], FPS) is None
-    # A mean rotation is in the middle.
-    vectors = torch.tensor([[0.0, 0.3, 0.0], [0.0, -0.1, 0.0]])
-    middle = axis_angle_from_matrix(following.mean_rotation(matrix_from_axis_angle(vectors)))
-    torch.testing.assert_close(middle, torch.tensor([0.0, 0.1, 0.0]).double(), atol=1e-6, rtol=0)
 
 
 def test_blinks_are_seen_in_the_lids():

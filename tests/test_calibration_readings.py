@@ -128,7 +128,7 @@ def test_a_reading_that_agrees_on_a_face_inside_out_is_warned_of(marks: Tensor, 
     assert "agree within" in told
 
 
-def test_ties_are_said() -> None:
+def test_ties_are_said_and_advice_is_part_of_the_refusal(marks: Tensor) -> None:
     entries = [Ranked(Reading((text,) if text else (), ()), pixels, pixels / 100) for text, pixels in
                (("write A", 0.7), ("write B", 0.8), ("write C", 4.0), ("", float("inf")))]  # fmt: skip
     advice = advice_of(entries)
@@ -137,9 +137,6 @@ def test_ties_are_said() -> None:
     assert "write C" not in advice
     assert advice_of(entries[1:]) == "write B (points of the face then agree within 0.8 px)"
     assert advice_of(entries[3:]) == ""
-
-
-def test_the_advice_is_part_of_the_refusal(marks: Tensor) -> None:
     given, pixels = written(RIGS["ring"], "room", "camera to world"), seen_by(RIGS["ring"], marks)
     calibrated = [CalibratedCamera(str(index), camera) for index, camera in enumerate(given)]
     refusal = "no two cameras ever .*; the matrices go from camera to world, .* agree within"

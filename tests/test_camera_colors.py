@@ -135,7 +135,7 @@ def _person(side: int, red: float = 150.0) -> np.ndarray:
     return np.array([red, 90.0, 60.0]) - np.where(np.arange(side) > side / 2, 20.0, 0.0)[:, None, None]
 
 
-def test_soft_edges_have_the_color_of_the_person() -> None:
+def test_soft_edges_have_the_color_of_the_person_in_large_pictures_as_well() -> None:
     image, matte = _filmed()
     found = foreground_colors(image, matte)
     share, soft = matte[..., None] / 255.0, (matte > 0) & (matte < 252)
@@ -145,10 +145,7 @@ def test_soft_edges_have_the_color_of_the_person() -> None:
         before, after = (np.abs(picture - true)[soft].mean() for picture in (filmed, cleaned))
         assert before > 10
         assert after < 0.15 * before
-
-
-def test_large_pictures_are_cleaned_as_well() -> None:
-    """A window of 273 pixels holds a sum of colours that 32 bits do not."""
+    # A window of 273 pixels holds a sum of colours that 32 bits do not.
     image, matte = _filmed(3000, 250.0, slice(1300, 1700))
     part = (slice(100, 300), slice(2300, 2500))
     share, soft = matte[part][..., None] / 255.0, soft_pixels(matte[part])

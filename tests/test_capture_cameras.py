@@ -190,7 +190,7 @@ def boxes_of(point: torch.Tensor, cameras: list[Camera]) -> np.ndarray:
     return np.concatenate([middles - 30, middles + 30], axis=-1)[None].repeat(2, axis=0)
 
 
-def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
+def test_a_face_that_is_none_does_not_move_the_head_and_cameras_that_never_agree_check_their_names():
     cameras = list(CAMERAS.values())
     true = torch.tensor([0.02, 0.03, 0.05])
     boxes = boxes_of(true, cameras)
@@ -202,9 +202,6 @@ def test_back_of_a_head_taken_for_a_face_does_not_move_the_head():
     assert not path.known[1]
     crops, size = choose_crops(path, cameras, 512, whole=False)
     assert size[0] == min(crop.crop_width for crop in crops)
-
-
-def test_cameras_that_agree_under_no_mistake_are_told_to_check_their_names():
     cameras = list(CAMERAS.values())[:4]
     boxes = boxes_of(torch.tensor([0.02, 0.03, 0.05]), cameras)
     boxes += np.array([0, 400, -400, 900])[:, None] * np.array([0, 1, 0, 1])

@@ -97,7 +97,7 @@ def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -
     assert abs(found_dots(lens.straighten(picture)) - found_dots(large)).max() < 0.2, "small pictures"
 
 
-def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> None:
+def test_all_lengths_of_opencv_are_read_and_distortion_of_all_cameras_is_refused(tmp_path: Path) -> None:
     for count in (4, 5, 8, 12, 14):
         numbers = [-0.1, 0.01, 0.001, 0.001] + [0.0] * (count - 4)
         assert lens_of(tmp_path, [[number] for number in numbers]).coefficients == tuple(numbers)
@@ -106,6 +106,10 @@ def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> No
         {"model": "Sony A7"}, {"distance": 3}, {"distortion_model": "plumb_bob"}, {"fisheye": False},
     ):  # fmt: skip
         assert read_calibration(write_rig(tmp_path / "rig.json", {**ENTRY, **harmless}))[0].lens is None, harmless
+    with pytest.raises(UserError, match="has distortion for all cameras together; write it into the entry of each"):
+        read_calibration(write_rig(tmp_path / "rig.json", ENTRY, distortion=BARREL))
+    with pytest.raises(UserError, match="camera 0: has distortion, but pictures are drawn as by an ideal lens"):
+        read_cameras(write_rig(tmp_path / "path.json", {**ENTRY, "distortion": BARREL}))
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -123,13 +127,6 @@ def test_all_lengths_of_opencv_are_read_in_a_row_or_column(tmp_path: Path) -> No
 ])  # fmt: skip
 def test_other_descriptions_are_refused(tmp_path: Path, change: dict, message: str) -> None:
     refuses(message, read_calibration, write_rig(tmp_path / "rig.json", {**ENTRY, **change}))
-
-
-def test_distortion_of_all_cameras_and_of_camera_paths_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="has distortion for all cameras together; write it into the entry of each"):
-        read_calibration(write_rig(tmp_path / "rig.json", ENTRY, distortion=BARREL))
-    with pytest.raises(UserError, match="camera 0: has distortion, but pictures are drawn as by an ideal lens"):
-        read_cameras(write_rig(tmp_path / "path.json", {**ENTRY, "distortion": BARREL}))
 
 
 SMALL = {"id": "a", "K": [[300, 0, 40], [0, 300, 30], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 80,

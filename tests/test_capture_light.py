@@ -1,12 +1,12 @@
 """Light in captures: exposure that changes, darkness, noise, and screens behind the person."""
 
-from known import known
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from known import known
 from mien.capture import CaptureSettings, capture_video, is_light_changing
 from mien.capture.quality import measure_face, quality_report, relative_quality
 from mien.capture.screen import screen_matte, screen_of, without_screen
@@ -56,12 +56,9 @@ def test_exposure_darkness_and_noise_are_told_with_numbers(gains, noise, said):
         assert any(words in hint for hint in report["hints"]), report["hints"]
 
 
-def test_light_is_measured_where_faces_are():
+def test_light_is_measured_where_faces_are_and_is_in_the_report(test_data: Path, tmp_path: Path, capsys):
     assert not is_light_changing(np.full(5, np.nan))
     assert is_light_changing(np.array([np.nan, 0.2, 0.4, np.nan, 0.3]))
-
-
-def test_exposure_of_a_video_is_in_its_report(test_data: Path, tmp_path: Path, capsys):
     capture_video(test_data / "cases" / "exposure.mp4", tmp_path / "capture", CaptureSettings(size=96, stride=5))
     report = read_json(tmp_path / "capture" / "report.json", "mien.capture_report", 1)
     assert report["face_brightness_change"] == pytest.approx(2.43, abs=0.3)

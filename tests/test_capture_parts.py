@@ -62,7 +62,7 @@ def test_jitter_is_the_second_difference():
     assert np.isnan(second_difference_jitter(steady[:2]))
 
 
-def test_matte_has_its_border_on_the_edge_of_the_picture():
+def test_mattes_have_their_border_on_the_edge_of_the_picture_and_of_what_is_new():
     """A matte ends at the picture's edge, although the mask is soft and 3 pixels off, as from a 256x256 network."""
     picture = np.full((512, 512, 3), 50, np.uint8)
     picture[:, 260:] = (200, 150, 130)
@@ -73,9 +73,6 @@ def test_matte_has_its_border_on_the_edge_of_the_picture():
     assert np.abs(alpha - truth).sum() < 0.4 * np.abs(soft - truth).sum()
     assert (alpha[:235] == 0).all()
     assert (alpha[285:] == 1).all()
-
-
-def test_clean_plate_cuts_on_the_border_of_what_is_new():
     plate = np.random.default_rng(0).integers(60, 200, (160, 160, 3)).astype(np.uint8)
     plate = cv2.GaussianBlur(plate, (0, 0), 3)
     truth = cv2.ellipse(np.zeros((160, 160), np.uint8), (80, 90), (36, 50), 0, 0, 360, 255, -1)

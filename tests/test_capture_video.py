@@ -80,7 +80,7 @@ def test_pixels_become_square(tmp_path, aspect, size):
     assert bright.any(axis=0).sum() / bright.any(axis=1).sum() == pytest.approx(float(aspect), rel=0.08)
 
 
-def test_bad_videos_are_named(tmp_path):
+def test_bad_videos_are_named_and_nothing_is_written_of_nothing_or_nowhere(tmp_path):
     (tmp_path / "text.mp4").write_text("this is no video " * 100)
     (tmp_path / "empty.mp4").touch()
     write_gradient_video(tmp_path / "half.mp4")
@@ -98,9 +98,6 @@ def test_bad_videos_are_named(tmp_path):
     ):
         error = refuses(message, next, read_video_frames(tmp_path / name))
         assert str(tmp_path / name) in error
-
-
-def test_writing_nothing_or_nowhere_is_refused(tmp_path):
     refuses("no frames", write_video, tmp_path / "none.mp4", [], 25)
     assert list(tmp_path.iterdir()) == []
     blocked = tmp_path / "file"

@@ -50,7 +50,7 @@ def facing(model: FaceModel) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)[:, 2]
 
 
-def test_the_front_is_seen_and_the_back_is_not(toy: Toy) -> None:
+def test_the_front_is_seen_and_not_the_back_nor_what_is_cut_off(toy: Toy) -> None:
     model, sequence = toy
     found, front = covered(toy), facing(model)
     assert (found.seen[front > 0.7] > 0.95).all()
@@ -68,9 +68,6 @@ def test_the_front_is_seen_and_the_back_is_not(toy: Toy) -> None:
     mouth = replace(model, region_names=("skin", "mouth"), face_regions=regions)
     drawn = torch.where(regions == 1, 1.0, found.seen)
     assert torch.equal(drawn_share(mouth, found), drawn), "the inside of the mouth is always drawn"
-
-
-def test_what_the_mask_or_the_neck_line_cuts_off_is_not_seen(toy: Toy) -> None:
     model, sequence = toy
     assert not covered((model, replace(sequence, scoring=np.zeros_like(sequence.scoring)))).seen.any()
     assert (covered(toy).above == 1).all()

@@ -75,7 +75,7 @@ def faces(
     return store["face_index"].tolist()
 
 
-def test_small_ones_duplicate_and_large_ones_split() -> None:
+def test_small_ones_duplicate_and_large_ones_split_by_their_mean_gradient() -> None:
     store = make_store([0.001, 0.001, 0.004, 0.004])
     strategy = control(store)
     strategy.observe(pose(store), rendering([ABOVE, BELOW, ABOVE, BELOW]))
@@ -85,10 +85,7 @@ def test_small_ones_duplicate_and_large_ones_split() -> None:
     assert torch.equal(store["means"][3], store["means"][0])
     torch.testing.assert_close(store["log_scales"][4:].exp(), torch.full((2, 3), 0.004 / 1.6))
     assert not torch.equal(store["means"][4], store["means"][5])
-
-
-def test_gradient_is_the_mean_over_the_steps_that_showed_the_gaussian() -> None:
-    """Also after a checkpoint."""
+    # Also after a checkpoint.
     store = make_store([0.001, 0.001])
     strategy, other = control(store), control(store)
     strategy.observe(pose(store), rendering([ABOVE, ABOVE]))

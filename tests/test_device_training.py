@@ -112,11 +112,17 @@ def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> 
 
 
 @pytest.mark.gpu
-def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
+def test_a_gpu_trains_as_the_native_core_does_and_its_run_goes_on_without_one(scene: Scene, tmp_path: Path) -> None:
     native, on_gpu = train_some(scene, torch.zeros(())), train_some(scene, like_on("cuda"))
     store = on_gpu.avatar.gaussian_store()
     assert all(store[name].is_cuda for name in store.names())
     assert_alike(on_gpu, native)
+    face_model, sequence = scene
+    often = replace(SETTINGS, device="cuda", checkpoint_every=1)
+    with pytest.raises(KeyboardInterrupt):
+        train([sequence], face_model, train_toy.CONFIG, often, tmp_path, stopped_at(SETTINGS.steps // 2))
+    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), tmp_path, silence)
+    assert load_avatar(tmp_path).gaussian_store()["means"].device.type == "cpu"
 
 
 @pytest.mark.unchecked
@@ -133,16 +139,6 @@ def test_a_whole_head_is_trained_on_a_device(device: str, monkeypatch: pytest.Mo
     store = state.avatar.gaussian_store()
     assert all(store[name].device.type == like.device.type for name in store.names())
     assert all(torch.isfinite(store[name]).all() for name in store.trained)
-
-
-@pytest.mark.gpu
-def test_what_a_gpu_trained_is_loaded_and_resumed_without_one(scene: Scene, tmp_path: Path) -> None:
-    face_model, sequence = scene
-    often = replace(SETTINGS, device="cuda", checkpoint_every=1)
-    with pytest.raises(KeyboardInterrupt):
-        train([sequence], face_model, train_toy.CONFIG, often, tmp_path, stopped_at(SETTINGS.steps // 2))
-    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), tmp_path, silence)
-    assert load_avatar(tmp_path).gaussian_store()["means"].device.type == "cpu"
 
 
 def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:

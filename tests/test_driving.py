@@ -79,7 +79,7 @@ def test_motion_is_done_in_the_avatars_own_frame() -> None:
     assert torch.equal(still.head_rotation, avatar.head_rotation)
 
 
-def test_turntable_keeps_the_center_in_its_place() -> None:
+def test_turntables_and_cameras_aside_keep_the_center_in_its_place() -> None:
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     center = torch.tensor([0.02, 0.05, -0.6])
     path = turntable(camera, center, 8)
@@ -96,10 +96,7 @@ def test_turntable_keeps_the_center_in_its_place() -> None:
     swing = turntable(camera, center, 8, span=1.0)
     for index, angle in ((2, 0.5), (6, -0.5), (4, 0.0)):
         torch.testing.assert_close(swing[index].viewmat, orbit(camera, center, angle).viewmat, atol=1e-6, rtol=0)
-
-
-def test_a_camera_aside_looks_at_the_same_place() -> None:
-    """A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit."""
+    # A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit.
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     center, ahead = torch.tensor([0.0, 0.0, -0.6]), 0.6 * math.sqrt(0.75)
     for yaw, pitch, place in ((90, 0, [0.6, 0.0, 0.0]), (0, 30, [0.0, 0.3, ahead]), (90, 30, [ahead, 0.3, 0.0])):
@@ -213,16 +210,13 @@ def test_each_coefficient_moves_its_side_of_a_face() -> None:
 # -- times of frames --------------------------------------------------------------------------------------------------
 
 
-def test_a_pause_does_not_change_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
+def test_pauses_and_dropped_and_odd_frames_do_not_change_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
     """A pause of 20 s in a clip at 30 frames a second leaves 30, however the file states its rate."""
     times = np.concatenate([np.arange(30), 600 + np.arange(30)]) / 30
     for nominal in (30.0, 60 / times[-1], 1000.0):
         assert frame_rate(times, nominal) == pytest.approx(30)
     assert pace_report("clip", times)["pauses"] == 1
     assert "clip: a pause of 19.0 s without a frame, after 1.0 s" in capsys.readouterr().err
-
-
-def test_dropped_and_odd_frames_do_not_change_the_rate() -> None:
     random = np.random.default_rng(0)
     kept = np.flatnonzero(random.uniform(size=300) > 0.2)
     assert frame_rate((kept - kept[0]) / 25, 25.0) == 25
@@ -265,14 +259,11 @@ def test_a_driver_moves_at_the_times_of_its_video(tmp_path: Path) -> None:
     assert torch.equal(steady.face.head_rotation[:, 1], 0.01 * torch.arange(9).float())
 
 
-def test_a_driver_waits_in_a_pause(tmp_path: Path) -> None:
+def test_a_driver_waits_in_a_pause_but_not_in_one_that_never_ends(tmp_path: Path) -> None:
     """In a pause of two seconds, the face is held, and it moves on just before the next frame."""
     angles = filmed_at(tmp_path, np.concatenate([np.arange(10), 60 + np.arange(10)])).face.head_rotation[:, 1]
     assert len(angles) == 70
     assert (angles[9:60] - angles[9]).abs().max() < 1e-6
     torch.testing.assert_close(angles[60:], 0.01 * torch.arange(60, 70), atol=1e-6, rtol=0)
-
-
-def test_a_pause_that_never_ends_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="frame 5: comes 100 s after the one before"):
         filmed_at(tmp_path, np.concatenate([np.arange(5), 2500 + np.arange(5)]))

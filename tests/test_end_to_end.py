@@ -128,19 +128,16 @@ def test_no_command_needs_a_network_once_there_is_a_run(offline, fork_server, tm
     lines = {"export": "{toy} --out {exported} --format gaussian-avatars"}
     run_all(fork_server, lines, toy=toy, exported=exported)
     run_all(fork_server, OF_A_RUN, demo=offline, toy=toy, exported=exported, out=tmp_path)
+    runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
+    viewer = fork_server.call("test_end_to_end:view_alone", str(tmp_path / "me.mien"))
+    assert viewer.wait() == 0, viewer.stderr
+    assert "<html" in viewer.stdout
 
 
 def test_a_capture_by_litert_is_made_without_a_network(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
     pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
     line = "{video} --out {out} --capture.detector litert --capture.max-frames 2"
     run_all(fork_server, {"capture": line}, video=offline / VIDEO, out=tmp_path)
-
-
-def test_the_viewer_needs_no_network_but_the_loopback(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
-    runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
-    viewer = fork_server.call("test_end_to_end:view_alone", str(tmp_path / "me.mien"))
-    assert viewer.wait() == 0, viewer.stderr
-    assert "<html" in viewer.stdout
 
 
 def view_alone(avatar: str) -> None:

@@ -102,14 +102,11 @@ def test_crops_beside_the_truth_are_found(folders: ImageFolders) -> None:
     refuses("'a' has no box", read_crops, path)
 
 
-def test_names_and_sizes_that_do_not_match(folders: ImageFolders, tmp_path: Path) -> None:
+def test_pictures_that_do_not_match_or_are_damaged_are_named(folders: ImageFolders, tmp_path: Path) -> None:
     (folders.images / "b.png").rename(folders.images / "z.png")
     refuses(r"lacks 1 of the 3 pictures.*\(b; it has a, c, z\)", score_folders, folders, PLAIN)
     write_pictures(folders.images, "b", size=(20, 20))
     refuses("b has 20x20 pixels, and its truth has 36x40", score_folders, folders, PLAIN)
-
-
-def test_damaged_pictures_are_named(folders: ImageFolders) -> None:
     path = folders.images / "b.png"
     path.write_bytes(path.read_bytes()[:-40])
     refuses(r"b\.png: is not a complete picture", score_folders, folders, PLAIN)

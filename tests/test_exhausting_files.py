@@ -105,12 +105,19 @@ def test_members_of_a_sog_have_bounds(tmp_path: Path) -> None:
         refused(read_sog, path, r"cannot be read as \.sog")
 
 
-def test_rows_of_a_ply_have_a_bound(tmp_path: Path) -> None:
+def test_rows_of_a_ply_and_lists_of_json_have_a_bound(tmp_path: Path) -> None:
     names = [*property_names(1), *(f"more_{index}" for index in range(2000))]
     lines = "".join(f"property float {name}\n" for name in names)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex 1000000\n{lines}end_header\n"
     path = sparse(tmp_path / "a.ply", 10 << 30, head.encode())
     refused(read_ply, path, "bytes of vertices, more than 536,870,912; leave columns out")
+    # Empty lists take twenty times their text.
+    path = tmp_path / "a.json"
+    path.write_text("[" + "[]," * (20 << 20) + "[]]")
+    refused(read_blendshape_json, path, "too many lists, objects or numbers", 200 * MIB)
+    names = ",".join(f'"{index}": 0' for index in range(30_000))
+    with allocating_at_most(256 * MIB, 60), pytest.raises(ValueError, match="it holds '0' twice"):
+        parse_json(f'{{{names}, "0": 1}}', unique_names=True)
 
 
 def test_landmarks_are_as_large_as_their_frames_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,16 +138,6 @@ def test_landmarks_are_as_large_as_their_frames_need(tmp_path: Path, monkeypatch
     monkeypatch.setattr(given.np, "array", lambda *values, array=np.array: read.append(1) or array(*values))
     refused(lambda path: read_landmarks(path, 3), path, r"has landmarks of shape \[4, 478, 2\]")
     assert len(read) < 10, "only as many as there are frames are held"
-
-
-def test_lists_of_json_have_a_bound(tmp_path: Path) -> None:
-    """Empty lists take twenty times their text."""
-    path = tmp_path / "a.json"
-    path.write_text("[" + "[]," * (20 << 20) + "[]]")
-    refused(read_blendshape_json, path, "too many lists, objects or numbers", 200 * MIB)
-    names = ",".join(f'"{index}": 0' for index in range(30_000))
-    with allocating_at_most(256 * MIB, 60), pytest.raises(ValueError, match="it holds '0' twice"):
-        parse_json(f'{{{names}, "0": 1}}', unique_names=True)
 
 
 def test_a_message_shows_the_beginning_and_the_remedy(made_once: MadeOnce, tmp_path: Path, capsys) -> None:
@@ -248,7 +245,7 @@ def test_pictures_that_are_too_few_or_not_whole(tmp_path: Path) -> None:
     refuses(r"0\.png: damaged", decode_png, path, (8, 8), "capture again")
 
 
-def test_faces_of_another_type_or_size_are_named(tmp_path: Path) -> None:
+def test_faces_of_another_type_or_size_and_those_that_face_nowhere_are_named(tmp_path: Path) -> None:
     model, sequence = toy_sequence(timesteps=5, size=32)
     face = sequence.tracking.face
     with pytest.raises(UserError, match=r"here: expression is torch\.float64"):
@@ -258,9 +255,6 @@ def test_faces_of_another_type_or_size_are_named(tmp_path: Path) -> None:
     tracking = replace(sequence.tracking, face=replace(face, identity=torch.zeros(0)))
     other = replace(sequence, tracking=tracking, folder=tmp_path / "clip")
     refuses(r"clip: identity is \[0\]", train, [other], model, train_toy.CONFIG, train_toy.SETTINGS, tmp_path / "run")
-
-
-def test_triangles_that_face_nowhere(tmp_path: Path) -> None:
     arrays = tiny_flame()
     turned: dict[str, Any] = {**arrays, "f": arrays["f"][:, ::-1]}
     np.savez(tmp_path / "tiny.npz", **turned)

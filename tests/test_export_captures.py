@@ -3,7 +3,6 @@
 The importers are tested with writers that call nothing of mien. What they do not read, or read in several ways, is
 checked by matrices from the description of the layout."""
 
-from known import known
 import json
 import re
 from dataclasses import replace
@@ -18,6 +17,7 @@ import torch
 from dataset_checks import CAMERA, PIXELS, check_intrinsics, check_projection, filmed_camera, read
 from dataset_scene import SIDE, NoDetector, Scene, draw, drawn_person, head_view, projected
 from dataset_writers import UNEQUAL, rotation_of, tracker_frame
+from known import known
 from mien.camera import Camera
 from mien.capture import read_capture_hash, write_capture
 from mien.cli import main

@@ -152,7 +152,7 @@ def test_the_model_is_the_published_one_and_one_version_is_pinned() -> None:
     assert f"@mediapipe/tasks-vision@{VERSION}\n" in (WEB.parent / "Makefile").read_text()
 
 
-def test_a_model_without_its_second_part_is_explained(page: Path, monkeypatch, capsys, tmp_path: Path) -> None:
+def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monkeypatch, capsys, tmp_path) -> None:
     """mien from a source distribution lacks the network for blend shapes. A model that is given serves."""
     monkeypatch.setenv("MIEN_TASKS_VISION", str(tasks_vision()))
     monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
@@ -166,9 +166,6 @@ def test_a_model_without_its_second_part_is_explained(page: Path, monkeypatch, c
     assert find_webcam_files(model).model == model
     model.write_bytes(b"")
     assert "mien has one" not in refused(page, capsys, "--webcam-model", str(model))
-
-
-def test_a_wrong_model_is_explained(page: Path, monkeypatch: pytest.MonkeyPatch, capsys, tmp_path: Path) -> None:
     tasks_vision()
     model = tmp_path / "any.task"
     monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))

@@ -57,9 +57,6 @@ def test_activations_follow_training_within_its_range_and_stop_soon_after() -> N
     assert torch.equal(within_seen(lengths[:, None] * along, seen[:0]), lengths[:, None] * along)
     inputs = torch.cat([lengths[1:4, None] * along, torch.tensor([[-4.0, 0.5], [2.0, 3.0]])]).double() + 0.01
     assert torch.autograd.gradcheck(lambda x: within_seen(x, seen.double()), inputs.requires_grad_())
-
-
-def test_frames_of_training_are_not_shortened() -> None:
     activations = random(200, 4)
     seen = outermost(activations)
     assert len(seen) < 100
@@ -172,12 +169,20 @@ def with_features(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True
     return avatar
 
 
-def test_starts_as_without_features() -> None:
+def test_an_avatar_starts_as_without_features_and_changes_with_them_have_a_penalty() -> None:
     plain = plain_gaussian_avatars(expression_rank=RANK, expression_color_rate=Rate(0.0))
     torch.manual_seed(0)
     static = GaussianAvatars(plain, toy_face_model(), toy_face(5))
     ours, theirs = (avatar.pose(toy_face(5)).gaussians for avatar in (with_features(filled=False), static))
     assert all(torch.equal(getattr(ours, part), getattr(theirs, part)) for part in PARTS)
+    avatar = with_features(replace(CONFIG, appearance_weight=0.5))
+    for name in ("feature_bases", "neutral_features"):
+        avatar.store[name].data[0] = 0
+    posed = avatar.pose(toy_face(5)[1])
+    changes = [posed.aux[name] for name in ("feature_color", "feature_opacity")]
+    assert all(not each[0].any() and each[1].any() for each in changes)
+    losses = avatar.regularizers(posed, pictured(len(avatar.store)), Progress(0, 1))
+    torch.testing.assert_close(losses["appearance"], 0.5 * sum(each.square().mean() for each in changes))
 
 
 def test_color_and_opacity_change_by_the_network() -> None:
@@ -209,17 +214,6 @@ def test_baked_avatars_pose_alike_far_from_what_was_filmed(settings: dict[str, R
             own, theirs = getattr(found, part), getattr(truth, part).detach().numpy()
             np.testing.assert_allclose(own, theirs, atol=1e-5, rtol=1e-4, err_msg=part)
     assert pack(portable), "a page holds them"
-
-
-def test_a_gaussian_without_features_never_changes_and_changes_have_a_penalty() -> None:
-    avatar = with_features(replace(CONFIG, appearance_weight=0.5))
-    for name in ("feature_bases", "neutral_features"):
-        avatar.store[name].data[0] = 0
-    posed = avatar.pose(toy_face(5)[1])
-    changes = [posed.aux[name] for name in ("feature_color", "feature_opacity")]
-    assert all(not each[0].any() and each[1].any() for each in changes)
-    losses = avatar.regularizers(posed, pictured(len(avatar.store)), Progress(0, 1))
-    torch.testing.assert_close(losses["appearance"], 0.5 * sum(each.square().mean() for each in changes))
 
 
 def test_features_have_their_own_number_of_activations() -> None:

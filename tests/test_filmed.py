@@ -1,6 +1,5 @@
 """Driving keeps softly to the expressions and poses that training saw; sheets show every expression or side once."""
 
-from known import known
 import math
 import shutil
 from dataclasses import replace
@@ -12,6 +11,7 @@ import pytest
 import torch
 
 import train_toy
+from known import known
 from mien import runtime
 from mien.avatar import DEFAULT_METHOD, METHODS, Avatar, load_avatar, make_portable, measure_filmed, write_avatar
 from mien.camera import Camera, camera_from_fov
@@ -69,7 +69,7 @@ def _written(path: Path, avatar: Avatar, **changes: object) -> runtime.PortableA
     return runtime.read_portable(path)
 
 
-def test_soft_limits_change_nothing_inside_and_stay_below_their_limit() -> None:
+def test_limits_are_soft_and_a_rare_combination_becomes_weaker_and_keeps_its_kind() -> None:
     values = np.linspace(-5, 5, 1001)
     limited = soft_limits(values, np.array(-1.0), np.array(2.0), np.array(0.0), 1e-6)
     inside = (values >= -1) & (values <= 2)
@@ -79,10 +79,7 @@ def test_soft_limits_change_nothing_inside_and_stay_below_their_limit() -> None:
     assert (slopes > 0).all(), "more motion of the driver is never less of the avatar"
     assert slopes.max() < 1 + 1e-9
     assert np.abs(np.diff(slopes)).max() < 0.08, "no kink"
-
-
-def test_a_rare_combination_becomes_weaker_and_keeps_its_kind() -> None:
-    """Either of two expressions was filmed at 1, never both together."""
+    # Either of two expressions was filmed at 1, never both together.
     single = torch.cat([torch.eye(3)[:2].repeat(20, 1), torch.zeros(20, 3)])
     inputs = np.zeros((3, 9), np.float32)
     inputs[0, 0], inputs[1, :2], inputs[2, 2] = 1.0, 1.0, 1.5
@@ -207,7 +204,7 @@ def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
     assert {"jawOpen 1.20", "browInnerUp 1.50"} <= strong, "coefficients stay within the bounds of the face model"
 
 
-def test_strengths_relative_to_what_was_filmed() -> None:
+def test_strengths_are_relative_to_what_was_filmed_and_a_turntable_ends_at_half_of_its_angle() -> None:
     model = make_small_face_model()
     count = len(model.expression_names)
     model = replace(model, expression_bounds=torch.tensor([[0.0, 1.0]]).repeat(count, 1))
@@ -216,9 +213,6 @@ def test_strengths_relative_to_what_was_filmed() -> None:
     tiles = filmed_tiles(model, model.neutral(), CAMERA, filmed, 1.5)
     shown = [float(tile.face.expression.max()) for tile in tiles[1:]]
     assert shown == pytest.approx([min(1.5 * value, 1.0) for value in highest[:count][::-1].tolist()])
-
-
-def test_a_turntable_ends_at_half_of_its_angle_on_either_side() -> None:
     face, center = make_small_face_model().neutral(), torch.zeros(3)
     tiles, around = (turntable_tiles(face, CAMERA, center, span) for span in (120.0, 360.0))
     assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "front", "+60 degrees"]
@@ -257,7 +251,7 @@ def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: lis
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
 
 
-def test_a_sheet_without_a_name_lies_in_the_runs_folder(workspace: Path, tmp_path: Path, capsys) -> None:
+def test_a_sheet_lies_in_the_runs_folder_and_what_is_beyond_the_film_is_told(workspace, tmp_path, capsys) -> None:
     """Other pictures need a name, because it says what they are."""
     render = ["render", str(shutil.copytree(workspace, tmp_path / "W")), "--size", "32"]
     assert main([*render, "--sheet", "turntable"]) == 0
@@ -265,9 +259,6 @@ def test_a_sheet_without_a_name_lies_in_the_runs_folder(workspace: Path, tmp_pat
     assert f"{sheet}: 9 pictures" in capsys.readouterr().err
     assert main(render) == 2
     assert "--out: is missing" in capsys.readouterr().err
-
-
-def test_what_is_beyond_the_film_is_told_and_softened(workspace: Path, tmp_path: Path, capsys) -> None:
     still = ["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "32"]
     for value, told in ((1, True), (0, False)):
         assert main([*still, "--set", f"drop={value}"]) == 0

@@ -63,7 +63,7 @@ def _swinging(marks: torch.Tensor, frames: slice) -> torch.Tensor:
     return found
 
 
-def test_swings_go():
+def test_swings_go_and_noise_motion_blinks_and_short_runs_stay():
     marks = _still(noise=0.05)
     found = without_flicker(_swinging(marks, slice(6, 15)), _all_seen(marks))
     torch.testing.assert_close(found[6:15], marks[6:15], atol=0.35, rtol=0)
@@ -73,9 +73,6 @@ def test_swings_go():
     marks = _still(8)
     found = without_flicker(_swinging(marks, slice(0, 8)), _all_seen(marks))
     torch.testing.assert_close(found, marks, atol=1e-9, rtol=0)
-
-
-def test_noise_motion_blinks_and_short_runs_stay():
     marks = _still(40, noise=0.25)
     marks[10:14, :, :50] += 6.0
     marks[20, :, :50] -= 6.0  # of a single frame

@@ -197,13 +197,10 @@ def test_a_workspace_is_no_folder_of_videos(tmp_path: Path, capsys: pytest.Captu
     assert "me.mp4" not in told
 
 
-def test_a_take_with_what_systems_leave_is_recognised(tmp_path: Path) -> None:
+def test_a_take_with_what_systems_leave_is_recognised_also_in_a_hidden_folder(tmp_path: Path) -> None:
     given(tmp_path, "take.mov", "take.csv")
     live_link_face(tmp_path, [{}] * 3)
     assert LIVE_LINK_FACE.recognises(tmp_path) == "a take of Live Link Face (a video, coefficients)"
-
-
-def test_a_folder_whose_own_name_is_hidden_is_read(tmp_path: Path) -> None:
     assert [path.name for path in list_images(given(tmp_path / ".hidden" / "__MACOSX", "a.png"))] == ["a.png"]
 
 

@@ -90,13 +90,15 @@ def test_pixels_of_held_out_timesteps_decide_nothing(tmp_path: Path):
     assert gains[40:].equal(gains[39:40].expand(10, 3)), "the light of the last timestep that is trained on"
 
 
-def test_a_gap_is_filled_in_time():
+def test_a_gain_keeps_the_background_and_gaps_are_filled_in_time():
     sequence = in_light(toy_sequence(timesteps=50, size=16)[1], np.exp(0.02 * np.arange(50.0))[:, None].repeat(3, 1))
     valid = sequence.capture.valid.copy()
     valid[20:30] = False
     gains = gains_of(replace(sequence, capture=replace(sequence.capture, valid=valid))).gains().detach()
     steps = gains[18:32, 0].log().diff()
     np.testing.assert_allclose(steps, steps.mean(), atol=5e-3)
+    shown, picture = drawing(np.array([0.5, 1.0, 2.0]))
+    assert torch.allclose(lit(shown, BACKGROUND, torch.tensor([0.5, 1.0, 2.0])).image, picture, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -154,8 +156,3 @@ def test_scores_and_alignment_draw_in_the_light_of_the_frame():
     ):
         own = found[frame.timestep] if len(found) > 1 else found
         assert (own.head_rotation - truth[frame.timestep].head_rotation).abs().max() < 0.01
-
-
-def test_a_gain_keeps_the_background():
-    shown, picture = drawing(np.array([0.5, 1.0, 2.0]))
-    assert torch.allclose(lit(shown, BACKGROUND, torch.tensor([0.5, 1.0, 2.0])).image, picture, atol=1e-6)

@@ -96,7 +96,7 @@ def _back_hair(model: FaceModel, hanging: torch.Tensor, hair: float = _HAIR) -> 
     return back_hair(model, model.template, hair * head_parts(model).scalp.float(), hanging)
 
 
-def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
+def test_long_hair_falls_from_the_widest_part_of_the_head_if_it_hangs_at_both_sides(anny):
     middles, _, normals = triangle_geometry(anny.template, anny.faces)
     found, parts = _back_hair(anny, _beside(anny)), head_parts(anny)
     nape = (found > 0) & (normals[:, 2] < -0.8) & (middles[:, 0].abs() < 0.02)
@@ -110,9 +110,6 @@ def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
     assert (cut.margins(outside[found > 0]) > 0).all(), "no hair hangs below the cut"
     shorter = _back_hair(anny, _beside(anny, low=-0.09))
     assert float(middles[found > 0][:, 1].min()) < float(middles[shorter > 0][:, 1].min()) - 0.01, "as at the sides"
-
-
-def test_hair_that_does_not_hang_at_both_sides_has_no_back_hair(anny):
     for hanging in ({"left": 0.0, "right": 0.0}, {"left": 0.05, "right": 0.005}, {"low": 1.0}):
         assert not _back_hair(anny, _beside(anny, **hanging)).any(), hanging
     assert not _back_hair(anny, _beside(anny), hair=0.0).any(), "a bald head"

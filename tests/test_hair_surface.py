@@ -281,7 +281,7 @@ def test_mirror_images_lie_on_the_other_side_in_the_same_region(anny, flame):
     assert (mirror_triangles(half) == -1).all()
 
 
-def test_an_unseen_side_gets_the_mirror_images_colors(anny):
+def test_an_unseen_side_gets_the_mirror_images_colors_without_a_border(anny):
     """A mole on one cheek appears on the other, which the camera did not see."""
     colors, middles, face = _painted(anny), _middles(anny), head_parts(anny).face
     away = (middles - torch.tensor([0.045, -0.03, 0.08])).norm(dim=1)
@@ -290,10 +290,7 @@ def test_an_unseen_side_gets_the_mirror_images_colors(anny):
     colors[mole] = torch.tensor([0.4, 0.25, 0.2])
     completed = _completed(anny, middles[:, 0] > -0.01, colors)
     assert (completed[mirror_triangles(anny)[mole]] - colors[mole]).abs().max() < 0.02
-
-
-def test_no_border_shows_if_one_side_is_lit_less(anny):
-    """The left is brighter than the right. Where neither side is on the midline, the step between both is small."""
+    # The left is brighter than the right. Where neither side is on the midline, the step between both is small.
     middles = _middles(anny)
     lit = _SKIN * (1 + 3 * middles[:, :1].clamp(-0.07, 0.07))
     completed = _completed(anny, middles[:, 0] > -0.03, lit)

@@ -63,17 +63,14 @@ def test_boxes_are_those_of_mediapipe_near_and_far(drawn, side):
         assert own.surest(wide) == pytest.approx(other.surest(wide), abs=0.05)
 
 
-def test_two_faces_are_followed_and_none_is_found_in_an_empty_picture(drawn):
+def test_two_faces_are_followed_none_is_found_in_nothing_and_landmarks_turn_with_the_picture(drawn):
     beside = np.concatenate([drawn, drawn[:, ::-1]], axis=1)
     mesh = Mesh(4, follows=True)
     found = [mesh.find(np.ascontiguousarray(beside)) for _ in range(3)][-1]
     assert sorted(found[:, 1, 0] > 256) == [False, True]
     found = [mesh.find(np.zeros((100, 80, 3), np.uint8)) for _ in range(2)][-1]
     assert found.shape == (0, 478, 3)
-
-
-def test_landmarks_turn_with_the_picture(drawn):
-    """The square that the network sees follows the face, also when the head lies on a shoulder."""
+    # The square that the network sees follows the face, also when the head lies on a shoulder.
     turned = np.ascontiguousarray(np.rot90(drawn))
     with LandmarkDetector(False, "litert") as upright, LandmarkDetector(False, "litert") as lying:
         one, two = [(upright.detect(drawn), lying.detect(turned)) for _ in range(3)][-1]

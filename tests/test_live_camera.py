@@ -2,7 +2,6 @@
 
 Time is an argument: the clock of a `Stage` goes on when a test lets it."""
 
-from known import known
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from known import known
 from mien.capture.camera_names import CameraName, camera_named, is_camera
 from mien.capture.live_camera import LiveCamera
 from mien.capture.video import write_video

@@ -23,16 +23,13 @@ def aside(avatar: runtime.Avatar, degrees: float) -> runtime.Avatar:
     return runtime.Avatar(replace(portable, neutral=replace(portable.neutral, head_rotation=turned)))
 
 
-def test_a_head_turns_to_the_sides_that_were_filmed(avatar: runtime.Avatar) -> None:
+def test_the_head_turns_to_the_sides_that_were_filmed_and_never_leaves_the_film(avatar: runtime.Avatar, monkeypatch):
     # The head of the drawn person looks 5.1 degrees to its right of the camera.
     assert np.multiply(living.yaws_of(aside(avatar, 5.1), (15, 10)), DEGREES) == pytest.approx((-10, 15), abs=0.1)
     # A camera that sees its right already leaves less on that side.
     assert np.multiply(living.yaws_of(aside(avatar, 10.1), (15, 10)), DEGREES) == pytest.approx((-15, 10), abs=0.1)
     assert living.yaws_of(avatar, (0, 0)) == (-living.LEAST_YAW, living.LEAST_YAW)
     assert living.yaws_of(avatar, (180, 180)) == living.yaws_of(avatar, None) == (-living.MOST_YAW, living.MOST_YAW)
-
-
-def test_the_head_fills_the_film_and_never_leaves_it(avatar: runtime.Avatar, monkeypatch: pytest.MonkeyPatch) -> None:
     yaws = (-0.1, 0.4)
     monkeypatch.setattr(living, "FPS", 4)
     pictures = np.stack(list(living.pictures_of(Living(avatar, living.near_camera(avatar, yaws), yaws))))

@@ -46,7 +46,7 @@ def largest_share(pictures: np.ndarray) -> int:
 
 
 @pytest.mark.usefixtures("_tiny_limit")
-def test_a_map_gives_its_pages_back(tmp_path: Path) -> None:
+def test_maps_and_captures_give_their_pages_back(tmp_path: Path) -> None:
     file, shape = tmp_path / "pictures.u8", (64, 1, 512, 512)
     file.write_bytes(bytes(range(256)) * (64 << 10))
     pictures, held = map_pictures(file, shape), np.memmap(file, np.uint8, "r", shape=shape)
@@ -54,10 +54,6 @@ def test_a_map_gives_its_pages_back(tmp_path: Path) -> None:
     assert largest_share(held) > 12 * MIB, "the test sees what is held"
     np.testing.assert_array_equal(pictures, held)
     assert largest_share(pictures[:, 0][:, None]) < 6 * MIB, "views count, too"
-
-
-@pytest.mark.usefixtures("_tiny_limit")
-def test_captures_are_looked_at_without_being_held(tmp_path: Path) -> None:
     write_capture(tmp_path / "capture", random_capture(timesteps=40, height=256, width=300))
     images = read_capture(tmp_path / "capture").images
     assert images.nbytes > 16 * MIB

@@ -56,7 +56,7 @@ def sphere(subdivisions: int) -> tuple[Tensor, Tensor]:
     return torch.tensor(np.array(made.vertices)).float(), torch.tensor(np.array(made.faces)).long()
 
 
-def test_known_triangle_lands_on_known_pixels():
+def test_a_known_triangle_lands_on_known_pixels_and_the_nearest_is_seen():
     vertices = at_depth([(2, 1, 1), (6, 1, 1), (2, 5, 1)])
     fragments = rasterize_mesh(vertices, torch.tensor([[0, 1, 2]]), pixel_camera())
     rows, columns = (fragments.face_index >= 0).nonzero().unbind(1)
@@ -70,6 +70,13 @@ def test_known_triangle_lands_on_known_pixels():
     for order, seen in (([0, 1, 2], False), ([0, 2, 1], True)):  # clockwise, counter-clockwise
         culled = rasterize_mesh(vertices, torch.tensor([order]), pixel_camera(), cull_backfaces=True)
         assert bool((culled.face_index == 0).any()) == seen
+    near, far = [(1, 1, 1), (9, 1, 1), (1, 9, 1)], [(0, 0, 2), (15, 0, 2), (0, 11, 2)]
+    vertices = at_depth(near + far)
+    for faces, expected in (([[0, 1, 2], [3, 4, 5]], 0), ([[3, 4, 5], [0, 1, 2]], 1)):
+        fragments = rasterize_mesh(vertices, torch.tensor(faces), pixel_camera())
+        assert fragments.face_index[3, 3] == expected
+        assert fragments.depth[3, 3] == 1
+        assert fragments.face_index[0, 5] == 1 - expected
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -112,16 +119,6 @@ def test_interpolation_is_perspective_correct():
     torch.testing.assert_close(fragments.barycentric[covered][inside].double(), expected[inside], atol=1e-5, rtol=1e-5)
     projected, _ = camera.project(interpolate(fragments, vertices, faces)[covered][inside])
     torch.testing.assert_close(projected.double(), pixels[inside, :2], atol=1e-2, rtol=0)
-
-
-def test_the_nearest_triangle_is_seen_whatever_the_order():
-    near, far = [(1, 1, 1), (9, 1, 1), (1, 9, 1)], [(0, 0, 2), (15, 0, 2), (0, 11, 2)]
-    vertices = at_depth(near + far)
-    for faces, expected in (([[0, 1, 2], [3, 4, 5]], 0), ([[3, 4, 5], [0, 1, 2]], 1)):
-        fragments = rasterize_mesh(vertices, torch.tensor(faces), pixel_camera())
-        assert fragments.face_index[3, 3] == expected
-        assert fragments.depth[3, 3] == 1
-        assert fragments.face_index[0, 5] == 1 - expected
 
 
 def test_a_triangle_through_the_near_plane_is_cut_there():

@@ -187,15 +187,12 @@ def test_eyes_that_look_up_and_down_stay_open() -> None:
         assert visible(name, 1.0) > 0.3 * ahead, name
 
 
-def test_a_take_goes_on_after_midnight(tmp_path: Path) -> None:
+def test_a_take_goes_on_after_midnight_and_a_timecode_that_comes_twice_costs_one_row(tmp_path: Path) -> None:
     times = [(23, 59, 58), (23, 59, 59), (0, 0, 0), (0, 0, 1)]
     codes = [f"{h:02d}:{m:02d}:{s:02d}:{f:02d}.451" for h, m, s in times for f in range(0, 60, 2)]
     motion = read_rows(tmp_path, *map(row, codes))
     assert (len(motion), motion.fps) == (120, pytest.approx(30))
     assert motion.notes == ()
-
-
-def test_a_timecode_that_comes_twice_costs_one_row(tmp_path: Path) -> None:
     path, codes = tmp_path / "a.csv", ("1:0:0:0", "1:0:0:1", "1:0:0:1", "1:0:0:0.5", "1:0:0:2", "1:0:0:4")
     motion = read_rows(tmp_path, *rows_of(*codes))
     np.testing.assert_allclose(jaw(motion), [0, 0.1, 0.4, 0.45, 0.5], atol=1e-6)
@@ -243,7 +240,7 @@ def test_every_layout_gives_the_same_motion(write, tmp_path: Path) -> None:
         assert motion.head_translation[0] == pytest.approx([0, 0, -0.4])
 
 
-def test_units_of_times(tmp_path: Path) -> None:
+def test_units_of_times_are_found_and_missing_times_are_said(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
 
     def read(key: str, step: float, count: int = 120) -> Motion:
@@ -259,9 +256,6 @@ def test_units_of_times(tmp_path: Path) -> None:
         ("time", 1e-4, "10,000 frames in a second; give seconds"),
     ):
         refuses(words, read, key, step)
-
-
-def test_missing_times_are_said(tmp_path: Path) -> None:
     path = write_json(tmp_path / "a.json", [{"blendshapes": {"jawOpen": 0.5}}] * 3)
     motion = read_blendshape_json(path)
     assert motion.fps == pytest.approx(30)

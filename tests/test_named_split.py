@@ -52,7 +52,7 @@ def test_table_2(subject: str) -> None:
     assert split_by_name(FOLDERS, "104", subject).subject == subject, "a given subject wins over the folder"
 
 
-def test_what_the_names_do_not_say_is_told_with_the_remedy() -> None:
+def test_what_the_names_do_not_say_and_what_is_withheld_twice_is_told() -> None:
     for names, folder, subject, words in (
         (FOLDERS, "me", None, "'me' does not say which subject it is; give --subject (the subjects are 074"),
         (FOLDERS, "104_306", None, "does not say which subject"),
@@ -65,9 +65,6 @@ def test_what_the_names_do_not_say_is_told_with_the_remedy() -> None:
             split_by_name(names, folder, subject)
         assert words in str(told.value)
         assert "\n" not in str(told.value)
-
-
-def test_frames_withheld_twice_are_told() -> None:
     held = TrainSettings(held_out_sequences=("FREE",))
     assert "--split blocks holds out a fifth of each other sequence" in known(doubly_held_out(held))
     assert doubly_held_out(TrainSettings()) is doubly_held_out(replace(held, split="none")) is None

@@ -222,7 +222,7 @@ def camera_at(*center: float) -> Camera:
     return Camera(torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), viewmat, 16, 16)
 
 
-def test_extent_is_that_of_the_training_cameras() -> None:
+def test_extent_is_that_of_the_training_cameras_and_reaches_rates_in_its_unit_only() -> None:
     _, sequence = toy_sequence(2, 16)
 
     def extent(places: list[tuple[float, float, float]], *seen: int) -> float:
@@ -237,9 +237,6 @@ def test_extent_is_that_of_the_training_cameras() -> None:
     arc = [(math.sin(angle), 0.0, math.cos(angle)) for angle in angles]
     assert extent(arc, *range(16)) == pytest.approx(0.8, abs=0.02)
     assert (PAPER.density.split_size, PAPER.density.prune_size) == (0.005 / FOOTAGE.least_extent, 0.05 / 0.5)
-
-
-def test_extent_reaches_rates_in_its_unit_only() -> None:
     for config, factor in ((plain_gaussian_avatars(), 1), (plain_gaussian_avatars(means_times_extent=True), 3)):
         moved = []
         for extent in (1.0, 3.0):

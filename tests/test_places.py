@@ -100,15 +100,12 @@ def test_only_mien_system_knows_systems_apart():
     assert found == ["import fcntl", "os.kill", "signal.SIGHUP", "from pty"]
 
 
-def test_processes_that_have_ended_do_not_live():
+def test_processes_that_have_ended_do_not_live_and_the_peak_of_memory_grows_with_what_is_taken():
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         assert system.may_live(child.pid)
         child.communicate(b"\n")
     assert not system.may_live(child.pid)
     assert system.may_live(os.getpid())
-
-
-def test_the_peak_of_memory_grows_with_what_is_taken():
     before = system.peak_memory_mb()
     assert 5 < before < 100_000
     taken = bytearray(round((before + 40) * 2**20))

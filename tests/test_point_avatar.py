@@ -63,13 +63,21 @@ def test_points_double_and_shrink_together() -> None:
     torch.testing.assert_close(avatar.store["means"].norm(dim=-1), torch.full((400,), 0.125))
 
 
-def test_slopes_are_the_gradients_of_the_distance() -> None:
+def test_slopes_are_the_gradients_of_the_distance_and_losses_hold_points_where_it_is_none() -> None:
     torch.manual_seed(0)
     network, points = SurfaceNet(16, 3, 2).double(), torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     found = network(points)
     torch.testing.assert_close(found.slope, torch.autograd.grad(found.distance.sum(), points)[0])
+    avatar = new_avatar()
+    posed = avatar.pose(toy_face(5)[1], Progress(4, 100))
+    rendering = rasterize(posed.gaussians.timestep(0), toy_camera(32), torch.ones(3))
+    losses = avatar.regularizers(posed, rendering, Progress(4, 100))
+    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
+    torch.testing.assert_close(losses["distance"], surface.distance.square().mean())
+    torch.testing.assert_close(losses["slope"], 0.1 * (surface.slope.norm(dim=-1) - 1).square().mean())
+    assert set(losses) >= {"skinning", "expression_directions"}
 
 
 def test_a_color_is_albedo_times_light_on_the_normal() -> None:
@@ -112,17 +120,6 @@ def test_points_that_others_hide_are_not_drawn() -> None:
     (rendering.image * torch.linspace(0, 1, 32)[:, None]).sum().backward()
     seen = was_drawn(gaussians, rendering)
     assert (seen[0], seen[4]) == (1, 0)
-
-
-def test_losses_hold_points_on_a_surface_whose_slope_is_one() -> None:
-    avatar = new_avatar()
-    posed = avatar.pose(toy_face(5)[1], Progress(4, 100))
-    rendering = rasterize(posed.gaussians.timestep(0), toy_camera(32), torch.ones(3))
-    losses = avatar.regularizers(posed, rendering, Progress(4, 100))
-    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
-    torch.testing.assert_close(losses["distance"], surface.distance.square().mean())
-    torch.testing.assert_close(losses["slope"], 0.1 * (surface.slope.norm(dim=-1) - 1).square().mean())
-    assert set(losses) >= {"skinning", "expression_directions"}
 
 
 def test_closing_fills_bright_specks_and_keeps_the_rest() -> None:

@@ -157,7 +157,7 @@ def test_layouts_and_dtypes() -> None:
     assert [choose_backend(one.background) for one in (scene, double)] == ["native", "reference"]
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_what_does_not_fit_or_cannot_be_counted_is_refused() -> None:
     scenes = [random_scene(seed) for seed in range(3)]
     one, cameras = scenes[0].gaussians, [scene.camera for scene in scenes]
     for gaussians, given, words in (
@@ -168,6 +168,13 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         with pytest.raises(ValueError, match=words):
             rasterize(gaussians, given, torch.zeros(3))
+    count, width = 70_000, 1_048_544  # each Gaussian touches all of 32,767 tiles
+    gaussians = one_gaussian(scale=3.0).select(torch.zeros(count, dtype=torch.long))
+    gaussians.means[:, 2] += torch.linspace(0, 1, count)
+    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), 0.5], [0, 0, 1]])
+    words = r"^it: cannot be drawn \(too many pairs .*\); do something else$"
+    with pytest.raises(UserError, match=words), drawable("it", "do something else"):
+        rasterize_in_place(gaussians, Camera(K, torch.eye(4), width, 1), torch.ones(3), backend="native")
 
 
 def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
@@ -193,13 +200,3 @@ def test_a_forked_child_renders() -> None:
 def test_gsplat_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
     refuses("pip install gsplat==", rasterize_in_place, one_gaussian(), front_camera(), torch.zeros(3), "gsplat")
-
-
-def test_more_pairs_than_can_be_counted_are_refused():
-    count, width = 70_000, 1_048_544  # each Gaussian touches all of 32,767 tiles
-    gaussians = one_gaussian(scale=3.0).select(torch.zeros(count, dtype=torch.long))
-    gaussians.means[:, 2] += torch.linspace(0, 1, count)
-    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), 0.5], [0, 0, 1]])
-    words = r"^it: cannot be drawn \(too many pairs .*\); do something else$"
-    with pytest.raises(UserError, match=words), drawable("it", "do something else"):
-        rasterize_in_place(gaussians, Camera(K, torch.eye(4), width, 1), torch.ones(3), backend="native")

@@ -137,16 +137,13 @@ def test_what_is_not_the_person_goes(given: np.ndarray, others: np.ndarray, want
     np.testing.assert_array_equal(without_others(given, FACE, others), wanted)
 
 
-def test_what_a_hair_joins_goes_and_people_who_touch_are_cut_between_their_faces() -> None:
+def test_what_a_hair_joins_goes_and_a_face_that_is_missed_for_some_frames_still_counts() -> None:
     found = without_others(drawn(PERSON, BOTTLE, bridge=4), FACE, NOBODY)
     assert found[:, 250:].max() == 0
     assert found[81:83, 140].min() > 200
     found = without_others(drawn(PERSON, HEAD, bridge=40), FACE, OTHER[None]) > 0
     assert found[100, :150].sum() > 100
     assert not found[:, 155:].any()  # faces of one size: the border is in the middle, between 90 and 200
-
-
-def test_a_face_that_is_missed_for_some_frames_still_counts() -> None:
     others = np.full((40, 1, 4), np.nan)
     others[10] = OTHER
     assert np.isfinite(held(others, 12)[:, 0, 0]).nonzero()[0].tolist() == list(range(23))

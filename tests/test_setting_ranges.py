@@ -80,7 +80,7 @@ def test_ranges_in_words() -> None:
     check_ranges(Some(first=0.5, last=0.5), str)
 
 
-def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
+def test_training_refuses_settings_out_of_range_and_tells_of_those_that_make_it_diverge(tmp_path: Path) -> None:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     for config, settings, words in (
         (train_toy.CONFIG, TrainSettings(record_every=0), "--training.record-every 0"),
@@ -88,9 +88,6 @@ def test_training_refuses_settings_out_of_range(tmp_path: Path) -> None:
     ):
         refuses(words, train, [sequence], face_model, config, settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_settings_that_make_training_diverge_are_told(tmp_path: Path) -> None:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     config = replace(HeadGasConfig(points=50), log_scales_rate=Rate(100.0))
     with pytest.raises(UserError, match=r"training diverged by step \d+ \(.*\); lower the learning rates"):

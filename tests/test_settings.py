@@ -203,7 +203,7 @@ def test_files_that_make_no_sense_are_refused_before_any_work(content: str, word
     assert not (workspace / "runs").exists()
 
 
-def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_paths_that_are_no_file_and_files_of_another_method_are_refused(workspace: Path, capsys) -> None:
     runs = workspace / "runs"
     (runs / "a").mkdir(parents=True)
     (runs / "a" / "config.json").touch()
@@ -213,9 +213,6 @@ def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.Capt
         ("/dev/null", "is not an ordinary file"), ("", "--config= is empty"),
     ):  # fmt: skip
         assert words in complaint(capsys, ["train", str(workspace), f"--config={path}"])
-
-
-def test_a_file_of_another_method_than_asked_for_is_refused(workspace: Path, capsys: Any) -> None:
     words = [*with_file(workspace, '{"method": {"kind": "headgas"}}'), "--method", "gaussian_avatars"]
     assert "has settings of headgas, but --method asks for gaussian_avatars" in complaint(capsys, words)
 

@@ -1,6 +1,5 @@
 """Side views, which no camera took, and the soft cut: opacities fade towards the neck cut."""
 
-from known import known
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from known import known
 from mien import runtime
 from mien.avatar import GaussianAvatars, Progress, make_portable, method_named
 from mien.camera import camera_from_fov

@@ -119,7 +119,7 @@ QUATS_IN_SPZ = {
 three in that order, a sign and 9 bits of size each, in steps of sqrt(1/2) / 511. 0.6 is 434 steps."""
 
 
-def test_quaternions_lie_in_spz_in_the_order_of_its_specification(tmp_path: Path) -> None:
+def test_quaternions_lie_in_spz_as_its_specification_says_and_far_positions_are_coarser(tmp_path: Path) -> None:
     """Writer and reader could swap components alike, which no round trip would see."""
     quats = torch.tensor(list(QUATS_IN_SPZ))
     write_spz(tmp_path / "a.spz", replace(some(len(quats), 1), quats=quats), version=3)
@@ -127,6 +127,13 @@ def test_quaternions_lie_in_spz_in_the_order_of_its_specification(tmp_path: Path
     assert np.frombuffer(content[-4 * len(quats) :], "<u4").tolist() == list(QUATS_IN_SPZ.values())
     same = (read_spz(tmp_path / "a.spz").quats * quats).sum(-1).abs()
     torch.testing.assert_close(same, torch.ones(len(quats)), atol=1e-4, rtol=0)
+    # Positions beyond 128 m take bits from behind the point; what no bits can hold is refused.
+    near = some(10, 1)
+    far = replace(near, means=near.means + 1000)
+    write_spz(tmp_path / "a.spz", far)
+    expect_near(read_spz(tmp_path / "a.spz"), far, replace(SPZ_LOSS, meters=2**-13))
+    with pytest.raises(UserError, match=r"a\.spz: a Gaussian is 1e\+09 m away, too far for \.spz"):
+        write_spz(tmp_path / "a.spz", replace(near, means=near.means + 1e9))
 
 
 @pytest.mark.parametrize(
@@ -144,16 +151,6 @@ def test_another_program_opens_them(tmp_path: Path, ending: str, coefficients: i
         found = in_world(replace(found, T_world_local=HALF_TURN))
         expect_near(found, written, SPZ_LOSS)
         expect_near(found, read_spz(path), Loss(color=1e-5, higher=1e-5, opacity=1e-6))
-
-
-def test_far_positions_in_spz_are_coarser(tmp_path: Path) -> None:
-    """Positions beyond 128 m take bits from behind the point; what no bits can hold is refused."""
-    near = some(10, 1)
-    far = replace(near, means=near.means + 1000)
-    write_spz(tmp_path / "a.spz", far)
-    expect_near(read_spz(tmp_path / "a.spz"), far, replace(SPZ_LOSS, meters=2**-13))
-    with pytest.raises(UserError, match=r"a\.spz: a Gaussian is 1e\+09 m away, too far for \.spz"):
-        write_spz(tmp_path / "a.spz", replace(near, means=near.means + 1e9))
 
 
 def test_similar_gaussians_share_coefficients() -> None:

@@ -1,6 +1,5 @@
 """Nothing heavy is imported before it is needed, and the base install works without what an extra brings."""
 
-from known import known
 import importlib
 import json
 import subprocess
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from known import known
 from mien import extras, runtime
 from mien.avatar import make_portable
 from mien.cli import COMMANDS, main
@@ -157,12 +157,9 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_create_needs_no_package_of_another_extra():
+def test_extras_bring_what_commands_need_and_the_base_install_asks_for_five_packages():
     missing = {module for module, extra in extras.EXTRA_OF.items() if extra not in ("create", "video")}
     assert "mien.commands.stages.training" in python_without(missing, STAGES).split()
-
-
-def test_extras_bring_what_error_messages_say_and_the_base_install_asks_for_five_packages():
     asked = requirements_of(PROJECT)
     assert {name for name, extra in asked.items() if not extra} == {"numpy", "safetensors", "jaxtyping", "tyro", "rich"}
     extra_of = {extras.PACKAGE_OF.get(module, module).lower(): extra for module, extra in extras.EXTRA_OF.items()}

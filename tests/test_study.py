@@ -1,6 +1,5 @@
 """`mien study`: a page shows runs blind and in random order, saves answers, and the tally counts them."""
 
-from known import known
 import base64
 import json
 import re
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 import train_toy
+from known import known
 from mien.avatar import METHODS
 from mien.capture.video import read_video_frames
 from mien.cli import main
@@ -260,7 +260,7 @@ SAVE = """(async () => {
 })()"""
 
 
-def test_a_participant_answers_in_a_browser(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_participant_answers_in_a_browser_under_a_name_of_their_own(page: Path, tmp_path: Path, capsys) -> None:
     key = read_key(page.with_name("study.key.json"))
     toy, begun = (
         [tile for clip in key.clips for tile in clip.tiles if clip.tiles[tile] == run] for run in ("toy", "begun")
@@ -289,9 +289,6 @@ def test_a_participant_answers_in_a_browser(page: Path, tmp_path: Path, capsys: 
     assert main(["study", "tally", str(page.with_name("study.key.json")), str(saved), "--json"]) == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
     assert (runs["toy"]["quality"]["percent"], runs["begun"]["expression"]["percent"]) == (100, 100)
-
-
-def test_everybody_can_take_part_under_a_name_of_their_own(page: Path) -> None:
     expect_usable(page, "", f"{START};")
     name = 'document.getElementById("participant").textContent'
     first, other = (browse(page, [START, name])["results"][1] for _ in range(2))

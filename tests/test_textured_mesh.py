@@ -65,13 +65,25 @@ def plane_model(cells: int = 5) -> FaceModel:
     )  # fmt: skip
 
 
-def test_surfels_cover_equal_areas() -> None:
+def test_surfels_cover_equal_areas_and_follow_offsets_exactly() -> None:
     model = plane_model()
     bound = place_surfels(model.template, model.faces, 3000)
     assert len(bound) == pytest.approx(3000, rel=0.05)
     own = triangle_geometry(model.template, model.faces)[1] / torch.bincount(bound)
     assert own.max() / own.min() < 1.4
     assert torch.bincount(place_surfels(model.template, model.faces, 1)).tolist() == [1] * len(model.faces)
+    avatar = new_avatar(disturbed=1.0)
+    model, face, bound = avatar.face_model, at_rest(avatar), avatar.store["face_index"]
+    posed = avatar.pose(face)
+    corners = (model.rest_vertices(face) + posed.aux["offsets"])[model.faces]
+    surfels = Surfels(bound, len(model.faces), model.template)
+    torch.testing.assert_close(posed.gaussians.means[0], surfels.at_corners(corners), atol=1e-6, rtol=0)
+    # A surfel's covariance is that of its part of the triangle, twice and a half as wide along each axis.
+    parts = (corners - corners.mean(1, keepdim=True))[bound] * surfels.shares()[:, None, None]
+    expected = PLAIN.overlap**2 * parts.transpose(1, 2) @ parts / 12
+    turns, scales = matrix_from_quaternion(posed.gaussians.quats[0]), posed.gaussians.scales[0]
+    found = turns @ torch.diag_embed((scales * torch.tensor([1, 0, 1])) ** 2) @ turns.transpose(1, 2)
+    torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-3)
 
 
 def picture(avatar: TexturedMesh) -> tuple[Tensor, Tensor]:
@@ -103,21 +115,6 @@ def test_surfels_cover_the_mesh(surfels: int, least: float) -> None:
     assert stretched[inside].min() > least - 0.01
     narrow, inside = picture(new_avatar(replace(config, overlap=1.2), plane_model()))
     assert narrow[inside].min() < 0.9
-
-
-def test_surfels_follow_offsets_exactly() -> None:
-    avatar = new_avatar(disturbed=1.0)
-    model, face, bound = avatar.face_model, at_rest(avatar), avatar.store["face_index"]
-    posed = avatar.pose(face)
-    corners = (model.rest_vertices(face) + posed.aux["offsets"])[model.faces]
-    surfels = Surfels(bound, len(model.faces), model.template)
-    torch.testing.assert_close(posed.gaussians.means[0], surfels.at_corners(corners), atol=1e-6, rtol=0)
-    # A surfel's covariance is that of its part of the triangle, twice and a half as wide along each axis.
-    parts = (corners - corners.mean(1, keepdim=True))[bound] * surfels.shares()[:, None, None]
-    expected = PLAIN.overlap**2 * parts.transpose(1, 2) @ parts / 12
-    turns, scales = matrix_from_quaternion(posed.gaussians.quats[0]), posed.gaussians.scales[0]
-    found = turns @ torch.diag_embed((scales * torch.tensor([1, 0, 1])) ** 2) @ turns.transpose(1, 2)
-    torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-3)
 
 
 def test_offsets_and_colours_are_averaged_over_neighbours() -> None:

@@ -165,9 +165,6 @@ def test_priors_weigh_as_much_in_the_cost_as_in_the_equations(case):
     torch.testing.assert_close(equations.cost, wanted)
     torch.testing.assert_close(equations.gradient, own.state @ precision)
     torch.testing.assert_close(equations.hessian, precision.expand_as(equations.hessian))
-
-
-def test_shared_parameters_have_one_prior_in_the_cost_and_in_the_equations(case):
     term, own, subject = case
     fit = fitting.Fit(subject, (own,))
     precision = precision_of_shared(fit, [0], TrackingSettings())

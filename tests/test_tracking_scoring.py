@@ -137,7 +137,7 @@ def test_bowed_chin_stays_and_slivers_go():
     assert head_crop(0 * mask).tolist() == [0, 0, 60, 50]
 
 
-def test_make_scoring():
+def test_scoring_keeps_what_is_above_the_line_of_each_picture_and_nothing_else():
     model, face = _upright(2)
     scoring = make_scoring(capture_of(torch.full((2, 478, 2), 100.0)), _tracking(model, face), model)
     assert (scoring.masks.shape, scoring.cut) == ((2, 1, SIZE, SIZE), "plane")
@@ -147,10 +147,7 @@ def test_make_scoring():
     left, top, width, height = scoring.crops[0, 0]
     assert (left, top, width) == (0, 0, SIZE)
     assert abs(height - row) < 15
-
-
-def test_the_cut_line_keeps_what_is_above_the_line_of_each_picture_and_nothing_else():
-    """`line` is the supplement's mask: a straight line in the picture, and no exception for what is below it."""
+    # `line` is the supplement's mask: a straight line in the picture, and no exception for what is below it.
     model, face = _upright(2, roll=0.5)
     tracking, capture = _tracking(model, face), capture_of(torch.full((2, 478, 2), 100.0))
     scoring = make_scoring(capture, tracking, model, settings=ScoringSettings("line"))

@@ -43,7 +43,7 @@ def test_splits(timesteps: int, split: Split, expected: list[int]) -> None:
     assert held_out(timesteps, split).nonzero()[:, 0].tolist() == expected
 
 
-def test_frames_leave_out_what_is_invalid_or_held_out() -> None:
+def test_frames_leave_out_what_is_invalid_or_held_out_which_has_to_be_there() -> None:
     _, sequence = toy_sequence(60, 16)
     valid = np.ones((60, 1), dtype=bool)
     valid[3] = False
@@ -53,9 +53,6 @@ def test_frames_leave_out_what_is_invalid_or_held_out() -> None:
     assert {frame.timestep for frame in frames if frame.sequence == 1} == set(range(60)) - {3} - set(range(40, 50))
     only = training_frames([sequence, second], plain_run(split="none", held_out_sequences=("toy",)))
     assert {frame.sequence for frame in only} == {1}
-
-
-def test_what_is_held_out_has_to_be_there() -> None:
     _, sequence = toy_sequence(12, 16)
     for settings, words in (
         (plain_run(held_out_sequences=("tyo",)), "--hold-out tyo: no such sequence in this run; there are: toy"),
@@ -224,7 +221,7 @@ def workers() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("mien-targets")]
 
 
-def test_native_composite_has_the_integers_of_the_reference() -> None:
+def test_native_composite_has_the_integers_of_the_reference_and_rounds_every_one() -> None:
     random = np.random.default_rng(0)
     for width in (1, 7, 8, 50, 64) * 20:
         image = random.integers(0, 256, (9, width, 3), dtype=np.uint8)
@@ -237,9 +234,6 @@ def test_native_composite_has_the_integers_of_the_reference() -> None:
         for seen, box in ((matte, None), (matte * inside, (left, 2, right - left, 5))):
             expected = composite_reference(image, seen, background, box)
             np.testing.assert_array_equal(composite(image, seen, background, box), expected)
-
-
-def test_every_integer_is_the_rounded_one() -> None:
     value, matte = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
     image = np.repeat(value[..., None], 3, axis=2)
     for gray in (0, 1, 100, 255):

@@ -31,17 +31,14 @@ def random_rig(
     return vertices, faces, face_index, means, quats, log_scales
 
 
-def test_frame_of_a_known_triangle():
+def test_a_known_triangle_has_its_frame_and_a_gaussian_at_rest_takes_it():
     vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1, 0]])
     frames = triangle_frames(vertices, torch.tensor([[0, 1, 2]]))
     # Columns: first edge (+x), normal (+z), their cross product (-y).
     torch.testing.assert_close(frames.R[0], torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
     torch.testing.assert_close(frames.T[0], torch.tensor([2.5 / 3, 1 / 3, 0]))
     torch.testing.assert_close(frames.k[0], torch.tensor(1.5))
-
-
-def test_a_gaussian_at_rest_takes_its_triangles_frame():
-    """The native core uses each of the four quaternion formulas."""
+    # The native core uses each of the four quaternion formulas.
     vertices, faces, *_ = random_rig()
     frames, zeros = triangle_frames(vertices, faces), torch.zeros(30, 3)
     unit, bound = torch.tensor([3.0, 0, 0, 0]).expand(30, 4), torch.arange(30)

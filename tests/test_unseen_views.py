@@ -15,13 +15,22 @@ from mien.lab.synthetic.recipe import SIDES
 from mien.rotation import matrix_from_axis_angle
 
 
-def test_the_front_camera_is_that_of_the_tracking() -> None:
+def test_views_begin_at_the_tracked_camera_and_show_moments_of_the_held_out_sequence() -> None:
     """Whatever the tracked face, focal length and distance are, the avatar is seen as it was trained."""
     own = _camera(0.48, (0.02, 0.1, 0.8))
     front = Front(_camera(0.5, (0.0, 0.1, 0.9)), own, np.array([0.01, 0.0, 0.02]), np.array([0.03, -0.01, 0.05]))
     placed = camera_beside(front.true, front)
     torch.testing.assert_close(placed.viewmat, own.viewmat)
     torch.testing.assert_close(placed.K, own.K)
+    # The side views are those timesteps of the sequence, in the front camera as well, and no one else's.
+    reference = REFERENCES["mono-sides"]
+    assert known(reference.views).sequence in reference.held_out_sequences
+    front, aside, views = reference.tiny().scenes()
+    for index, timestep in enumerate(known(views.moments)):
+        torch.testing.assert_close(views.vertices(index), aside.vertices(timestep))
+    assert not torch.equal(front.vertices(0), aside.vertices(0))
+    assert len(views.cameras) == len(SIDES) + 1
+    torch.testing.assert_close(views.cameras[0].viewmat, aside.camera.viewmat)
 
 
 def test_a_camera_aside_sees_a_true_tracking_where_it_sees_the_person() -> None:
@@ -52,18 +61,6 @@ def test_a_camera_aside_sees_a_true_tracking_where_it_sees_the_person() -> None:
 def _camera(field_of_view: float, place: tuple[float, float, float]) -> Camera:
     viewmat = look_at(torch.tensor(place), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     return camera_from_fov(field_of_view, 320, 320, viewmat)
-
-
-def test_views_show_moments_of_the_held_out_sequence() -> None:
-    """The side views are those timesteps of the sequence, in the front camera as well, and no one else's."""
-    reference = REFERENCES["mono-sides"]
-    assert known(reference.views).sequence in reference.held_out_sequences
-    front, aside, views = reference.tiny().scenes()
-    for index, timestep in enumerate(known(views.moments)):
-        torch.testing.assert_close(views.vertices(index), aside.vertices(timestep))
-    assert not torch.equal(front.vertices(0), aside.vertices(0))
-    assert len(views.cameras) == len(SIDES) + 1
-    torch.testing.assert_close(views.cameras[0].viewmat, aside.camera.viewmat)
 
 
 def test_table_and_chart(tmp_path) -> None:  # noqa: ANN001

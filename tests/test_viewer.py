@@ -139,7 +139,7 @@ def test_a_motion_that_cannot_be_loaded_leaves_all_as_it_was(avatar: runtime.Ava
     assert (session.clip is None, session.timestep) == (False, 2)
 
 
-def test_pictures_have_the_shape_of_the_window(session: Session) -> None:
+def test_pictures_have_the_shape_of_the_window_and_are_those_of_the_native_renderer(session: Session) -> None:
     view = front_view(session.avatar, 960, 640)
     assert session.picture(view).shape == (512, 768, 3)
     assert session.picture(view, full=False).shape == (256, 384, 3)
@@ -154,9 +154,6 @@ def test_pictures_have_the_shape_of_the_window(session: Session) -> None:
         decoded = cv2.imdecode(np.frombuffer(saved, np.uint8), cv2.IMREAD_COLOR)
         assert decoded is not None
         assert decoded.shape == (*shape, 3)
-
-
-def test_a_view_is_that_of_the_native_renderer_and_a_head_fits_a_narrow_window(session: Session) -> None:
     expected, _ = session.avatar.render(session.avatar.pose(), session.avatar.camera.resized(64, 64))
     np.testing.assert_array_equal(session.picture(front_view(session.avatar, 64, 64)), to_rgb(expected))
     wide, narrow = (session.picture(front_view(session.avatar, width, 192)) for width in (192, 96))

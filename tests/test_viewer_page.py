@@ -1,6 +1,5 @@
 """The viewer's server: real connections, two clients, clients that vanish, the door, and a real browser."""
 
-from known import known
 import asyncio
 import contextlib
 import gzip
@@ -15,6 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+
+from known import known
 
 pytest.importorskip("viser")
 
@@ -339,5 +340,4 @@ def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
 
 
 def read(path: Path) -> np.ndarray:
-    picture = known(cv2.imread(str(path)))
-    return picture
+    return known(cv2.imread(str(path)))

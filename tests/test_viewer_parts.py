@@ -1,6 +1,5 @@
 """The viewer's door, loop and worker, and a viewer that shows an avatar while it trains."""
 
-from known import known
 import os
 import signal
 import subprocess
@@ -19,6 +18,7 @@ import torch
 import train_toy
 from capture_helpers import tree_bytes
 from forked import ForkServer
+from known import known
 from mien import runtime
 from mien.avatar import make_portable
 from mien.commands.stages import live_view, viewing
