@@ -92,7 +92,6 @@ def encode(
     prepare: Callable[[Any], object] = lambda stream: None,
 ) -> None:  # fmt: skip
     """Encode a video with FFmpeg, whose names of codecs and pixel formats are given.
-
     Frames are RGB pictures [h, w, 3], lists of planes of the pixel format, or as PyAV has them. `ticks` are their times
     in units of the rate. `colors` are stated by the codec's header and the frames, `tags` by the container. Without
     options, libx264 keeps nearly every level. `prepare` changes the stream before anything is encoded."""

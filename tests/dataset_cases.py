@@ -1,5 +1,4 @@
 """Cases of the fuzzer of datasets: a small dataset of each layout, one fault in it, and what may come of that.
-
 A case is a layout and a number; the number decides the fault and the way in which the dataset is read."""
 
 import shutil

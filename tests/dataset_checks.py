@@ -60,7 +60,6 @@ def check_projection(
     which: np.ndarray | slice = slice(None),
 ) -> None:  # fmt: skip
     """Check the imported face and camera against some of the writer's vertices, and the writer's camera.
-
     Where a moving camera became a moving head, what is compared is the motion from the writer's world to the camera.
     The writer's world is `scale` times as large."""
     K, rotation, translation = view

@@ -171,7 +171,6 @@ def posed_as_flame(
     offsets: np.ndarray | float = 0.0,
 ) -> np.ndarray:  # fmt: skip
     """Return vertices [v, 3] by the formulas of GaussianAvatars (methods.md A.1), in float64.
-
     `pose` [5, 3] holds the axis-angles of root, neck, jaw and eyes; `shape` holds all coefficients. Joints are
     regressed from the shaped vertices: identity, expression and static offsets [v, 3]."""
     shaped = shaped_as_flame(arrays, shape, offsets)

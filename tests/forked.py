@@ -88,7 +88,6 @@ class ForkServer:
         path: Sequence[Path] = (), exits: bool = False,
     ) -> Forked:  # fmt: skip
         """Start a process that calls a function, as in "module:name", with arguments that json can carry.
-
         Modules of tests are found, and those in the folders of `path`. Without `cwd`, its folder is that of the tests,
         and the variables of `env` are set on top of today's. `exits` says that what it returns is the exit code."""
         self._count += 1

@@ -1,5 +1,4 @@
 """Plain settings of methods and runs: small, fast, with open sides, and without what the defaults add to the papers.
-
 Tests of a formula or a mechanism use them, so that a change of a default does not change what they check."""
 
 from dataclasses import replace

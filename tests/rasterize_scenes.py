@@ -47,7 +47,6 @@ def rasterize_anywhere(
 
 def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int = 61, height: int = 45) -> Scene:
     """Return Gaussians of all shapes around a tilted camera.
-
     Some are behind it, outside of the picture or transparent."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -68,7 +67,6 @@ def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int 
 
 def comparable_pixels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Tensor:
     """Return the pixels [h, w] that do not change when the two cutoffs move a little.
-
     At the others, an alpha or a transmittance is so close to its cutoff that rounding decides."""
     pictures = []
     for factor in (1 - 1e-4, 1 + 1e-4):

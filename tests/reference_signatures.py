@@ -33,7 +33,6 @@ mm; one such step is allowed."""
 
 def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     """Return the means and standard deviations of picture blocks, the means of matte blocks, landmarks and vertices.
-
     The pictures are those of the first, middle and last timestep from the first and the last camera. The parts are flat
     lists in grey levels, pixels and millimetres."""
     timesteps = sorted({0, scene.timesteps // 2, scene.timesteps - 1})

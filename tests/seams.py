@@ -41,7 +41,6 @@ OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}
 
 def naming_faults(texts: Mapping[str, str]) -> Iterator[str]:
     """Yield a message for each file that names a method and may not, and for each of `MAY_NAME` that names none.
-
     A method's name counts anywhere in a file, also in comments. Its classes count in code alone, since papers that
     docstrings cite are written like them."""
     idle = set(MAY_NAME)

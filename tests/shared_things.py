@@ -1,5 +1,4 @@
 """Things that several files of tests read. A run makes each once, by the fixture `made_once` (tests/conftest.py).
-
 Folders are for reading: a test that changes one copies it first."""
 
 from collections.abc import Callable

@@ -1,5 +1,4 @@
 """Bad input is refused in one line. docs/bad_input.md lists for every command which test shows this.
-
 On a full disk, every writer says so, and keeps the file of before; then the same command succeeds."""
 
 import errno
@@ -37,7 +36,7 @@ from mien.training import read_run_config, read_training_summary
 from mien.training.checkpoint import checkpoint_files
 from mien.workspace import Workspace, open_workspace
 from needs import NO_MOUNT
-from refusals import refuses
+from refusals import complaint, refuses
 from shared_things import MadeOnce, toy_workspace
 from toy_scene import toy_sequence
 
@@ -154,8 +153,7 @@ def test_a_full_disk_or_memory_anywhere_is_no_bug(error: Exception, words: str, 
         raise error
 
     monkeypatch.setattr("mien.workspace.Workspace.sequence_names", fail)
-    assert main(["track", str(tmp_path)]) == 2
-    assert words in capsys.readouterr().err
+    assert words in complaint(capsys, "track", str(tmp_path))
 
 
 def test_workspaces_in_odd_places(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -170,8 +168,7 @@ def test_workspaces_in_odd_places(run_dir: Path, tmp_path: Path, capsys: pytest.
             (tmp_path / "out", "is a file"),
             *((outer / name, f"inside the workspace {outer}") for name in ("runs", "sequences/other", "runs/new/deep")),
         ):
-            assert main([command, str(tmp_path / "a.mp4"), "--out", str(place)]) == 2
-            shown = capsys.readouterr().err
+            shown = complaint(capsys, command, str(tmp_path / "a.mp4"), "--out", str(place))
             assert words in shown
             assert "disk space" not in shown
     assert (tmp_path / "out").read_text() == "mine"
@@ -268,7 +265,6 @@ def test_a_full_disk_leaves_the_avatar_that_was_there(given: Path, tmp_path: Pat
 @pytest.fixture(params=["limit", "mount"])
 def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Return a folder, and what fills its disk: a limit, or a disk of 16 MiB in memory.
-
     On the latter, the temporary files of libraries are on the full disk, too."""
     if request.param == "limit":
         yield tmp_path, small_disk

@@ -35,7 +35,7 @@ from mien.commands.stages.batch_table import read_table
 from mien.files import write_atomically
 from mien.locks import hold
 from other_process import Holder
-from refusals import refuses
+from refusals import complaint, refuses
 
 
 def run_stubs(batch: Batch, rows: list[Row], **options: object) -> dict[str, str]:
@@ -225,14 +225,6 @@ def check_store(batch: Batch, store: str, *steps: tuple[str, str]) -> None:
 # Of strangers ---------------------------------------------------------------------------------------------------------
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that must be refused in one line, and return the line."""
-    capsys.readouterr()
-    assert main(list(arguments)) == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
-    return line
-
-
 @pytest.mark.parametrize(("name", "text"), [
     ("a.csv", "video,preset\nann.mp4,draft;--out;/elsewhere\n"),
     ("a.csv", "video;preset\nann.mp4;--out=/elsewhere\n"),
@@ -302,7 +294,7 @@ def test_hostile_states_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[s
     batch.state_file("ann").write_text(content)
     assert main(["batch", "status", str(tmp_path)]) == 0
     assert f"{batch.state_file('ann')}: damaged (" in capsys.readouterr().out.replace("\n", "")
-    assert "no row is done yet" in refused(capsys, "batch", "table", str(tmp_path))
+    assert "no row is done yet" in complaint(capsys, "batch", "table", str(tmp_path))
 
 
 def test_formulas_in_headings_are_defused(tmp_path: Path) -> None:

@@ -1,5 +1,4 @@
 """`mien bench quality` measures no error if the tracking is the truth, and the right amount if it is not.
-
 Known lags, losses of amplitude and jitter are found."""
 
 from dataclasses import replace
@@ -10,13 +9,13 @@ import pytest
 import torch
 
 from capture_helpers import random_capture
-from mien.cli import main
 from mien.commands.bench import CaptureName
 from mien.lab.benchmarking import following, quality
 from mien.lab.synthetic import RECIPES, REFERENCES, Segment, SyntheticScene, Truth, truth_of
 from mien.render.mesh import vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import Tracking
+from refusals import complaint
 from small_face_model import make_small_face_model
 from tracking_case import still_camera
 
@@ -114,8 +113,7 @@ def test_the_table_names_key_and_baselines(tmp_path, capsys):
     known = quality.TrackingErrors(1.0, 2.0, 3.0, 0.5, 0.02, 0.04, following.Following(0.3, 7.0, 5), None, 0.61)
     assert quality.tracking_cells(known).endswith("| 0.020 px, 0.040 mm | 0.30 frames, 7 % (5) | - | 0.61 %")
     # An unknown capture is told.
-    assert main(["bench", "quality", "--captures", "mono", "--out", str(tmp_path)]) == 2
-    assert "mono-short" in capsys.readouterr().err
+    assert "mono-short" in complaint(capsys, "bench", "quality", "--captures", "mono", "--out", str(tmp_path))
     assert set(get_args(CaptureName)) == set(REFERENCES), "the command line knows their names without importing them"
 
 

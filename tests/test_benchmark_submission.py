@@ -58,7 +58,6 @@ def film_of(video: Path, truth: Path, rate: float) -> tuple[np.ndarray, np.ndarr
 
 def inside(pictures: np.ndarray, mattes: np.ndarray, shift: int = 0) -> list[float]:
     """Return the share of each avatar's dark pixels that lie on the matte, moved sideways by some pixels.
-
     An avatar of two steps is a fog, and ends at the neck, so that its silhouette is not that of the matte."""
     dark, solid = pictures.min(-1) < 205, np.roll(mattes[..., 0] > 127, shift, axis=2)
     assert dark.sum((1, 2)).min() > 300

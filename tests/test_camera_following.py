@@ -22,6 +22,7 @@ from mien.lab.synthetic import RECIPES, Segment, SyntheticScene
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime import write_portable
 from mien.viewer import CameraSwitch, DrawingLoop, Seen, Session, View
+from refusals import complaint
 from test_live_camera import FPS, Stage, until
 from web_case import drawn_head
 
@@ -273,5 +274,4 @@ def test_what_the_command_refuses(tmp_path: Path, capsys) -> None:
         (["--by", f"camera:{clip}", "--port", "99999"], "--port 99999"),
         (["--by", str(clip), "--camera-format", "v4l2", "--out", "a.mp4"], "--camera-format"),
     ):
-        assert main(["drive", str(avatar), *options]) == 2
-        assert message in capsys.readouterr().err
+        assert message in complaint(capsys, "drive", str(avatar), *options)

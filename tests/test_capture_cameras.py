@@ -109,8 +109,7 @@ def test_same_command_reads_the_capture_back_and_an_interrupted_one_continues(ri
     capture_cameras([rig[0]], rig[1], tmp_path / "whole" / "capture", "s", settings)
     calls = interrupt_at(3, monkeypatch, from_cameras, "process_part")
     out = tmp_path / "stopped" / "capture"
-    with pytest.raises(KeyboardInterrupt):
-        capture_cameras([rig[0]], rig[1], out, "s", settings)
+    pytest.raises(KeyboardInterrupt, capture_cameras, [rig[0]], rig[1], out, "s", settings)
     capture_cameras([rig[0]], rig[1], out, "s", settings)
     assert tree_bytes(out) == tree_bytes(tmp_path / "whole" / "capture")
     done = len(calls)

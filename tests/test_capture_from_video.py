@@ -93,8 +93,7 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
     capture_video(face_clip, tmp_path / "straight" / "capture", settings)
     out = tmp_path / "interrupted" / "capture"
     calls = interrupt_at(2, monkeypatch, process.PartProcessor, "process")
-    with pytest.raises(KeyboardInterrupt):
-        capture_video(face_clip, out, settings)
+    pytest.raises(KeyboardInterrupt, capture_video, face_clip, out, settings)
     refuses("no capture there", read_capture, out)
     capture_video(face_clip, out, settings)
     assert [start for _, start, *_ in calls] == [0, 3, 3]

@@ -1,5 +1,4 @@
 """Videos with cuts or several people are divided into parts, and each face is followed by itself.
-
 Drawn people stand in front of plain walls, so that the true landmarks are known."""
 
 import re
@@ -140,8 +139,7 @@ def test_interrupted_parts_go_on_to_the_same_bytes(shots, tmp_path, monkeypatch)
     settings = CaptureSettings(size=64, shortest_part=0.2, max_frames=17)
     capture_video_parts(shots, tmp_path / "straight", settings)
     calls = interrupt_at(2, monkeypatch, process, "PartProcessor")
-    with pytest.raises(KeyboardInterrupt):
-        capture_video_parts(shots, tmp_path / "interrupted", settings)
+    pytest.raises(KeyboardInterrupt, capture_video_parts, shots, tmp_path / "interrupted", settings)
     capture_video_parts(shots, tmp_path / "interrupted", settings)
     assert [arguments[1].name for arguments in calls] == ["clip-1", "clip-2", "clip-2", "clip-3"]
     assert tree_bytes(tmp_path / "interrupted") == tree_bytes(tmp_path / "straight")

@@ -54,10 +54,8 @@ def test_equal_pictures_give_equal_files(tmp_path):
 
 
 @pytest.mark.parametrize(("degrees", "mirrored", "turn"), [
-    (90, False, lambda picture: np.rot90(picture, 1)),
-    (-90, False, lambda picture: np.rot90(picture, -1)),
-    (180, False, lambda picture: np.rot90(picture, 2)),
-    (0, True, lambda picture: picture[:, ::-1]),
+    (90, False, lambda picture: np.rot90(picture, 1)), (-90, False, lambda picture: np.rot90(picture, -1)),
+    (180, False, lambda picture: np.rot90(picture, 2)), (0, True, lambda picture: picture[:, ::-1]),
     (90, True, lambda picture: np.rot90(picture, 1)[:, ::-1]),
 ])  # fmt: skip
 def test_rotation_and_mirror_flags_are_applied(tmp_path, degrees, mirrored, turn):

@@ -18,16 +18,9 @@ from forked import ForkServer
 from mien.cli import COMMANDS, main
 from mien.commands.help_text import readable
 from mien.files import write_atomically
+from refusals import complaint
 
 Told = pytest.CaptureFixture[str]
-
-
-def complaint(capsys: Told, *arguments: str | Path) -> str:
-    """Run a command that must fail by the user's mistake, and return its one line."""
-    assert main(list(map(str, arguments))) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
-    assert len(lines) == 1, lines
-    return lines[0]
 
 
 def help_of(capsys: Told, *arguments: str) -> str:

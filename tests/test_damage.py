@@ -60,7 +60,6 @@ def check_damage(folder: str, material: str, kind: str) -> None:
 
 def check_values(folder: str, material: str, name: str) -> None:
     """Put values that the reader must refuse into each file with such a place. Its checksum is right, or there is none.
-
     Whoever makes a file can make its checksum."""
     files = list(enumerate(sorted(path for path in Path(material).glob(TARGETS[name].files) if path.is_file())))
     cases = [

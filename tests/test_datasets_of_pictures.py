@@ -224,8 +224,7 @@ def test_a_take_of_live_link_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     import_footage.write_footage(tmp_path / "out", footage, find_dataset("live-link-face"), folder)
     assert (tmp_path / "out/driving.csv").is_file()
     (folder / "Me_3_iPhone_cal.csv").write_text("Timecode,BlendshapeCount,EyeBlinkLeft\nnothing\n")
-    with pytest.raises(UserError):
-        checks.read(folder, "live-link-face")
+    pytest.raises(UserError, checks.read, folder, "live-link-face")
 
 
 def test_insta_without_checkpoints_is_pictures(scene: Scene, tmp_path: Path) -> None:

@@ -88,7 +88,6 @@ def smooth(values: np.ndarray, seconds: float) -> np.ndarray:
 
 def synthesised(seed: int, syllables: int, even: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return speech made of a buzz through three formants, with the jaw of each sample, and whether lips are closed.
-
     If it is `even`, all vowels are equally loud: i and u, behind a closed jaw, as loud as a."""
     random, rows = np.random.default_rng(seed), []
     for _ in range(syllables):

@@ -1,5 +1,4 @@
 """A run's folder becomes metrics.json and report.html, through the files that the earlier stages write.
-
 Runs are scored by time, by sequence and by camera; tables compare them."""
 
 import json
@@ -255,8 +254,7 @@ def test_evaluation_goes_on_where_it_was(root: Path, scored: dict[str, dict], mo
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(protocols, "drawn_frames", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(run_dir, [folder], quick)
+    pytest.raises(KeyboardInterrupt, evaluate, run_dir, [folder], quick)
     partial = run_dir / ".self_reenactment.partial"
     kept = len(partial.read_text().splitlines()) - 1
     assert kept >= 2

@@ -1,5 +1,4 @@
 """Files that would take gigabytes or minutes, hold huge numbers, or were findings of the fuzzers: refused in one line.
-
 Each is refused before memory is taken, and the line names the file."""
 
 import io
@@ -29,7 +28,6 @@ from mien.capture import given
 from mien.capture.crop import whole_picture
 from mien.capture.faces import LANDMARKS
 from mien.capture.given import GivenMattes, read_landmarks
-from mien.cli import main
 from mien.driving import drive, motion, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
 from mien.export import ply, read_glb, read_glb_avatar, read_ply, read_sog, read_usd, write_ply, write_sog, write_usd
@@ -44,7 +42,7 @@ from mien.picture_files import decode_png, png_fits
 from mien.runtime.checks import check
 from mien.training import train
 from recordings import row, write_csv, write_json
-from refusals import refuses
+from refusals import complaint, refuses
 from shared_things import MadeOnce, toy_workspace
 from test_glb_avatar import rewritten, written
 from test_splat_files import needs_usd, some
@@ -148,9 +146,7 @@ def test_a_message_shows_the_beginning_and_the_remedy(made_once: MadeOnce, tmp_p
     del header["__metadata__"]
     header["head_rotation"]["shape"] += [1] * 30_000
     track.write_bytes(joined(header, body))
-    capsys.readouterr()
-    assert main(["evaluate", str(tmp_path / "W")]) == 2
-    said = capsys.readouterr().err
+    said = complaint(capsys, "evaluate", str(tmp_path / "W"))
     assert said.count("\n") == 1
     assert len(said) < 2100
     assert said.startswith(f"mien: {track}: ")
@@ -179,8 +175,7 @@ def test_a_stage_that_names_other_files_is_refused(tmp_path: Path) -> None:
         path.write_text(good[:start] + number + good[good.index(",", start) :])
         refused(read_usd, path, "1 of 4 Gaussians are NaN or infinite")
     path.write_text(good.replace("point3f[] positions", "string[] positions").replace("[(", '["', 1))
-    with pytest.raises(UserError):
-        read_usd(path)
+    pytest.raises(UserError, read_usd, path)
 
 
 # Motion ---------------------------------------------------------------------------------------------------------------

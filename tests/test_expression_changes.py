@@ -1,5 +1,4 @@
 """Changes of gaussian_avatars with the expression: their formulas, and what of them is kept and refused.
-
 `test_methods` trains, resumes, saves and bakes them, as the configuration `gaussian_avatars-features`."""
 
 from dataclasses import replace
@@ -164,8 +163,7 @@ def with_features(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True
         for name in set(avatar.store.names()) & {"feature_bases", "neutral_features", "offset_basis", "opacity_basis"}:
             avatar.store.assign(name, 0.3 * torch.randn(avatar.store[name].shape))
         with torch.no_grad():
-            assert avatar.appearance is not None
-            avatar.appearance.last.weight.normal_(0, 0.3)
+            known(avatar.appearance).last.weight.normal_(0, 0.3)
     return avatar
 
 

@@ -8,10 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mien.cli import main
 from mien.commands.stages import driving
 from mien.face import available_face_models, cache, listing, load_face_model, loading
-from refusals import refuses
+from refusals import complaint, refuses
 from small_face_model import make_small_face_model
 
 
@@ -130,8 +129,7 @@ def test_without_a_home_folder_nothing_is_promised(homeless, monkeypatch, tmp_pa
     assert "next time" not in said
     assert "for this command only; set MIEN_CACHE to keep it" in said
     (tmp_path / "model.npz").write_bytes(b"a model")
-    assert main(["face-models", "--add", str(tmp_path / "model.npz")]) == 2
-    assert "there is no folder to keep it in" in capsys.readouterr().err
+    assert "there is no folder to keep it in" in complaint(capsys, "face-models", "--add", str(tmp_path / "model.npz"))
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     assert cache.cache_is_kept()
     driving.tracked_film(tmp_path / "clip.mp4", "small")

@@ -113,7 +113,6 @@ def _moving(model: FaceModel, timesteps: int) -> FaceParams:
 
 def _as_detected(model: FaceModel, face: FaceParams) -> Tensor:
     """Landmarks in the world, with the offsets that the detector was measured to have on this model.
-
     Only anny was measured. Its fit takes these offsets away, so landmarks without them are not those of a picture."""
     response, double = read_response(model, TrackingSettings.bias_sigma), face.to(torch.zeros((), dtype=torch.float64))
     offsets = response.mean + response.of_turns(double.head_rotation)

@@ -197,7 +197,6 @@ def test_the_same_avatar_gives_the_same_bytes(written: Path, portable: runtime.P
 
 def test_the_texture_has_the_colors_of_the_surface_and_not_of_what_is_seen_through_it() -> None:
     """Faint red skin in front of an opaque dark core, as of a mouth behind the nape, stays red in the texture.
-
     Its upper half is green as well, and its right half blue."""
     vertices = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]], np.float32)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])

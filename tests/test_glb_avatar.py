@@ -49,7 +49,6 @@ def rewritten(source: Path, path: Path, edit: Any) -> Path:
 @pytest.mark.parametrize("method", METHODS)
 def test_the_whole_avatar_comes_back(method: str, tmp_path: Path) -> None:
     """The .mien files of both avatars have the same bytes, so all arrays are equal.
-
     Besides KHR_gaussian_splatting, which it does not know yet, the validator only notes the extension and its views."""
     path, portable = written(method, tmp_path)
     read = read_glb_avatar(path)

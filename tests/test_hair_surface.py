@@ -134,8 +134,7 @@ def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
         return [(tmp_path / name / file).read_bytes() for file in RESULTS]
 
     whole = run("whole")
-    with pytest.raises(KeyboardInterrupt):
-        run("halves", stopped_at(10))
+    pytest.raises(KeyboardInterrupt, run, "halves", stopped_at(10))
     assert run("halves") == whole
     assert run("still", hair_rate=0.0)[0] != whole[0]
 

@@ -1,5 +1,4 @@
 """A stranger's workspace leads nowhere else, and is refused if its files do not fit together.
-
 mien follows no link and no name out of it. Single values are in `fuzzing.values`."""
 
 import json
@@ -267,8 +266,7 @@ def test_kept_pieces_of_a_tracking_that_are_of_no_use(workspace: Path, tmp_path:
     assert seen == [True, False]
     assert "starts again" in capsys.readouterr().err
     monkeypatch.setattr(pipeline, "track_once", lambda *_: {}["a bug of ours"])
-    with pytest.raises(KeyError):
-        track_subject(*arguments)
+    pytest.raises(KeyError, track_subject, *arguments)
 
 
 def test_a_tracking_with_the_hash_of_another_model_names_its_folder(tmp_path: Path) -> None:

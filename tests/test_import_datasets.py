@@ -1,5 +1,4 @@
 """`mien import` on the command line: what is told before, the workspace, its split, and mistakes.
-
 An exported GaussianAvatars folder is imported, posed at any frame, rendered, and exported again."""
 
 import json
@@ -30,6 +29,7 @@ from mien.training import (
     write_own_split,
 )
 from mien.training.footage.frames import training_frames
+from refusals import complaint
 from shared_things import MadeOnce, toy_workspace
 from toy_workspace import write_toy_workspace
 
@@ -50,14 +50,6 @@ def added(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
-
-
-def refused(line: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert main(line) == 2
-    told = [one for one in capsys.readouterr().err.splitlines() if one.startswith("mien: ")]
-    assert len(told) == 1
-    assert message in told[0]
 
 
 def test_a_dry_run_only_tells(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -82,8 +74,8 @@ def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest
     settings = with_own_split(TrainSettings(split="dataset"), splits, dict.fromkeys(CLIPS, 3))
     assert settings.held_out_sequences == (CLIPS[1],)
     assert {frame.sequence for frame in training_frames(read, settings)} == {0}
-    refused(["train", str(out), "--split", "dataset", "--hold-out", CLIPS[0]], "decides what is held out", capsys)
-    refused(again, "is there already", capsys)
+    assert "decides what is held out" in complaint(capsys, "train", out, "--split", "dataset", "--hold-out", CLIPS[0])
+    assert "is there already" in complaint(capsys, *again)
     assert main([*again, "--resume"]) == 0
     assert "all sequences are there already" in capsys.readouterr().err
 
@@ -106,16 +98,16 @@ def test_pictures_are_tracked_again_if_asked(subject: Path, tmp_path: Path, monk
 @pytest.mark.usefixtures("added")
 def test_mistakes_leave_nothing(scene: Scene, subject: Path, tmp_path: Path, capsys) -> None:
     out = ["--out", str(tmp_path / "out")]
-    refused(["import", str(subject), *out], "needs FLAME 2020", capsys)
-    refused(["import", str(subject), *out, "--retrack", "--face-model", "flame"], "give only one", capsys)
-    refused(["import", str(subject.parent), *out], "holds 1 people (subject1); import each", capsys)
+    assert "needs FLAME 2020" in complaint(capsys, "import", str(subject), *out)
+    assert "give only one" in complaint(capsys, "import", str(subject), *out, "--retrack", "--face-model", "flame")
+    assert "holds 1 people (subject1); import each" in complaint(capsys, "import", str(subject.parent), *out)
     other = write_insta(tmp_path / "other", scene)
     frame = other / "checkpoint/00001.frame"
     frame.unlink()
     frame.symlink_to("/etc/hostname")
-    refused(["import", str(other), *out, "--face-model", "flame"], "leads out of the dataset", capsys)
+    assert "leads out of the dataset" in complaint(capsys, "import", str(other), *out, "--face-model", "flame")
     wrong = ["import", str(other), *out, "--dataset", "vhap"]
-    refused(wrong, f"{other}: looks like insta, and cannot be read as vhap; leave --dataset out (", capsys)
+    assert f"{other}: looks like insta, and cannot be read as vhap; leave --dataset out (" in complaint(capsys, *wrong)
     # Damaged JSON is named.
     place = shutil.copytree(subject, tmp_path / "subject1")
     file = place / "subject1/MVI_1810/flame_params.json"
@@ -133,7 +125,7 @@ def test_mistakes_leave_nothing(scene: Scene, subject: Path, tmp_path: Path, cap
         if value is None:
             del content["frames"][1][name]
         file.write_text(json.dumps(content))
-        refused(["import", str(place), *out, "--face-model", "flame"], words, capsys)
+        assert words in complaint(capsys, "import", str(place), *out, "--face-model", "flame")
     assert not list((tmp_path / "out").glob("sequences/*"))
 
 
@@ -143,14 +135,14 @@ def test_the_protocol_of_a_dataset_scores_its_mattes_and_its_frames(made_once: M
     root = Path(shutil.copytree(toy_workspace(made_once), tmp_path / "W"))
     clip, file = root / "sequences/clip", root / "runs/toy/config.json"
     line = ["evaluate", str(root), "--protocol", "insta", "--no-perceptual"]
-    refused(line, "was not imported; leave --protocol insta out", capsys)
+    assert "was not imported; leave --protocol insta out" in complaint(capsys, *line)
     write_own_split(clip, OwnSplit(((1, 3),)), {"imported": {"dataset": "insta", "from": "there"}})
-    refused(line, "was trained with --split", capsys)
+    assert "was trained with --split" in complaint(capsys, *line)
     config = json.loads(file.read_text())
     config["settings"]["split"] = "dataset"
     content = {name: value for name, value in config.items() if name not in ("format", "version", "checksum")}
     write_json(file, config["format"], config["version"], content)
-    refused([*line[:3], "imavatar", line[4]], "was imported from insta", capsys)
+    assert "was imported from insta" in complaint(capsys, *line[:3], "imavatar", line[4])
     assert main(line) == 0
     (entry,) = json.loads((root / "runs/toy/metrics.json").read_text())["protocols"].values()
     assert entry["per_frame"]["timestep"] == [1, 2]
@@ -224,6 +216,6 @@ def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFix
         (("evaluate", imported), ""),  # An imported run is not scored or continued.
         (("train", imported), ""),
     ):
-        refused([*line], message, capsys)
+        assert message in complaint(capsys, *line)
     assert not list(tmp_path.glob("N*/runs"))
     assert [path.name for path in tmp_path.iterdir() if path.suffix] == []

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from known import known
 from mien.avatar import METHODS, Avatar
 from mien.face import FaceModel
 from mien.gaussians import sh_from_rgb
@@ -77,8 +78,7 @@ def test_what_a_mouth_hides_is_hidden(toy: tuple[FaceModel, Sequence]) -> None:
     assert not hidden[~within].any()
     white = np.full(3, 255, np.uint8)
     asked = Targets(sequence, 0, face_model=model, inside=inside).target(1, 0, white, keep=False)
-    assert asked.hidden is not None
-    assert torch.equal(asked.hidden, inside)
+    assert torch.equal(known(asked.hidden), inside)
     assert asked.to(torch.zeros((), dtype=torch.float64)).hidden is not None
     assert Targets(sequence, 0, face_model=model).target(1, 0, white, keep=False).hidden is None
 

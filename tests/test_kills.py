@@ -1,5 +1,4 @@
 """Commands that are killed continue to the same bytes, and nothing has to be removed by hand.
-
 `make kills KILLS=200` does at length what the test marked `long` does with a few kills."""
 
 import os

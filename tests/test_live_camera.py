@@ -1,5 +1,4 @@
 """Names of cameras for `mien drive --by`, and cameras that are read while they film.
-
 Time is an argument: the clock of a `Stage` goes on when a test lets it."""
 
 import threading

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from capture_helpers import assert_same_capture, random_capture
+from known import known
 from mien import locks
 from mien.capture import read_capture, write_capture
 from mien.errors import CannotWriteError, UserError
@@ -86,8 +87,7 @@ with hold(place):
     words = [sys.executable, "-c", script, str(tmp_path / "r")]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     with process:
-        assert process.stdout is not None
-        children = [int(word) for word in process.stdout.readline().split()]
+        children = [int(word) for word in known(process.stdout).readline().split()]
         try:
             assert len(children) == 2
             with pytest.raises(BeingWrittenError), hold(tmp_path / "r"):

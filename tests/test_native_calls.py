@@ -1,5 +1,4 @@
 """Native functions refuse arguments that do not belong together, and survive a lack of memory.
-
 The cases run in another process, since a faulty core may end it. It prints a line of JSON for each case."""
 
 import json

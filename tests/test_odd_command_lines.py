@@ -15,7 +15,7 @@ from mien.cli import main
 from mien.commands.stages.names import doubled_videos
 from mien.tracking import TrackingSettings, read_tracking
 from mien.workspace import Workspace
-from refusals import refuses
+from refusals import complaint, refuses
 from shared_things import MadeOnce, toy_workspace
 
 SKEWED = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": (2 * np.eye(4)).tolist(), "width": 32, "height": 32}
@@ -103,8 +103,7 @@ def test_odd_command_lines_are_told_in_one_line(line: str, words: str, place: Pa
 def test_a_current_tracking_and_landmarks_of_no_face_are_said(place: Path, monkeypatch, capsys) -> None:
     """The landmarks of the toy capture are all at one point."""
     monkeypatch.chdir(place)
-    assert main(["track", "W", "--again"]) == 2
-    assert "no face fits the landmarks" in capsys.readouterr().err
+    assert "no face fits the landmarks" in complaint(capsys, "track", "W", "--again")
     current = {"clip": read_tracking(place / "W/sequences/clip/tracking")}
     monkeypatch.setattr("mien.commands.stages.tracking._current_trackings", lambda *_, **__: current)
     monkeypatch.setattr("mien.commands.stages.tracking.show_tracking", lambda *_: None)
@@ -134,8 +133,7 @@ def test_an_avatar_of_another_version_says_train_again(place: Path, tmp_path: Pa
     for words, change in changes.items():
         path.write_bytes(whole)
         edit_json(path, change)
-        assert main(["render", str(tmp_path / "W"), "--out", str(tmp_path / "a.png")]) == 2
-        told = capsys.readouterr().err
+        told = complaint(capsys, "render", str(tmp_path / "W"), "--out", str(tmp_path / "a.png"))
         assert words in told
         assert "train it again" in told
 

@@ -116,8 +116,7 @@ def test_files_that_name_other_files_are_refused(tmp_path: Path, monkeypatch: py
                 Path(name).write_text(text.replace("NAME", other).replace("PORT", port))
                 error = refuses(told or "cannot be read|is ", probe_video, Path(name))
                 assert error.startswith(f"{name}: ")
-        with pytest.raises(UserError):
-            probe_video(Path(address))
+        pytest.raises(UserError, probe_video, Path(address))
         named = Path(address.replace("//", "/"))
         named.parent.mkdir(parents=True)
         grey(tmp_path / "clip.mp4").rename(named)

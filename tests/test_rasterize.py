@@ -1,5 +1,4 @@
 """The native rasterizer agrees with the float64 reference, forward and backward, and the reference with differences.
-
 All draw the same picture as another program (gsplat)."""
 
 import math

@@ -89,10 +89,7 @@ def rendered_without_torch(avatar: Avatar, face: FaceParams, camera: Camera, fol
 
 @pytest.mark.exact
 @pytest.mark.parametrize("colors", [
-    {},
-    {"sh_degree": 2},
-    {"sh_degree": 1, "sh_frame": "head"},
-    {"sh_degree": 1, "expression_rank": 7},
+    {}, {"sh_degree": 2}, {"sh_degree": 1, "sh_frame": "head"}, {"sh_degree": 1, "expression_rank": 7},
     {"expression_rank": 4, "appearance": "features"},
 ], ids=str)  # fmt: skip
 @torch.no_grad()

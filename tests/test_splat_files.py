@@ -54,7 +54,6 @@ def some(n: int, coefficients: int, seed: int = 0) -> Gaussians:
 @dataclass(frozen=True)
 class Loss:
     """Largest differences that a format may make; `color` is the first SH coefficient, and `higher` are the others.
-
     By default there are none. Rotations agree to float32: their angle is the arc cosine of a number next to 1, which
     has half of the digits."""
 

@@ -22,6 +22,7 @@ from mien.export.pixels import png_bytes
 from mien.licences.spdx import requirements_of
 from mien.render import camera_paths as torchs
 from mien.runtime import camera_paths
+from refusals import complaint
 from test_runtime import new_avatar
 from toy_scene import toy_camera
 from viewer_alone import page_of
@@ -67,7 +68,6 @@ study make w --out a.html --side 100; study tally gone.json gone.json; demo --se
 
 def modules_after(lines: list[list[str]], folder: Path) -> list[tuple[int, set[str]]]:
     """Return exit code and imported modules after each of some command lines, run in turn in a new process.
-
     Torch is imported at the end, and has to have one thread."""
     words = [sys.executable, "-c", SCRIPT, json.dumps(lines)]
     done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=folder)
@@ -270,5 +270,4 @@ def test_a_file_refuses_what_only_a_run_has(exported: Path, tmp_path: Path, caps
         ("--timestep 0", "a file"), ("--own-motion", "a file"), ("--sheet turntable", "a file"), ("--run x", "a file"),
         ("--set dorp=1", "did you mean drop?"),
     ):  # fmt: skip
-        assert main([*render, *option.split()]) == 2
-        assert told in capsys.readouterr().err
+        assert told in complaint(capsys, *render, *option.split())

@@ -195,10 +195,7 @@ def content(path: Path) -> list[bytes]:
 @pytest.mark.unchecked
 @pytest.mark.usefixtures("short_films")
 @pytest.mark.parametrize(("name", "how"), [
-    ("a.mp4", signal.SIGKILL),
-    ("a.webm", signal.SIGINT),
-    ("a.png", signal.SIGINT),
-    ("a_%06d.png", signal.SIGTERM),
+    ("a.mp4", signal.SIGKILL), ("a.webm", signal.SIGINT), ("a.png", signal.SIGINT), ("a_%06d.png", signal.SIGTERM),
     ("pictures", signal.SIGKILL),
 ])  # fmt: skip
 def test_stopped_rendering_ends_alike_the_next_time(name: str, how: signal.Signals, fork_server, workspace, tmp_path):

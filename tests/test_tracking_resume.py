@@ -52,8 +52,7 @@ def test_goes_on_from_every_piece(tmp_path, monkeypatch, capsys):
         before, written = {path.stem for path in keep.glob("*")}, []
         with monkeypatch.context() as patched:
             patched.setattr(StageCache, "write", stops_after(piece, written, interrupt))
-            with pytest.raises(KeyboardInterrupt):
-                track_subject([case.capture], case.model, FAST, keep)
+            pytest.raises(KeyboardInterrupt, track_subject, [case.capture], case.model, FAST, keep)
         assert written[-1] == piece
         assert not before & set(written), "what was finished is done again"
         assert ("continues where it was interrupted" in capsys.readouterr().err) == bool(before)

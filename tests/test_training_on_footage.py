@@ -1,5 +1,4 @@
 """Datasets that are videos, from the folder to a scored avatar: NeRSemble's raw recordings, takes of Live Link Face.
-
 The videos show a synthetic person, in whom the detector finds a face, so that nothing of the path is replaced."""
 
 import json
@@ -50,7 +49,6 @@ def film(path: Path, pictures: list[np.ndarray], repeats: int = 1, fps: float = 
 
 def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
     """Write a person of NeRSemble's raw recordings, with one timestep in three pictures. Return the frontal mattes.
-
     The colours that the cameras film are others than those that were drawn, until they are corrected."""
     drawn = [list(rig.timestep_frames(timestep)) for timestep in range(rig.timesteps)]
     empty = (255 * known(rig.background)).astype(np.uint8)

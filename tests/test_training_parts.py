@@ -270,8 +270,7 @@ def test_the_queue_gives_the_targets_of_the_steps(resolution: int, background: s
 def test_the_worker_ends_with_an_error_of_its_own_and_with_an_interrupted_run(tmp_path, monkeypatch) -> None:
     face_model, sequence = toy_sequence(6, 32)
     run = partial(train, [sequence], face_model, train_toy.CONFIG, train_toy.SETTINGS)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "stopped", stopped_at(1))
+    pytest.raises(KeyboardInterrupt, run, tmp_path / "stopped", stopped_at(1))
     assert not workers()
 
     def unreadable(*_: object, **__: object) -> Target:

@@ -13,6 +13,7 @@ from forked import Forked, ForkServer
 from mien.cli import main
 from mien.locks import lock_file
 from other_process import Holder
+from refusals import complaint
 from two_commands import RANK, Studio, beside, toy_studio
 
 pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
@@ -102,12 +103,10 @@ def test_a_run_that_is_being_trained_cannot_be_rendered_yet(other: Holder, studi
     shutil.copy(studio.root / "runs" / "alone" / "config.json", run)
     render = ["render", str(studio.root), "--run", "begun", "--out", str(tmp_path / "a.png")]
     with other.holding(run):
-        assert main(render) == 2
-        line = capsys.readouterr().err
+        line = complaint(capsys, *render)
         assert f"process {other.pid} on" in line
         assert line.endswith("; try again when it is done\n")
-    assert main(render) == 2
-    assert "its training was not finished; run the same `mien train`" in capsys.readouterr().err
+    assert "its training was not finished; run the same `mien train`" in complaint(capsys, *render)
     shutil.rmtree(run)
     # A workspace whose first capture is at work.
     clip = tmp_path / "w" / "sequences" / "clip"

@@ -18,7 +18,7 @@ from mien.viewer import Clip, Mesh, Session, View
 from mien.viewer.drawing import words_about_view
 from mien.viewer.files import TURNTABLE_FRAMES, Stopped, around, screenshot, video
 from mien.viewer.session import center_of
-from refusals import refuses
+from refusals import complaint, refuses
 from shared_things import MadeOnce, toy_workspace
 from web_case import drawn_head, faces_of, motion_of
 
@@ -233,8 +233,7 @@ def test_videos_hold_the_motion_or_a_turn(session: Session, tmp_path: Path) -> N
     (tmp_path / "clip.mp4").write_bytes(video(session, view, center))
     assert count_frames(tmp_path / "clip.mp4") == 4
     assert session.timestep == 0
-    with pytest.raises(Stopped):
-        video(session, view, center, lambda: False)
+    pytest.raises(Stopped, video, session, view, center, lambda: False)
     center = center.astype(float)
     half = around(view, center, np.pi)
     for turned in (half, around(view, center, 0.3)):
@@ -266,5 +265,4 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, made_once: MadeOnce, caps
         assert words in line
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     for command in (["view", workspace], ["train", workspace, "--view"]):
-        assert main(command) == 2
-        assert "run `pip install 'mien[viewer]'`" in capsys.readouterr().err
+        assert "run `pip install 'mien[viewer]'`" in complaint(capsys, *command)

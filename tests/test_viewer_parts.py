@@ -284,8 +284,7 @@ def test_a_viewer_follows_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(viewing.time, "sleep", sleep)
     monkeypatch.setattr(viewing.os, "kill", lambda process, number: signals.append((process, number)))
     monkeypatch.setenv(live_view.PARENT_VARIABLE, str(os.getppid()))
-    with pytest.raises(StopIteration):
-        viewing.follow_file(session, file)
+    pytest.raises(StopIteration, viewing.follow_file, session, file)
     monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
     monkeypatch.setattr(viewing.time, "sleep", lambda _: None)
     viewing.follow_file(session, file)

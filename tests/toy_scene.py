@@ -135,7 +135,6 @@ def _facing(vertices: Tensor, faces: Tensor) -> Tensor:
 
 def sphere(rings: int, around: int, kept: int = -1, margin: float = 0.15) -> tuple[Tensor, Tensor]:
     """Return the vertices of a unit sphere of rings from top to bottom, and its triangles.
-
     Only the first rings are kept if there are more. The holes at its poles have a radius of `margin`."""
     polar = torch.linspace(margin, math.pi - margin, rings)[:, None][: kept if kept > 0 else rings]
     angle = torch.linspace(0, 2 * math.pi, around + 1)[:-1]

@@ -1,5 +1,4 @@
 """Run cases over all targets in processes of their own, and collect the findings by cause in a table.
-
 A process runs many cases in a row, until one ends it. A finding is then tried again alone."""
 
 import faulthandler

@@ -1,5 +1,4 @@
 """Faults of datasets by their meaning: a missing camera, hostile pickles, zip bombs, links.
-
 Other lengths, NaN and the like are faults of a format (`fuzzing.formats`)."""
 
 import json
@@ -31,7 +30,6 @@ class RunsCode:
 
 def faulty_dataset(root: Path, canary: Path, dice: Random, only: str | None = None) -> str:
     """Make one fault in a copy of a dataset, of any kind or of one, and return what it is.
-
     Links lead into the folder `canary` outside, and hostile pickles make a folder there."""
     kinds = list(KINDS)
     dice.shuffle(kinds)

@@ -95,7 +95,6 @@ class Place:
         self, stage: str, apart: bool = False, number: int = signal.SIGKILL, moment: float = _TO_FINISH
     ) -> tuple[int | None, str, float]:
         """Run a stage's command, as a fork or as a new process (`apart`), which gets a signal at a moment in seconds.
-
         Return the exit code (None if it hangs), what it told, and its seconds after the signal."""
         start = self._server.call("fuzzing.kills:run_anew", STAGES[stage], cwd=self.box, exits=True) if apart else None
         command = start or self._server.mien(*STAGES[stage], cwd=self.box)

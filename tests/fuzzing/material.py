@@ -72,7 +72,6 @@ _WEB = Path(__file__).parents[2] / "web"
 
 def make_material(root: Path, whole: bool = True) -> None:
     """Write everything below `root`, with the same bytes every time on one machine.
-
     What takes seconds is only there if it is to be `whole`: the pieces of a tracking, and the runtime of pages."""
     torch.set_num_threads(1)
     root.mkdir(parents=True, exist_ok=True)
