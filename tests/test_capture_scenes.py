@@ -191,7 +191,7 @@ def seen_of(frames: list) -> list[float | None]:
     return [place if seen else None for place, seen in zip(places, person.seen, strict=True)]
 
 
-def test_the_largest_and_most_persistent_is_followed():
+def test_the_largest_and_most_persistent_is_followed_and_landmarks_of_others_are_refused():
     passing, stranger = (0.5, 0.5, 0.45, 0.5), (*ANN[:3], 0.3)
     walking = [[(0.75 - 0.025 * step, *BOB[1:])] for step in range(18)]
     for frames, seen in (
@@ -209,10 +209,7 @@ def test_the_largest_and_most_persistent_is_followed():
     assert np.flatnonzero(crowded).tolist() == [40, 41, 42, 43]
     # A false detection, in a single frame, is nobody.
     assert not choose_person(survey_of([[ANN]] * 20 + [[ANN, (0.9, 0.1, 0.05, 0.1)]] + [[ANN]] * 20)).crowded.any()
-
-
-def test_landmarks_of_others_are_refused():
-    """Ann's centre is at 192 pixels, Bob's at 480; Ann is sometimes not found."""
+    # Ann's centre is at 192 pixels, Bob's at 480; Ann is sometimes not found.
     survey = survey_of([[ANN, BOB], [BOB], [BOB], [ANN, BOB], [BOB], [ANN, BOB]])
     script = iter([[480, 190], [480], [185, 480], [480], [193], [480, 250]])
 

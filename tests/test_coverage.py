@@ -78,7 +78,7 @@ def test_the_front_is_seen_and_not_the_back_nor_what_is_cut_off(toy: Toy) -> Non
     assert (above[heights < -0.04] == 0).all()
 
 
-def test_a_triangle_behind_another_is_hidden(toy: Toy) -> None:
+def test_what_is_behind_is_hidden_and_high_hair_is_drawn_where_the_mesh_is_not(toy: Toy) -> None:
     """A second head inside of the first faces the camera as well, and is never seen."""
     model, sequence = toy
     v, half = len(model.template), len(model.faces)
@@ -91,6 +91,18 @@ def test_a_triangle_behind_another_is_hidden(toy: Toy) -> None:
     seen = covered((twice, sequence)).seen
     assert (seen[:half][facing(model) > 0.8] > 0.9).all()
     assert not seen[half:].any()
+    # High hair on the back of a head stands out beside the face. Nothing is drawn outside of the head's mask.
+    model, sequence = toy
+    behind = facing(model) < -0.2
+
+    def drawn(height: float, given: Sequence) -> torch.Tensor:
+        above = torch.where(behind, height, 0.0)
+        return drawn_at_height(model, above, [given], [given.tracking.face], training_frames([given], SETTINGS))
+
+    assert drawn(0.0, sequence)[facing(model) > 0.7].all()
+    assert not drawn(0.0, sequence)[behind].any()
+    assert drawn(0.05, sequence)[behind].any()
+    assert not drawn(0.05, replace(sequence, scoring=np.zeros_like(sequence.scoring))).any()
 
 
 def measured(toy: Toy, avatar: Avatar) -> Unseen:
@@ -99,7 +111,7 @@ def measured(toy: Toy, avatar: Avatar) -> Unseen:
     return unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
 
 
-def test_only_what_is_seen_is_trained(toy: Toy) -> None:
+def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
     """Fills have no gradients but those that move them along their normal."""
     sequence, avatar = toy[1], bare_avatar(toy)
     unseen, store = measured(toy, avatar), avatar.gaussian_store()
@@ -120,10 +132,7 @@ def test_only_what_is_seen_is_trained(toy: Toy) -> None:
     moved = known(store["means"].grad)[filled_in]
     assert moved[:, 1].any()
     assert not moved[:, [0, 2]].any()
-
-
-def test_features_of_fills_are_not_trained(toy: Toy) -> None:
-    """Their bases have a gradient of their own kind, which is masked like the others."""
+    # Their bases have a gradient of their own kind, which is masked like the others.
     model, sequence = toy
     config = plain_gaussian_avatars(appearance="features", appearance_directions=2, appearance_features=3)
     avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
@@ -164,21 +173,6 @@ def test_what_is_beside_shown_triangles_is_trained(toy: Toy, monkeypatch: pytest
     further = filled(0.03)
     assert not further[drawn].any(), "hair that the mesh shows at its height is trained, and so is a band around it"
     assert not further[~behind].any()
-
-
-def test_high_hair_is_drawn_where_the_mesh_is_not(toy: Toy) -> None:
-    """High hair on the back of a head stands out beside the face. Nothing is drawn outside of the head's mask."""
-    model, sequence = toy
-    behind = facing(model) < -0.2
-
-    def drawn(height: float, given: Sequence) -> torch.Tensor:
-        above = torch.where(behind, height, 0.0)
-        return drawn_at_height(model, above, [given], [given.tracking.face], training_frames([given], SETTINGS))
-
-    assert drawn(0.0, sequence)[facing(model) > 0.7].all()
-    assert not drawn(0.0, sequence)[behind].any()
-    assert drawn(0.05, sequence)[behind].any()
-    assert not drawn(0.05, replace(sequence, scoring=np.zeros_like(sequence.scoring))).any()
 
 
 def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:

@@ -153,7 +153,7 @@ def disc(size: int = 64) -> np.ndarray:
     return to_rgba(colors * alpha[..., None], alpha)
 
 
-def test_colors_are_straight_and_a_png_keeps_every_value(tmp_path: Path) -> None:
+def test_colors_are_straight_a_png_keeps_every_value_and_outlines_have_no_fringe(tmp_path: Path) -> None:
     picture = disc()
     seen = picture[..., 3] > 8
     assert np.abs(picture[seen][:, :3].astype(int) - [204, 77, 51]).max() <= 1
@@ -163,9 +163,6 @@ def test_colors_are_straight_and_a_png_keeps_every_value(tmp_path: Path) -> None
     read = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert read is not None
     assert np.array_equal(cv2.cvtColor(read, cv2.COLOR_BGRA2RGBA), picture)
-
-
-def test_webm_keeps_alpha_and_outlines_have_no_fringe(tmp_path: Path) -> None:
     write_pictures(plan_output(tmp_path / "a.webm", 3, True), [disc(65)] * 3, 25)
     decoder, frames = av.CodecContext.create("libvpx-vp9", "r"), []
     assert isinstance(decoder, av.VideoCodecContext)

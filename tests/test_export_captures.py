@@ -127,10 +127,7 @@ def test_insta_is_read_back(folders: dict[str, Path], single: Sequence, scene: S
     for part in ("flame", "opencv"):
         shapes = [{name: (array.shape, array.dtype) for name, array in each[part].items()} for each in (frame, wanted)]
         assert shapes[0] == {name: shapes[1][name] for name in shapes[0]}
-
-
-def test_insta_by_its_own_conventions(folders: dict[str, Path], single: Sequence, scene: Scene) -> None:
-    """Cameras are camera-to-world with OpenCV's axes, and meshes are seen by them as the person in the pictures is."""
+    # Cameras are camera-to-world with OpenCV's axes, and meshes are seen by them as the person in the pictures is.
     folder = folders["insta"]
     content = json.loads((folder / "transforms.json").read_text())
     K = np.array([[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]])

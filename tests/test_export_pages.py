@@ -144,12 +144,22 @@ def test_the_command_needs_nothing_but_what_comes_with_mien(page: Path, monkeypa
     assert 5_000_000 < len(camera) < 10_000_000
 
 
-def test_the_model_is_the_published_one_and_one_version_is_pinned() -> None:
+def test_the_model_is_the_published_one_and_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
     digest = hashlib.sha256(own_model()).hexdigest()
     assert digest == "64184e229b263107bc2b804c6625db1341ff2bb731874b0bcc2fe6544e0bc9ff"
     package = json.loads((WEB / "package.json").read_text())
     assert package["devDependencies"]["@mediapipe/tasks-vision"] == VERSION
     assert f"@mediapipe/tasks-vision@{VERSION}\n" in (WEB.parent / "Makefile").read_text()
+    # In mien's own folder, the largest file lies compressed.
+    (wasm,) = package.rglob("vision_wasm_internal.wasm")
+    compressed = package / "vision_wasm_internal.wasm.xz"
+    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
+    wasm.unlink()
+    assert find_webcam_files().package == package, "its content has the right hash"
+    cut = compressed.read_bytes()[:-100]
+    for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
+        compressed.write_bytes(content)
+        refuses(told, find_webcam_files)
 
 
 def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monkeypatch, capsys, tmp_path) -> None:
@@ -191,16 +201,3 @@ def test_a_missing_or_other_package_is_explained(page: Path, package: Path, caps
     told = refused(page, capsys)
     for part in ("needs vision_bundle.cjs", "make landmarker", f"@mediapipe/tasks-vision@{VERSION}"):
         assert part in told
-
-
-def test_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
-    """In mien's own folder, the largest file lies compressed."""
-    (wasm,) = package.rglob("vision_wasm_internal.wasm")
-    compressed = package / "vision_wasm_internal.wasm.xz"
-    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
-    wasm.unlink()
-    assert find_webcam_files().package == package, "its content has the right hash"
-    cut = compressed.read_bytes()[:-100]
-    for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
-        compressed.write_bytes(content)
-        refuses(told, find_webcam_files)

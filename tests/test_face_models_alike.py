@@ -40,7 +40,7 @@ def _marks(model: FaceModel, face: FaceParams) -> Tensor:
     return model.landmark_positions(model.head_vertices(face), "mediapipe")
 
 
-def test_the_mesh_is_a_head(model: FaceModel) -> None:
+def test_the_mesh_is_a_head_whose_joints_move_their_parts_alone(model: FaceModel) -> None:
     """Arrays fit each other; the outside faces outwards; eyes, regions and landmarks are where every head has them."""
     check_face_model(model, model.name, "-")
     faces = model.faces.numpy()
@@ -68,9 +68,6 @@ def test_the_mesh_is_a_head(model: FaceModel) -> None:
     assert marks[NOSE, 2] > marks[:, 2].max() - 0.004
     assert marks[CORNER_LEFT, 0] > 0.015 > -0.015 > marks[CORNER_RIGHT, 0]
     assert model.landmarks["ibug68"].faces.shape == (68,)
-
-
-def test_joints_move_their_parts_alone(model: FaceModel) -> None:
     rest = model.neutral()
     for name in ("left_eye", "right_eye", "neck"):
         joints = rest.joints.clone()

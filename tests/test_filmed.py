@@ -185,7 +185,7 @@ CAMERA = toy_camera(32)
 workspace = pytest.fixture(toy_workspace)
 
 
-def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
+def test_every_expression_has_a_tile_whose_strength_is_relative_to_what_was_filmed() -> None:
     model = load_face_model("anny")
     face = model.neutral()
     tiles = expression_tiles(model, face, CAMERA, 1.0)
@@ -201,9 +201,6 @@ def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
             assert not tile.face.joints.any(), name
     strong = {tile.name for tile in expression_tiles(model, face, CAMERA, 1.5)}
     assert {"jawOpen 1.20", "browInnerUp 1.50"} <= strong, "coefficients stay within the bounds of the face model"
-
-
-def test_strengths_are_relative_to_what_was_filmed_and_a_turntable_ends_at_half_of_its_angle() -> None:
     model = make_small_face_model()
     count = len(model.expression_names)
     model = replace(model, expression_bounds=torch.tensor([[0.0, 1.0]]).repeat(count, 1))

@@ -140,7 +140,7 @@ def _strands(model: FaceModel) -> dict[str, torch.Tensor]:
     return strand_gaussians(model.template, model.faces, _back(model), heights, colors)
 
 
-def test_strands_cover_the_chosen_triangles_and_hang_in_the_surface(anny):
+def test_strands_cover_the_chosen_triangles_hang_in_the_surface_and_keep_their_colors(anny):
     strands, frames = _strands(anny), triangle_frames(anny.template, anny.faces)
     counts = torch.bincount(strands["face_index"], minlength=len(anny.faces)).double()
     expected = 150_000 * triangle_geometry(anny.template.double(), anny.faces)[1] * _back(anny)
@@ -168,9 +168,6 @@ def test_strands_cover_the_chosen_triangles_and_hang_in_the_surface(anny):
     none = torch.zeros(len(anny.faces), dtype=torch.bool)
     empty = strand_gaussians(anny.template, anny.faces, none, none.float(), none[:, None].expand(-1, 3).float())
     assert not any(len(values) for values in empty.values())
-
-
-def test_a_closed_head_has_strands_that_keep_their_colors(anny):
     chosen, count = _back(anny), len(anny.faces)
     config = PRESETS["standard"].config("gaussian_avatars")
     avatar = method_named("gaussian_avatars").avatar(config, anny, anny.neutral(1))

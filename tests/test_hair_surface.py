@@ -182,7 +182,7 @@ def test_contributions_are_the_shares_of_the_picture(anny):
     assert (both >= found).all()
 
 
-def test_of_hidden_copies_one_stays(anny):
+def test_of_hidden_copies_one_stays_and_none_below_what_is_shown(anny):
     """A third Gaussian on each hidden triangle, and a second one on triangles that are shown."""
     avatar, view, back = _closed_avatar(anny)
     back &= contributions(avatar, [view]) < 0.03
@@ -194,9 +194,6 @@ def test_of_hidden_copies_one_stays(anny):
     left = avatar.store["face_index"][~removed].bincount(minlength=len(anny.faces))
     assert (left == 1).all(), "no triangle is left without a Gaussian, and none has two"
     assert len(rows) > 50
-
-
-def test_hidden_copies_below_what_is_shown_go(anny):
     avatar, view, _ = _closed_avatar(anny)
     rows, n = (anny.region_mask("nose") & (contributions(avatar, [view]) > 0.2)).nonzero()[:, 0], len(avatar.store)
     assert len(rows) > 20

@@ -179,7 +179,7 @@ def test_checkpoints_run_nothing_and_their_numbers_are_checked(tmp_path: Path) -
     refused(read, path, "data.pkl has more than 8,388,608 bytes")
 
 
-def test_names_stay_in_the_dataset(tmp_path: Path) -> None:
+def test_names_stay_in_the_dataset_and_odd_numbers_arrays_and_json_are_named(tmp_path: Path) -> None:
     root, json = tmp_path / "root", tmp_path / "root/a.json"
     root.mkdir()
     (tmp_path / "secret.png").touch()
@@ -194,9 +194,6 @@ def test_names_stay_in_the_dataset(tmp_path: Path) -> None:
         *((name, "is not the name of a file") for name in ("a\nb", 7, "")),
     ):  # fmt: skip
         refuses(words, inner, json, root, name)
-
-
-def test_odd_numbers_arrays_and_json_are_named(tmp_path: Path) -> None:
     for value, shape in (
         ([1, 2], (3,)), ([[1, 2], [3]], (2, 2)), ("1", ()), (True, ()), (None, ()), ([], (None,)),
         ([float("inf")], (1,)), ([10**30], (1,)), ({"a": 1}, (1,)), ([["1"]], (1, 1)),

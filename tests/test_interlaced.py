@@ -112,7 +112,7 @@ def test_each_interlaced_frame_becomes_one_picture_of_its_first_moment(kind, ord
         assert errors[0] < 7 < 20 < errors[1]
 
 
-def test_only_the_interlaced_frames_of_a_mixed_clip_change(pattern, tmp_path):
+def test_only_the_interlaced_frames_change_and_unmarked_ones_if_the_user_says_so(pattern, tmp_path):
     """Fields of one moment, as of a still head, lose nothing but single levels."""
     path, still = tmp_path / "mixed.mkv", moment(pattern, 0)
     pictures = [still, moment(pattern, 2), *woven(pattern, "tff")[2:4], still, still, still]
@@ -124,9 +124,6 @@ def test_only_the_interlaced_frames_of_a_mixed_clip_change(pattern, tmp_path):
     assert [frame.seconds for frame in auto] == [frame.seconds for frame in never]
     assert auto[6].combs() < 0.001
     assert np.abs(green(auto[6]).astype(int) - still).mean() < 2
-
-
-def test_unmarked_frames_are_deinterlaced_only_if_the_user_says_so(pattern, tmp_path):
     path = tmp_path / "unmarked.mkv"
     write(path, "ffv1.mkv", flagged(woven(pattern, "tff"), "yuv420p", ["prog"] * FRAMES))
     for one, other in zip(*read_twice(path, "always"), strict=True):

@@ -49,7 +49,7 @@ def test_one_holds_and_the_other_is_told(other: Holder, tmp_path: Path) -> None:
         assert holder_of(place) is None, "several places are held all or none"
 
 
-def test_nothing_stays_of_a_lock(tmp_path: Path) -> None:
+def test_nothing_stays_of_a_lock_and_a_removed_file_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
     with hold(tmp_path / "new" / "deep" / "r"):
         assert (tmp_path / "new" / "deep" / ".r.lock").is_file()
     assert list(tmp_path.iterdir()) == []
@@ -62,6 +62,26 @@ def test_nothing_stays_of_a_lock(tmp_path: Path) -> None:
     one, other = (tmp_path / ("n" * 250 + end) for end in "12")
     with hold(one), hold(other):
         assert lock_file(one) != lock_file(other), "long names have locks of their own"
+    # Threads that lock in turns never hold it together.
+    inside, most = [0], [0]
+
+    def visit(_: int) -> None:
+        visits = 0
+        while visits < 60:
+            try:
+                with hold(tmp_path / "r"):
+                    inside[0] += 1
+                    most[0] = max(most[0], inside[0])
+                    visits += 1
+                    time.sleep(0)
+                    inside[0] -= 1
+            except BeingWrittenError:
+                time.sleep(0.001)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(visit, range(4)))
+    assert most[0] == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_children_do_not_keep_the_lock_of_a_parent_that_has_died(tmp_path: Path) -> None:
@@ -180,29 +200,6 @@ def test_a_place_that_cannot_be_written(number: int, tmp_path: Path, monkeypatch
     if number == errno.EACCES:
         with hold(tmp_path / "theirs"), pytest.raises(BeingWrittenError), hold(tmp_path / "theirs"):
             pass
-
-
-def test_a_lock_whose_file_was_removed_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
-    """Threads that lock in turns never hold it together."""
-    inside, most = [0], [0]
-
-    def visit(_: int) -> None:
-        visits = 0
-        while visits < 60:
-            try:
-                with hold(tmp_path / "r"):
-                    inside[0] += 1
-                    most[0] = max(most[0], inside[0])
-                    visits += 1
-                    time.sleep(0)
-                    inside[0] -= 1
-            except BeingWrittenError:
-                time.sleep(0.001)
-
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(visit, range(4)))
-    assert most[0] == 1
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_reader_of_damage_asks_who_writes(other: Holder, tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_every_pixel_of_a_tessellated_quad_is_covered_exactly_once(seed: int):
     assert (hits == 1).all()
 
 
-def test_interpolation_is_perspective_correct():
+def test_interpolation_is_perspective_correct_and_that_of_its_reference():
     vertices, faces = random_mesh()
     camera = head_camera(96)
     fragments = rasterize_mesh(vertices, faces, camera)
@@ -119,6 +119,17 @@ def test_interpolation_is_perspective_correct():
     torch.testing.assert_close(fragments.barycentric[covered][inside].double(), expected[inside], atol=1e-5, rtol=1e-5)
     projected, _ = camera.project(interpolate(fragments, vertices, faces)[covered][inside])
     torch.testing.assert_close(projected.double(), pixels[inside, :2], atol=1e-2, rtol=0)
+    vertices, faces = random_mesh()
+    fragments = rasterize_mesh(vertices, faces, head_camera(96))
+    for attributes, corners in ((torch.randn(40, 5), faces), (torch.randn(60, 3, 4), torch.arange(180).view(60, 3))):
+        own = attributes.requires_grad_()
+        rows = own.detach().flatten(0, -2).double().requires_grad_()
+        found, expected = interpolate(fragments, own, faces), interpolate_reference(fragments, rows, corners)
+        torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
+        weights = torch.randn(expected.shape)
+        (grad,) = torch.autograd.grad(found, own, weights)
+        (exact,) = torch.autograd.grad(expected, rows, weights.double())
+        torch.testing.assert_close(grad.double().view(exact.shape), exact, atol=1e-4, rtol=1e-5)
 
 
 def test_a_triangle_through_the_near_plane_is_cut_there():
@@ -154,20 +165,6 @@ def test_bad_input_is_dropped_or_refused():
     assert (rasterize_mesh(vertices, faces[:0], pixel_camera()).face_index == -1).all()
     with pytest.raises(IndexError, match="vertex"):
         rasterize_mesh(vertices, torch.tensor([[0, 1, 7]]), pixel_camera())
-
-
-def test_native_interpolation_equals_the_reference():
-    vertices, faces = random_mesh()
-    fragments = rasterize_mesh(vertices, faces, head_camera(96))
-    for attributes, corners in ((torch.randn(40, 5), faces), (torch.randn(60, 3, 4), torch.arange(180).view(60, 3))):
-        own = attributes.requires_grad_()
-        rows = own.detach().flatten(0, -2).double().requires_grad_()
-        found, expected = interpolate(fragments, own, faces), interpolate_reference(fragments, rows, corners)
-        torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
-        weights = torch.randn(expected.shape)
-        (grad,) = torch.autograd.grad(found, own, weights)
-        (exact,) = torch.autograd.grad(expected, rows, weights.double())
-        torch.testing.assert_close(grad.double().view(exact.shape), exact, atol=1e-4, rtol=1e-5)
 
 
 def test_texture_lookup():

@@ -39,7 +39,7 @@ def read_rows(folder: Path, *rows: list[str], fps: float | None = None) -> Motio
     return read_live_link_face(write_csv(folder / "a.csv", *rows), fps)
 
 
-def test_values_times_and_turns(tmp_path: Path) -> None:
+def test_values_times_and_turns_and_the_lowest_rate_that_has_the_frame_numbers(tmp_path: Path) -> None:
     """Head angles follow Unreal: yaw to the subject's right, pitch down, roll to the left shoulder."""
     assert (len(COLUMNS), COLUMNS[2], COLUMNS[53:55]) == (63, "EyeBlinkLeft", ["TongueOut", "HeadYaw"])
     first = row("11:59:59:58.5", JawOpen=0.25, HeadYaw=0.3, EyeLookOutLeft=1, EyeLookInRight=1, EyeLookDownLeft=0.5)
@@ -58,10 +58,7 @@ def test_values_times_and_turns(tmp_path: Path) -> None:
     ahead_and_left = [turned[0, 2], turned[1, 2], turned[1, 0]]
     expected = [math.sin(0.3) * math.cos(0.2), math.sin(0.2), math.sin(0.1) * math.cos(0.2)]
     assert ahead_and_left == pytest.approx([-value for value in expected], abs=1e-6)
-
-
-def test_the_rate_is_the_lowest_that_has_the_frame_numbers(tmp_path: Path) -> None:
-    """Frames of 30 a second have the numbers 0 to 29, so the number 30 means 48, the next rate."""
+    # Frames of 30 a second have the numbers 0 to 29, so the number 30 means 48, the next rate.
     for largest, rate in ((29, 30), (30, 48)):
         rows = [row(f"0:00:0{second}:{frame:02d}.0") for second in (0, 1) for frame in range(largest + 1)]
         motion = read_rows(tmp_path, *rows)

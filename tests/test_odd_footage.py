@@ -318,13 +318,10 @@ def test_the_video_is_found_among_streams(name: str, ending: str, tmp_path: Path
     assert live.picture.shape == (side, side, 3)
 
 
-def test_a_track_of_thousands_of_frames_a_second_is_no_film(tmp_path: Path) -> None:
+def test_the_default_stream_counts_for_sound_too_and_thousands_of_frames_a_second_are_no_film(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_tracks(path, [([flat(128)] * 5, False), ([flat(64)] * 5, False)], (5000, 25))
     assert probe_video(path).stream == 1
-
-
-def test_sound_follows_the_default_too(tmp_path: Path) -> None:
     path, silence = tmp_path / "a.mkv", np.zeros((1, 800), np.int16)
     write_tracks(path, [([silence] * 3, False), ([silence + 8000] * 3, True)], (16000, 16000))
     assert read_sound(path).mean() == pytest.approx(8000 / 32768, abs=1e-3)

@@ -80,16 +80,13 @@ def test_slopes_are_the_gradients_of_the_distance_and_losses_hold_points_where_i
     assert set(losses) >= {"skinning", "expression_directions"}
 
 
-def test_a_color_is_albedo_times_light_on_the_normal() -> None:
+def test_a_color_is_albedo_times_light_on_the_normal_which_turns_with_the_head() -> None:
     avatar = new_avatar()
     surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
     normals = torch.nn.functional.normalize(surface.slope, dim=-1)
     expected = surface.albedo.sigmoid() * avatar.shading(normals)
     torch.testing.assert_close(colors(avatar, toy_face(5)[2]), expected)
     assert new_avatar(disturbed=False).shading(normals).unique().tolist() == [1.0]
-
-
-def test_light_follows_deformed_normals_as_the_head_turns() -> None:
     avatar, still, face = new_avatar(replace(SMALL, normals="deformed")), new_avatar(), toy_face(5)[2]
     turned = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.0, 0.0]))
     assert (colors(avatar, face) - colors(avatar, turned)).abs().max() > 1e-3

@@ -71,7 +71,7 @@ def test_no_package_has_changed_the_kind_of_its_licence_and_kinds_are_read_from_
         assert kind_of(expression) == kind, expression
 
 
-def test_every_package_is_named_with_what_brings_it(listed: dict[str, Any], capsys: pytest.CaptureFixture[str]):
+def test_every_package_is_named_with_what_brings_it_as_pip_licenses_lists_it(listed: dict[str, Any], capsys):
     used = {name: listed[name]["used_for"] for name in ("numpy", "torch", "kiwisolver", "viser")}
     assert list(used.values()) == ["mien", "mien[create]", "mien[create], by matplotlib", "mien[viewer]"]
     x264 = listed[canonical("x264 and x265")]
@@ -79,10 +79,7 @@ def test_every_package_is_named_with_what_brings_it(listed: dict[str, Any], caps
     assert "pip install --no-binary av av" in x264["meaning"]
     assert main(["licenses"]) == 0
     assert "keep its notices when you pass it on" in capsys.readouterr().out
-
-
-def test_the_list_is_that_of_pip_licenses(listed: dict[str, Any]):
-    """Row by row: the same packages and versions, and what both read as the declared licence."""
+    # Row by row: the same packages and versions, and what both read as the declared licence.
     command = [sys.executable, "-m", "piplicenses", "--format=json", "--with-system", "--from=mixed"]
     theirs = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert {canonical(row["Name"]) for row in theirs} == {name for name, own in listed.items() if "version" in own}
@@ -93,15 +90,12 @@ def test_the_list_is_that_of_pip_licenses(listed: dict[str, Any]):
             assert row["License"] == own["declared"], row["Name"]
 
 
-def test_the_bill_of_materials_in_the_wheel_is_up_to_date():
+def test_the_bill_of_materials_is_up_to_date_and_mediapipe_older_than_its_statistics():
     written = json.loads((ROOT / "src/mien/sbom.spdx.json").read_text(encoding="utf-8"))
     expected = spdx_document(PROJECT["version"], requirements_of(PROJECT))
     assert written == expected, "run: python -m mien.licences pyproject.toml > src/mien/sbom.spdx.json"
     assert {"numpy", "torch", "mediapipe", "nanobind", "mien"} <= {each["name"] for each in written["packages"]}
-
-
-def test_mediapipe_is_older_than_its_statistics():
-    """From 0.10.35 on, mediapipe declares that it sends usage metrics to its maker (docs/platforms.md)."""
+    # From 0.10.35 on, mediapipe declares that it sends usage metrics to its maker (docs/platforms.md).
     asked = next(line for line in PROJECT["optional-dependencies"]["create"] if line.startswith("mediapipe"))
     pinned = asked.partition(";")[0].removeprefix("mediapipe==").strip()
     assert tuple(map(int, pinned.split("."))) < (0, 10, 35)

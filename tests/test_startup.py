@@ -193,7 +193,7 @@ def test_a_file_is_drawn_and_exported_without_any_extra_and_what_is_missing_is_n
         assert f"pip install 'mien[{extra}]'" in told
 
 
-def test_a_film_and_the_example_of_the_runtime_need_no_more_than_pyav(exported: Path, tmp_path: Path):
+def test_a_film_needs_no_more_than_pyav_and_the_viewer_no_torch(exported: Path, tmp_path: Path):
     lines = [["render", str(exported), "--out", str(tmp_path / name), "--frames", "3"] for name in ("a.mp4", "a.webm")]
     ended = json.loads(python_without(set(extras.EXTRA_OF) - {"av"}, LINES, json.dumps(lines)))
     assert [code for code, _ in ended] == [0, 0], ended
@@ -203,10 +203,7 @@ def test_a_film_and_the_example_of_the_runtime_need_no_more_than_pyav(exported: 
     example += f"runpy.run_path({str(ROOT / 'examples' / '08_runtime.py')!r}, run_name='__main__')"
     assert "2 pictures" in python_without(set(extras.EXTRA_OF), example)
     assert len(list((tmp_path / "f").glob("*.png"))) == 2
-
-
-def test_a_file_is_viewed_without_torch(exported: Path):
-    """With mien[viewer] alone, the viewer serves its page. viser brings zstandard, and pillow by imageio."""
+    # With mien[viewer] alone, the viewer serves its page. viser brings zstandard, and pillow by imageio.
     missing = set(extras.EXTRA_OF) - {"viser", "zstandard", "PIL"}
     code = WITHOUT.format(missing=sorted(missing)) + "from mien.cli import main\nsys.exit(main(sys.argv[1:]))"
     told = page_of([sys.executable, "-c", code, "view", str(exported), "--port", "0"])

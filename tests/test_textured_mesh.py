@@ -117,7 +117,7 @@ def test_surfels_cover_the_mesh(surfels: int, least: float) -> None:
     assert narrow[inside].min() < 0.9
 
 
-def test_offsets_and_colours_are_averaged_over_neighbours() -> None:
+def test_offsets_and_colours_are_averaged_over_neighbours_and_teeth_and_eyes_stay() -> None:
     model = toy_face_model()
     v = len(model.template)
     matrix = torch.zeros(v, v, dtype=torch.float64)
@@ -128,9 +128,6 @@ def test_offsets_and_colours_are_averaged_over_neighbours() -> None:
     smooth = torch.linalg.matrix_power((torch.eye(v) + matrix.float()) / 2, 3)
     offsets = avatar.get_buffer("movable") * (smooth @ avatar.vertex_means)
     torch.testing.assert_close(avatar.averaged(), (offsets, smooth @ avatar.vertex_albedo))
-
-
-def test_teeth_and_eyes_stay_where_they_are() -> None:
     model = toy_face_model()
     regions = torch.zeros(len(model.faces), dtype=torch.long)
     regions[:20], regions[20:25], regions[-20:] = 1, 2, 3
@@ -142,7 +139,7 @@ def test_teeth_and_eyes_stay_where_they_are() -> None:
     assert torch.equal((offsets != 0).any(1), outer)
 
 
-def test_a_color_is_albedo_times_light_on_the_normal() -> None:
+def test_a_color_is_albedo_times_light_on_the_normal_in_the_frame_of_the_light() -> None:
     avatar = new_avatar(model=plane_model())
     torch.testing.assert_close(colors(avatar, at_rest(avatar)), torch.full((len(avatar.store), 3), 0.5))
     with torch.no_grad():
@@ -161,9 +158,6 @@ def test_a_color_is_albedo_times_light_on_the_normal() -> None:
     x, z = 0.6 * edges[:, 0] / edges.norm(dim=1), 0.8
     expected = torch.stack([0.25 * (1 + z + 0 * x), 0.5 * (1 + x), 0.75 * (3 * z**2 - 1) + 0 * x], dim=-1)
     torch.testing.assert_close(colors(avatar, at_rest(avatar)), expected)
-
-
-def test_light_in_the_world_stays_as_the_head_turns() -> None:
     turn = torch.tensor([[0.0, math.pi / 2, 0.0]])
     for light in ("head", "world"):
         avatar = new_avatar(replace(PLAIN, light=light), plane_model())

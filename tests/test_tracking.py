@@ -120,12 +120,19 @@ def test_fast_turns_neither_lag_nor_shrink():
     assert (tracked_yaw.diff().max() / yaw.diff().max()) > 0.85
 
 
-def test_the_focal_length_follows_the_crop_and_a_square_counts_as_cut_out():
+def test_the_focal_length_follows_the_crop_and_settings_out_of_use_do_not_count():
     capture = make_tracking_case(timesteps=3).capture
     crop = {"left": 300, "top": 0, "width": 1024, "height": 1024}
     cropped = replace(capture, source={"picture_size": [1920, 1080], "crop": crop})
     assert float(initial_camera(cropped, TrackingSettings()).K[0, 0]) == 1.5 * 1920 * 512 / 1024
     assert float(initial_camera(capture, TrackingSettings()).K[0, 0]) == pytest.approx(2.2 * 512)
+    paper, sizes = PaperSettings(epochs=2), PhotometricSettings(sizes=(64,))
+    asked = TrackingSettings(paper=paper, photometric=sizes)
+    assert asked.in_effect() == TrackingSettings(photometric=sizes)
+    assert replace(asked, schedule="landmarks").in_effect() == TrackingSettings(schedule="landmarks")
+    assert replace(asked, schedule="paper").in_effect() == replace(asked, schedule="paper")
+    alone = replace(asked, schedule="paper", paper=replace(paper, start="landmarks"))
+    assert alone.in_effect() == replace(alone, photometric=PhotometricSettings())
 
 
 def test_what_cannot_be_tracked_is_refused():
@@ -150,16 +157,6 @@ def test_anny_lips_and_lids_part():
     assert lips[1].min() > 0.012
     lids = (marks[:, [159, 386]] - marks[:, [145, 374]]).norm(dim=-1)
     assert (lids[2] < 0.6 * lids[0]).all()
-
-
-def test_settings_that_a_schedule_does_not_use_do_not_count():
-    paper, sizes = PaperSettings(epochs=2), PhotometricSettings(sizes=(64,))
-    asked = TrackingSettings(paper=paper, photometric=sizes)
-    assert asked.in_effect() == TrackingSettings(photometric=sizes)
-    assert replace(asked, schedule="landmarks").in_effect() == TrackingSettings(schedule="landmarks")
-    assert replace(asked, schedule="paper").in_effect() == replace(asked, schedule="paper")
-    alone = replace(asked, schedule="paper", paper=replace(paper, start="landmarks"))
-    assert alone.in_effect() == replace(alone, photometric=PhotometricSettings())
 
 
 FEW = TrackingSettings(keyframes=8)

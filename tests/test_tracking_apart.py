@@ -109,7 +109,7 @@ def test_pixels_calm_the_held_out_sequence(apart, tracked, schedule: str):
     assert by_pixels.pixel_residuals.isfinite().all()
 
 
-def test_an_unknown_focal_length_changes_as_the_others_did(case, shaping, apart):
+def test_focal_length_and_light_of_what_is_held_out_are_those_of_the_others(case, shaping, apart):
     small = replace(
         apart.capture, landmarks=apart.capture.landmarks / 2, images=apart.capture.images[:, :, ::2, ::2],
         mattes=apart.capture.mattes[:, :, ::2, ::2], principal_point=apart.capture.principal_point / 2,
@@ -117,10 +117,7 @@ def test_an_unknown_focal_length_changes_as_the_others_did(case, shaping, apart)
     first, second = track_subject([shaping], case.model, LANDMARKS, held_out=[small])
     assert float(second.cameras[0].K[0, 0]) == pytest.approx(float(first.cameras[0].K[0, 0]) / 2, rel=1e-6)
     assert turn_error(apart, second) < 1.5
-
-
-def test_the_light_is_the_mean_of_the_others_in_the_world(shaping):
-    """Sequences of a rig have frames of their own, so a light is turned twice on its way."""
+    # Sequences of a rig have frames of their own, so a light is turned twice on its way.
     random = torch.Generator().manual_seed(0)
     shot, straight = shot_of(shaping, LANDMARKS), torch.eye(4, dtype=torch.float64)
     turn = torch.tensor([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)

@@ -78,7 +78,7 @@ def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
         assert [(frame.timestep, frame.camera) for frame in frames] == [(t, c) for t in range(5) for c in cameras]
 
 
-def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> None:
+def test_order_backgrounds_and_density_draws_depend_on_seed_and_step_only() -> None:
     frames = training_frames([toy_sequence(12, 16)[1]], plain_run(split="none"))
     first, second, other = (
         [FrameOrder(frames, seed).at(step) for step in range(start, start + 12)]
@@ -89,9 +89,6 @@ def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> No
         assert {passes for _, passes in one} == {number}
     assert [frame for frame, _ in first] != [frame for frame, _ in second]
     assert first != other
-
-
-def test_random_backgrounds_and_density_draws_depend_on_seed_and_step() -> None:
     settings = plain_run(background="random", seed=1)
     assert background_at(settings, 3).tolist() != background_at(settings, 4).tolist()
     assert background_at(plain_run(background="white"), 3).tolist() == [255, 255, 255]
@@ -137,7 +134,7 @@ def test_loss_inside_the_box_of_difference_is_that_of_the_whole_picture(drawn, m
     assert loss["alpha"].item() == pytest.approx(expected)
 
 
-def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
+def test_adam_equals_torchs_keeps_its_state_in_the_store_and_has_rates_that_fall() -> None:
     store = GaussianStore({"means": torch.linspace(-1, 1, 12).reshape(4, 3)})
     network, adam = torch.nn.Linear(3, 2), Adam()
     twins = [torch.nn.Parameter(tensor.detach().clone()) for tensor in (store["means"], *network.parameters())]
@@ -156,10 +153,7 @@ def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
     assert moments.step == 5
     assert set(adam.state()) == {"network/weight", "network/bias"}
     assert store["means"].grad is None
-
-
-def test_rates() -> None:
-    """Learning rates fall from start to end, after their beginning. One that starts at nothing stays there."""
+    # Learning rates fall from start to end, after their beginning. One that starts at nothing stays there.
     late = Rate(1.0, 0.01, begin=0.5)
     for rate, step, expected in (
         (Rate(1.0, 0.01), 50, 0.1), (Rate(1.0, 0.01), 100, 0.01), (Rate(0.3), 70, 0.3), (Rate(0.0, 1e-3), 50, 0.0),

@@ -46,7 +46,7 @@ def front_view(avatar: runtime.Avatar, width: int = 96, height: int = 64) -> Vie
     return View(avatar.camera.viewmat.astype(float), float(field), width, height)
 
 
-def test_sliders_change_the_face_within_bounds(session: Session) -> None:
+def test_sliders_and_random_faces_change_the_face_within_bounds(session: Session) -> None:
     changes: list[int] = []
     session.changed = lambda: changes.append(session.version)
     names, joint = session.avatar.expression_names, session.avatar.joint_names[0]
@@ -68,9 +68,6 @@ def test_sliders_change_the_face_within_bounds(session: Session) -> None:
     np.testing.assert_array_equal(session.face.expression, session.avatar.portable.neutral.expression)
     assert len(changes) == 6
     assert changes == sorted(changes)
-
-
-def test_random_faces_keep_to_what_was_filmed(session: Session) -> None:
     portable = session.avatar.portable
     eye = np.eye(len(portable.neutral.expression) + portable.neutral.joints.size, dtype=np.float32)
     limits = runtime.Filmed(0 * eye[0], 0 * eye[0], eye, np.ones(1, np.float32), np.ones((2, 2), np.float32))

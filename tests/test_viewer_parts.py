@@ -53,7 +53,7 @@ def test_only_loopback_goes_without_a_token_and_strange_hosts_and_origins_are_re
         assert answer.body.isascii() or "\udc80" not in answer.body
 
 
-def test_a_proxy_with_a_path_of_its_own() -> None:
+def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -> None:
     """The redirect and the cookie stay below that path, and other hosts are fine with the token."""
     door = Door.of("127.0.0.1")
     there = {"Host": "me.example", "Origin": "https://me.example"}
@@ -65,9 +65,6 @@ def test_a_proxy_with_a_path_of_its_own() -> None:
     lost = known(door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie}))
     assert "page of https://me.example, and its Host is 127.0.0.1:80" in lost.body
     assert "let the proxy pass on the browser's Host header" in lost.body
-
-
-def test_a_token_becomes_a_cookie() -> None:
     door = Door.of("0.0.0.0")
     assert door.token is not None
     assert len(door.token) >= 20

@@ -69,7 +69,7 @@ KEY = """(async () => {
 })()"""
 
 
-def test_a_page_opens_alive(page: Path, portable: runtime.PortableAvatar) -> None:
+def test_a_page_opens_alive_and_faces_are_buttons(page: Path, portable: runtime.PortableAvatar) -> None:
     """The camera turns to the front, the filmed motion plays once, then the head blinks and looks at the pointer, which
     is to its left and up. With both switched off, it rests."""
     told = browse(page, [ALIVE], size=(300, 200), device=["lively"], opening=CLOCK)
@@ -78,6 +78,22 @@ def test_a_page_opens_alive(page: Path, portable: runtime.PortableAvatar) -> Non
     assert (first > 0.2, timesteps >= 2, closed > 0.3, aside > 0.25, down < -0.1) == (True,) * 5, told["results"]
     np.testing.assert_allclose(still, portable.neutral.head_rotation, atol=1e-6)
     assert opened == pytest.approx(portable.neutral.expression[portable.expression_names.index("eyeBlinkLeft")])
+    # Who asks for reduced motion gets a page that stands still, and faces that come at once.
+    told = browse(page, [STILL, PRESS, GAZE, MARKS], size=(300, 200))
+    assert (told["requests"], told["messages"]) == ([], [])
+    still, (*states, labels, (turned, playing)), (moved, pitch, *works), marks = told["results"]
+    assert still == [0, False, False]
+    assert labels[:4] == ["Smile", "Laugh", "Surprise", "Wink"]
+    smile, rest = runtime.Avatar(portable).face({"smile": 1.0}).expression, portable.neutral.expression
+    assert [state for state, _ in states] == ["true", "false", "true"]
+    np.testing.assert_allclose([expression for _, expression in states], [smile, rest, smile], atol=1e-3)
+    assert (turned, playing, works) == (pytest.approx(0.1), True, [False, True])
+    assert moved > 20
+    assert pitch < -0.2
+    # What was filmed goes from 0 to 1 in `drawn_head`.
+    most = portable.expression_bounds[portable.expression_names.index("jawOpen"), 1]
+    assert marks == ["0%", f"{round(100 / most)}%", False]
+    expect_usable(page, "await mien;", 'document.getElementById("more").click();')
 
 
 @pytest.mark.parametrize("looks", [-1, 1])
@@ -126,25 +142,6 @@ MARKS = """(async () => {
   const { style } = document.getElementById("jawOpen");
   return [style.getPropertyValue("--a"), style.getPropertyValue("--b"), document.getElementById("filmed").hidden];
 })()"""
-
-
-def test_faces_are_buttons_and_keys_work_without_a_click(page: Path, portable: runtime.PortableAvatar) -> None:
-    """Who asks for reduced motion gets a page that stands still, and faces that come at once."""
-    told = browse(page, [STILL, PRESS, GAZE, MARKS], size=(300, 200))
-    assert (told["requests"], told["messages"]) == ([], [])
-    still, (*states, labels, (turned, playing)), (moved, pitch, *works), marks = told["results"]
-    assert still == [0, False, False]
-    assert labels[:4] == ["Smile", "Laugh", "Surprise", "Wink"]
-    smile, rest = runtime.Avatar(portable).face({"smile": 1.0}).expression, portable.neutral.expression
-    assert [state for state, _ in states] == ["true", "false", "true"]
-    np.testing.assert_allclose([expression for _, expression in states], [smile, rest, smile], atol=1e-3)
-    assert (turned, playing, works) == (pytest.approx(0.1), True, [False, True])
-    assert moved > 20
-    assert pitch < -0.2
-    # What was filmed goes from 0 to 1 in `drawn_head`.
-    most = portable.expression_bounds[portable.expression_names.index("jawOpen"), 1]
-    assert marks == ["0%", f"{round(100 / most)}%", False]
-    expect_usable(page, "await mien;", 'document.getElementById("more").click();')
 
 
 OUTSIDE = """(async () => {
