@@ -30,7 +30,7 @@ from mien.cli import main
 from mien.errors import UserError
 from refusals import complaint
 from test_capture_parts import streak
-from test_interlaced import flagged, write, write_single_fields
+from test_changing_pictures import flagged, write, write_single_fields
 
 pytestmark = pytest.mark.unchecked
 Face = Callable[..., np.ndarray]
