@@ -134,8 +134,7 @@ def check_import(found: list[Any], layout: Layout, scene: Scene) -> None:
     for sequence, (name, timesteps), split in zip(found, layout.clips.items(), layout.splits, strict=True):
         assert isinstance(sequence, TrackedSequence)
         assert (sequence.capture.name, sequence.capture.camera_ids) == (name, layout.cameras)
-        assert sequence.own_split == split
-        assert sequence.capture.timesteps == len(timesteps)
+        assert (sequence.own_split, sequence.capture.timesteps) == (split, len(timesteps))
         for row, timestep in enumerate(timesteps):
             vertices = layout.vertices(shown, timestep)
             for camera in range(len(layout.cameras)):

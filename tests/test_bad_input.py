@@ -171,8 +171,7 @@ def test_workspaces_in_odd_places(run_dir: Path, tmp_path: Path, capsys: pytest.
             shown = complaint(capsys, command, str(tmp_path / "a.mp4"), "--out", str(place))
             assert words in shown
             assert "disk space" not in shown
-    assert (tmp_path / "out").read_text() == "mine"
-    assert sorted(tmp_path.rglob("*")) == before
+    assert ((tmp_path / "out").read_text(), sorted(tmp_path.rglob("*"))) == ("mine", before)
     refuses("is a file; give the folder of a workspace", open_workspace, tmp_path / "a.mp4")
     (tmp_path / "me/runs").mkdir(parents=True)
     refuses("there is no run yet; make one with `mien train", Workspace(tmp_path / "me").pick_run, None)

@@ -293,8 +293,7 @@ def test_delay_and_height_are_found_in_coefficients_and_in_turns():
     for delay, height in [(-1.3, 0.8), (0.0, 1.0), (0.6, 1.1), (2.0, 0.8)]:
         found = found_in(5 + bumps(delay, height))
         assert found.lag_frames == pytest.approx(delay, abs=0.1)
-        assert found.loss_percent == pytest.approx(100 * (1 - height), abs=2)
-        assert found.events == 2
+        assert (found.loss_percent, found.events) == (pytest.approx(100 * (1 - height), abs=2), 2)
     # Where nothing happens there is nothing to measure, and an event that was not tracked is left out.
     assert following.following(bumps()[:, None], bumps()[:, None], np.zeros(len(TIME), bool), 6) is None
     gap = bumps()
@@ -346,8 +345,7 @@ def test_blinks_are_seen_in_the_lids():
     assert following.eye_opening(true[:, 0]).min() < 0.2 * following.eye_opening(true[:, 0]).max()
     found = following.blink_following(tracked, true, truth, FPS)
     assert found is not None
-    assert found.events == 2
-    assert found.lag_frames == pytest.approx(1.0, abs=0.1)
+    assert (found.events, found.lag_frames) == (2, pytest.approx(1.0, abs=0.1))
     assert found.loss_percent == pytest.approx(100 * (1 - 0.6 / 0.9), abs=3)
     assert following.blink_following(tracked, open_eyes, truth, FPS) is None
     # Jitter counts where the truth stands still.

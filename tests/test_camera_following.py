@@ -96,8 +96,7 @@ def test_one_euro_is_still_at_rest_and_quick_in_motion() -> None:
 def test_an_avatar_learns_follows_without_lag_and_goes_to_rest(clip: Path, landmarks, course: Course) -> None:
     one, ((state, rest), *after) = course
     expressions = np.load(clip.with_name("expressions.npy"))
-    assert state == "waiting"
-    assert {state for state, _ in after[:22]} == {"learning"}
+    assert (state, {state for state, _ in after[:22]}) == ("waiting", {"learning"})
     assert {state for state, _ in after[30:]} == {"following"}
     faces = [face for _, face in after]
     for face in faces[:22]:

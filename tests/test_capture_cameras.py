@@ -81,8 +81,7 @@ def test_cameras_become_one_capture_with_the_head_at_one_scale(rig, tmp_path):
     assert half.width == WIDTH // 2
     torch.testing.assert_close(half.K[:2], CAMERAS["left"].K[:2] / 2)
     capture = capture_cameras([rig[0]], rig[1], tmp_path / "s" / "capture", "s", CaptureSettings(size=128))
-    assert capture.camera_ids == tuple(CAMERAS)
-    assert capture.images.shape == (FRAMES, 5, 128, 128, 3)
+    assert (capture.camera_ids, capture.images.shape) == (tuple(CAMERAS), (FRAMES, 5, 128, 128, 3))
     assert capture.calibration is not None
     assert capture.valid[:, :4].all()
     assert not capture.valid[:, 4].any()

@@ -109,8 +109,7 @@ def test_folder_of_images_in_natural_order(test_data, tmp_path):
         picture[:8, :8] = number
         cv2.imwrite(str(folder / f"{number}.png"), picture[..., ::-1])
     capture = capture_video(folder, tmp_path / "capture", CaptureSettings(fps=10.0, crop="none"))
-    assert capture.name == "pictures"
-    assert capture.images[:, 0, 0, 0, 0].tolist() == [1, 2, 10]
+    assert (capture.name, capture.images[:, 0, 0, 0, 0].tolist()) == ("pictures", [1, 2, 10])
     assert capture.valid[:, 0].tolist() == np.isfinite(capture.landmarks[:, 0, 0, 0]).tolist() == [True, False, True]
     np.testing.assert_allclose(capture.timestamps, [0, 0.1, 0.2])
     assert capture.images.shape[2:4] == (128, 128)  # not enlarged

@@ -77,8 +77,7 @@ def test_opencv_that_cannot_choose_the_filter_of_pngs(monkeypatch) -> None:
     for name in ("IMWRITE_PNG_FILTER", "IMWRITE_PNG_FILTER_UP"):
         monkeypatch.delattr(cv2, name)
     older = runpy.run_path(frame_files.__file__)["PNG_OPTIONS"]
-    assert frame_files.PNG_OPTIONS[:4] == older
-    assert len(frame_files.PNG_OPTIONS) == 6
+    assert (frame_files.PNG_OPTIONS[:4], len(frame_files.PNG_OPTIONS)) == (older, 6)
 
 
 def flip(path, place=7):

@@ -111,8 +111,7 @@ def test_a_person_who_leaves_another_is_no_cut() -> None:
     faces = np.full((20, 2, 4), np.nan)
     faces[:, 1] = np.array([4, 4, 10, 10]) / (32, 18, 32, 18)
     faces[:10, 0] = np.array([16, 6, 26, 16]) / (32, 18, 32, 18)
-    assert find_cuts(film, faces) == []
-    assert find_cuts(film, faces[:, :1]) == [10]
+    assert (find_cuts(film, faces), find_cuts(film, faces[:, :1])) == ([], [10])
 
 
 @pytest.mark.unchecked

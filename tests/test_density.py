@@ -134,8 +134,7 @@ def test_rounds_and_resets_happen_at_their_fractions() -> None:
         if strategy.adapt(store, pose(store), Progress(step, 50), random):
             rounds.append(step + 1)
         opacities.append(float(store["opacity_logits"].detach().sigmoid()))
-    assert rounds == [10, 20, 30]
-    assert opacities == pytest.approx([0.5] * 24 + [0.01] * 26)
+    assert (rounds, opacities) == ([10, 20, 30], pytest.approx([0.5] * 24 + [0.01] * 26))
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.002])
@@ -169,8 +168,7 @@ def test_refill_deletes_the_unseen_and_reaches_its_target() -> None:
         strategy.observe(posed, rendering([0.0] * 6))
     assert not strategy.adapt(store, faint, FIRST, random)
     assert strategy.adapt(store, faint, Progress(9, 100), random)
-    assert len(store) == 10
-    assert set(store["face_index"].tolist()) == {1, 4}
+    assert (len(store), set(store["face_index"].tolist())) == (10, {1, 4})
     distance = (store["means"].detach() - 3 * store["face_index"][:, None] - torch.arange(3.0)).abs()
     assert distance[2:].max() <= 0.5
     assert distance[2:].min() > 0

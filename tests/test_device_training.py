@@ -200,8 +200,7 @@ def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch
         if isinstance(moments, FactoredMoments):
             assert moments.second.device.type == "meta"
         else:
-            assert float(moments.step) == 3
-            assert moments.first.device.type == "meta"
+            assert (float(moments.step), moments.first.device.type) == (3, "meta")
 
 
 def _rendered(gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:

@@ -161,8 +161,7 @@ def test_the_rate_of_a_csv_can_be_given(tmp_path: Path) -> None:
     take = write_csv(tmp_path / "a.csv", *(row(f"0:00:00:{2 * index:02d}.0", JawOpen=index / 4) for index in range(4)))
     for fps, expected in ((None, 30.0), (24.0, 12.0), (48.0, 24.0)):
         driver = open_driver(take, None, model, fps)
-        assert driver.fps == pytest.approx(expected)
-        assert len(driver.face) == 4
+        assert (driver.fps, len(driver.face)) == (pytest.approx(expected), 4)
     for by, fps in ((take, -1.0), (take, float("nan")), (tmp_path, 25.0)):
         refuses("--fps", open_driver, by, None, model, fps)
     refuses(r"--sequence a: .*a\.csv has no sequences", open_driver, take, "a", model)

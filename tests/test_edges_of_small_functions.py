@@ -124,8 +124,7 @@ def test_a_guided_filter_is_locally_affine_and_the_matte_beside_the_head_whole_w
     head = np.zeros((300, 300), bool)
     head[50:250, 50:251] = True
     cut = cut_matte(np.full((300, 300), 255, np.uint8), head, np.full((300, 300), 0.5, np.float32))
-    assert cut[150, 253] == 255
-    assert cut[150, 254] == 128
+    assert (cut[150, 253], cut[150, 254]) == (255, 128)
 
 
 # Places and files -----------------------------------------------------------------------------------------------------

@@ -182,8 +182,7 @@ def test_report_stands_alone_shows_everything_and_survives_gaps(experiment: Expe
         line_chart([Series("one", x, np.array(values))], Axes("step", "loss"))
         for values in ([1.0] * 4, [1.0, np.nan, 2.0, 3.0], [np.nan] * 4)
     )
-    assert flat.count("L") == 3
-    assert gap.count("M") == 2
+    assert (flat.count("L"), gap.count("M")) == (3, 2)
     assert "nan" not in flat + gap
     assert "There are no values to draw" in none
     assert spans([]) == ()

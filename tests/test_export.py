@@ -306,8 +306,7 @@ def test_spz_of_version_2_is_read(tmp_path: Path, degree: int) -> None:
     expected = torch.tensor([[1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0.529, 0.6, 0, -0.6]])
     torch.testing.assert_close(read.quats, expected, atol=0.005, rtol=0)
     torch.testing.assert_close(read.scales, torch.ones(4, 3))
-    assert read.opacities.tolist() == [1] * 4
-    assert read.sh.shape == (4, (degree + 1) ** 2, 3)
+    assert (read.opacities.tolist(), read.sh.shape) == ([1] * 4, (4, (degree + 1) ** 2, 3))
     assert (read.sh[:, 1:] == 0.5).all()
 
 

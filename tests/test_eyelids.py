@@ -166,8 +166,7 @@ def test_a_hand_in_front_of_the_mouth_is_found(drawn, frames):
 @pytest.mark.unchecked
 def test_a_phone_in_front_of_the_eyes_is_found_there(drawn):
     found = found_in(with_slab(drawn[0], HALF, EYES), drawn)
-    assert found["eyes"] == HALF
-    assert found["mouth"] == []
+    assert (found["eyes"], found["mouth"]) == (HALF, [])
 
 
 def test_two_looks_that_are_equally_steady_leave_the_face_unknown():

@@ -87,8 +87,7 @@ def test_encodings_of_spreadsheets_are_read(tmp_path: Path, encoding: str) -> No
     plain = write_json(tmp_path / "a.json", [{"time": 0, "blendshapes": {"jawOpen": 0.5}}])
     for path in (take, plain):
         path.write_bytes(path.read_text().encode(encoding))
-    assert jaw(read_live_link_face(take)) == [0, 0.1]
-    assert jaw(read_blendshape_json(plain)) == [0.5]
+    assert (jaw(read_live_link_face(take)), jaw(read_blendshape_json(plain))) == ([0, 0.1], [0.5])
     take.write_bytes("Timecode,JawOpen,\u00fc\n0:0:0:0,1\n".encode("latin-1"))
     refuses("it is no text in UTF-8 or UTF-16; save it as UTF-8", read_live_link_face, take)
 
@@ -107,8 +106,7 @@ def test_tables_of_other_programs(tmp_path: Path, key: str, step: float, fps: fl
     motion = read_live_link_face(
         table(tmp_path / "a.csv", key, "jawOpen", "MouthSmile_L", "confidence", step=step), fps
     )
-    assert motion.fps == pytest.approx(rate)
-    assert jaw(motion) == [0, 0.1, 0.2, 0.3]
+    assert (motion.fps, jaw(motion)) == (pytest.approx(rate), [0, 0.1, 0.2, 0.3])
     assert motion.coefficients[3, ARKIT_NAMES.index("mouthSmileLeft")] == pytest.approx(0.3)
     assert "has no columns EyeBlinkLeft, " in motion.notes[0]
     assert "(50 in all), so they stay 0" in motion.notes[0]
@@ -218,8 +216,7 @@ def test_pictures_drive_an_avatar(tmp_path: Path, monkeypatch, names: tuple[str,
     film = folder if whole else folder / names[0]
     workspace, found = driving.tracked_film(film, "anny")
     assert isinstance(workspace, Workspace)
-    assert found == ["clip"]
-    assert len(captured) == (count if whole else 3)
+    assert (found, len(captured)) == (["clip"], (count if whole else 3))
     assert captured[0].read_bytes() == (folder / names[0]).read_bytes()
 
 

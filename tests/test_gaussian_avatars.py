@@ -73,8 +73,7 @@ def test_losses_are_those_of_the_paper() -> None:
 def test_sh_degrees_are_switched_on_one_after_the_other_and_may_turn_with_the_head() -> None:
     avatar, face = new_avatar(plain_gaussian_avatars(sh_degree=3, sh_warmup=0.4)), toy_face(5)[0]
     counts = [avatar.pose(face, Progress(step, 100)).gaussians.sh.shape[-2] for step in (0, 9, 10, 20, 31, 99)]
-    assert counts == [1, 1, 4, 9, 16, 16]
-    assert avatar.pose(face).gaussians.sh.shape[-2] == 16
+    assert (counts, avatar.pose(face).gaussians.sh.shape[-2]) == ([1, 1, 4, 9, 16, 16], 16)
     avatars = (new_avatar(plain_gaussian_avatars(sh_frame=frame)) for frame in ("world", "head"))
     drawn = (avatar.pose(toy_face(5)[1]).gaussians.timestep(0) for avatar in avatars)
     pictures = [rasterize(gaussians, toy_camera(32), torch.ones(3)).image for gaussians in drawn]

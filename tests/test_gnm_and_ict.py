@@ -127,8 +127,7 @@ def test_the_folder_and_the_packed_copy_have_one_name(tmp_path: Path, test_data:
         refuses("without --teeth", read_model_file, path, "ict", teeth=True)
     # The published model is read.
     whole = read_ict(test_data / "face_models" / "ict_facekit_light_f16.npz")
-    assert whole.template.shape == (26719, 3)
-    assert len(whole.identity) == 100
+    assert (whole.template.shape, len(whole.identity)) == ((26719, 3), 100)
     assert {"browInnerUp_L", "jawOpen", "PupilDilate_R"} <= whole.expression.keys()
 
 

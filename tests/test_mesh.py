@@ -63,8 +63,7 @@ def test_a_known_triangle_lands_on_known_pixels_and_the_nearest_is_seen():
     # Centres on the slanted edge x + y = 7 belong to the triangle on its other side: it is no top or left edge.
     expected = {(row, column) for row in range(1, 5) for column in range(2, 6) if row + column + 1 < 7}
     assert set(zip(rows.tolist(), columns.tolist(), strict=True)) == expected
-    assert fragments.depth[1, 2] == 1
-    assert fragments.depth[0, 0] == torch.inf
+    assert (fragments.depth[1, 2], fragments.depth[0, 0]) == (1, torch.inf)
     assert fragments.barycentric[0, 0].sum() == 0
     torch.testing.assert_close(fragments.barycentric[1, 2], torch.tensor([0.75, 0.125, 0.125]))
     for order, seen in (([0, 1, 2], False), ([0, 2, 1], True)):  # clockwise, counter-clockwise
@@ -74,8 +73,7 @@ def test_a_known_triangle_lands_on_known_pixels_and_the_nearest_is_seen():
     vertices = at_depth(near + far)
     for faces, expected in (([[0, 1, 2], [3, 4, 5]], 0), ([[3, 4, 5], [0, 1, 2]], 1)):
         fragments = rasterize_mesh(vertices, torch.tensor(faces), pixel_camera())
-        assert fragments.face_index[3, 3] == expected
-        assert fragments.depth[3, 3] == 1
+        assert (fragments.face_index[3, 3], fragments.depth[3, 3]) == (expected, 1)
         assert fragments.face_index[0, 5] == 1 - expected
 
 

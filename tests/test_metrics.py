@@ -217,9 +217,7 @@ def test_sheets_and_uris_hold_their_pictures() -> None:
     assert (joined[:, 8:10] == 255).all()
     assert (joined[:, 10:] == 100).all()
     sheet = picture_grid([_flat(4, 6, value) for value in (10, 20, 30)], columns=2, gap=1)
-    assert sheet.shape == (9, 13, 3)
-    assert sheet[0, 7, 0] == 20
-    assert sheet[5, 0, 0] == 30
+    assert (sheet.shape, sheet[0, 7, 0], sheet[5, 0, 0]) == ((9, 13, 3), 20, 30)
     assert (sheet[5:, 7:] == 255).all()
     picture = np.random.default_rng(0).integers(0, 255, (12, 9, 3)).astype(np.uint8)
     for quality in (None, 95):

@@ -45,8 +45,7 @@ def test_values_times_and_turns_and_the_lowest_rate_that_has_the_frame_numbers(t
     first = row("11:59:59:58.5", JawOpen=0.25, HeadYaw=0.3, EyeLookOutLeft=1, EyeLookInRight=1, EyeLookDownLeft=0.5)
     rows = row("11:59:59:59.5", JawOpen=0.5), row("12:00:00:00.5", JawOpen=1, HeadPitch=-0.2)
     motion = read_rows(tmp_path, first, *rows)
-    assert motion.fps == pytest.approx(60)
-    assert jaw(motion) == [0.25, 0.5, 1]
+    assert (motion.fps, jaw(motion)) == (pytest.approx(60), [0.25, 0.5, 1])
     np.testing.assert_allclose(motion.head_rotation[[0, 2]], [[0, -0.3, 0], [-0.2, 0, 0]], atol=1e-6)
     # Both eyes to the subject's left, the left one down as well.
     np.testing.assert_allclose(motion.eyes[0], [[LOOK_ANGLE / 2, LOOK_ANGLE, 0], [0, LOOK_ANGLE, 0]], atol=1e-6)
@@ -231,8 +230,7 @@ def test_every_layout_gives_the_same_motion(write, tmp_path: Path) -> None:
     assert jaw(motion) == [0, 0.125, 0.25, 0.375, 0.5]
     assert motion.coefficients[:, ARKIT_NAMES.index("eyeBlinkLeft")].tolist() == [0.5] * 5
     assert motion.coefficients.sum() == pytest.approx(1.25 + 5 * 0.75)
-    assert motion.fps == pytest.approx(30, rel=0.02)
-    assert motion.notes == ()
+    assert (motion.fps, motion.notes) == (pytest.approx(30, rel=0.02), ())
     if "facial_transformation_matrixes" in path.read_text():
         assert motion.head_translation[0] == pytest.approx([0, 0, -0.4])
 

@@ -339,8 +339,7 @@ def test_threads_of_a_run_are_those_it_asks_for(tmp_path: Path, monkeypatch: pyt
     settings, first = replace(train_toy.SETTINGS, steps=1, threads=before + 1), trainer.step
     monkeypatch.setattr(trainer, "step", lambda *given: seen.append(_native.thread_count()) or first(*given))
     train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
-    assert seen == [before + 1]
-    assert _native.thread_count() == before
+    assert (seen, _native.thread_count()) == ([before + 1], before)
 
 
 def about_options(help_text: str) -> dict[str, str]:

@@ -69,8 +69,7 @@ def test_depth_is_the_expected_depth() -> None:
     scale, quat, opacity = torch.full((1, 3), 0.05), torch.eye(4)[:1], torch.tensor([0.7])
     ball = Gaussians(means, quat, scale, opacity, torch.zeros(1, 1, 3))
     depth = known(rasterize(ball, [camera, camera], depth=True).depth)
-    assert depth.shape == (2, 11, 11)
-    assert depth[0, 5, 5].item() == pytest.approx(1.25, abs=1e-5)
+    assert (depth.shape, depth[0, 5, 5].item()) == ((2, 11, 11), pytest.approx(1.25, abs=1e-5))
     (gradient,) = torch.autograd.grad(depth[1, 5, 5], means)
     torch.testing.assert_close(gradient, torch.tensor([[0.0, 0.0, 1.0]]), atol=1e-3, rtol=0)
 

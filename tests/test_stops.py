@@ -52,8 +52,7 @@ def test_a_second_signal_does_not_interrupt_the_removal(number: signal.Signals) 
             removed.append("half a file")
 
     orderly(number, work)
-    assert removed == ["half a file"]
-    assert [signal.getsignal(each) for each in KINDS] == before
+    assert (removed, [signal.getsignal(each) for each in KINDS]) == (["half a file"], before)
 
 
 @of_every_kind
@@ -218,8 +217,7 @@ def test_stopped_rendering_ends_alike_the_next_time(name: str, how: signal.Signa
         assert len(visible(folder)) == 2
         assert all(cv2.imread(str(folder / each)) is not None for each in visible(folder))
     else:
-        assert visible(folder) == [name]
-        assert (out / name).read_text() == "mine"
+        assert (visible(folder), (out / name).read_text()) == ([name], "mine")
     assert how == signal.SIGKILL or len(visible(folder)) == len(list(folder.iterdir())), "something half-written stays"
     assert main([*command, str(out / name)]) == 0
     files = [path for path in undisturbed.rglob("*") if path.is_file()]

@@ -54,8 +54,7 @@ def test_capture_and_truth_keep_their_contracts_and_recipe_and_seed_decide_every
     """Frames come in order for any number of threads, and one that is drawn again is the same."""
     monkeypatch.setenv("MIEN_THREADS", "2")
     capture, truth = synthesize(replace(SMALL), seed=3)
-    assert capture.images.shape == (6, 1, 192, 192, 3)
-    assert capture.landmarks.shape == (6, 1, 478, 2)
+    assert (capture.images.shape, capture.landmarks.shape) == ((6, 1, 192, 192, 3), (6, 1, 478, 2))
     assert capture.valid.all()
     assert (len(truth.face), len(truth.valid), truth.neck_lines.shape) == (6, 6, (6, 1, 3))
     assert truth.face_model_hash == scene.model.content_hash

@@ -29,8 +29,7 @@ SHOWN = r"\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\xff.mp4"
 
 
 def test_what_acts_is_shown() -> None:
-    assert printable(NASTY) == SHOWN
-    assert printable("a\nb\t", lines=True) == "a\nb\\t"
+    assert (printable(NASTY), printable("a\nb\t", lines=True)) == (SHOWN, "a\nb\\t")
     for harmless in ("Köpfe und Leute", "頭.mp4", "👩\u200d💻 it's", r"C:\x1b", "a\xa0b"):
         assert printable(harmless) == harmless
     assert plain_name("a\x1b[2J\n\udcffb") == "a_[2J__b"
@@ -124,8 +123,7 @@ def test_a_closed_output_is_not_taken_by_the_next_file(tmp_path: Path) -> None:
     )
     path = tmp_path / "mine"
     done = subprocess.run(["bash", "-c", f"'{sys.executable}' -c \"{code}\" '{path}' >&- 2>&- <&-"], check=False)
-    assert done.returncode == 0
-    assert path.read_bytes() == b""
+    assert (done.returncode, path.read_bytes()) == (0, b"")
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "abc", "1025", "9" * 9000, "1.5", "\u0663", "\x1b[2J", "1 2"])

@@ -328,8 +328,7 @@ def test_every_stage_is_shown_and_changes_nothing(tmp_path, seen):
             "pixels, round 2 of 2, identity", "pixels, round 2 of 2, frames", "done"} <= set(stages)  # fmt: skip
     for name in ("landmarks", "pixels"):
         progress = [part for stage, part, _ in seen if stage.startswith(name)]
-        assert progress == sorted(progress)
-        assert progress[-1] == pytest.approx(1.0)
+        assert (progress, progress[-1]) == (sorted(progress), pytest.approx(1.0))
     heights = [height for _, _, height in seen]
     assert heights[0] < heights[stages.index("landmarks, identity")] < heights[-1], "residuals of colours are missing"
     assert "refresh" not in page.read_text(), "the last one is not renewed"

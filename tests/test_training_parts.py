@@ -150,8 +150,7 @@ def test_adam_equals_torchs_keeps_its_state_in_the_store_and_has_rates_that_fall
     torch.testing.assert_close([store["means"], *network.parameters()], twins)
     moments = store.moments["means"]
     assert isinstance(moments, Moments)
-    assert moments.step == 5
-    assert set(adam.state()) == {"network/weight", "network/bias"}
+    assert (moments.step, set(adam.state())) == (5, {"network/weight", "network/bias"})
     assert store["means"].grad is None
     # Learning rates fall from start to end, after their beginning. One that starts at nothing stays there.
     late = Rate(1.0, 0.01, begin=0.5)

@@ -66,8 +66,7 @@ def test_sliders_and_random_faces_change_the_face_within_bounds(session: Session
     session.take_random(np.random.default_rng(0))
     session.rest()
     np.testing.assert_array_equal(session.face.expression, session.avatar.portable.neutral.expression)
-    assert len(changes) == 6
-    assert changes == sorted(changes)
+    assert (len(changes), changes) == (6, sorted(changes))
     portable = session.avatar.portable
     eye = np.eye(len(portable.neutral.expression) + portable.neutral.joints.size, dtype=np.float32)
     limits = runtime.Filmed(0 * eye[0], 0 * eye[0], eye, np.ones(1, np.float32), np.ones((2, 2), np.float32))
@@ -108,8 +107,7 @@ def test_a_motion_plays_by_the_clock(session: Session) -> None:
     # A slow machine leaves timesteps out.
     moments = ((10.05, 0, 10.1), (10.1, 1, 10.2), (10.35, 3, 10.4), (10.45, 0, 10.5), (10.55, 1, 10.6))
     for now, timestep, wakes in moments:
-        assert session.advance(now) == pytest.approx(wakes)
-        assert session.timestep == timestep
+        assert (session.advance(now), session.timestep) == (pytest.approx(wakes), timestep)
         np.testing.assert_array_equal(session.face.expression, session.clip.motion.expression[timestep])
     session.play(False, 10.6)
     assert session.advance(99.0) is None
@@ -228,8 +226,7 @@ def test_videos_hold_the_motion_or_a_turn(session: Session, tmp_path: Path) -> N
     assert count_frames(tmp_path / "turn.mp4") == TURNTABLE_FRAMES
     session.choose("clip")
     (tmp_path / "clip.mp4").write_bytes(video(session, view, center))
-    assert count_frames(tmp_path / "clip.mp4") == 4
-    assert session.timestep == 0
+    assert (count_frames(tmp_path / "clip.mp4"), session.timestep) == (4, 0)
     pytest.raises(Stopped, video, session, view, center, lambda: False)
     center = center.astype(float)
     half = around(view, center, np.pi)

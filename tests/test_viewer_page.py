@@ -276,8 +276,7 @@ def test_a_port_that_is_taken_is_told_and_nothing_is_left_after_the_end(session:
     assert threads() <= before
     with pytest.raises(OSError):  # noqa: PT011
         request(port)
-    assert running.failures == []
-    assert capfd.readouterr().out == ""
+    assert (running.failures, capfd.readouterr().out) == ([], "")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])

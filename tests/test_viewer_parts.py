@@ -161,8 +161,7 @@ def test_a_picture_that_fails_concerns_its_client_alone() -> None:
     stage = Stage(1, 2, draw=draw, failed=failures.append)
     stage.look(1, 13)
     stage.look(2, 14)
-    assert [stage.loop.step() for _ in range(2)] == [0, 0]
-    assert stage.shown == [(2, 14, False)]
+    assert ([stage.loop.step() for _ in range(2)], stage.shown) == ([0, 0], [(2, 14, False)])
     stage.loop.add(3, show)
     stage.look(3, 12)
     assert stage.loop.step() == 0
@@ -171,8 +170,7 @@ def test_a_picture_that_fails_concerns_its_client_alone() -> None:
     stage.now += STILL_SECONDS
     assert [stage.loop.step() for _ in range(2)] == [0, None], "what failed is not tried again"
     stage.look(1, 15)
-    assert stage.loop.step() == 0
-    assert stage.shown[-1][:2] == (1, 15)
+    assert (stage.loop.step(), stage.shown[-1][:2]) == (0, (1, 15))
 
 
 def test_the_loop_stops_and_a_failure_that_concerns_all_ends_it_and_is_kept() -> None:
