@@ -176,8 +176,7 @@ def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monke
     assert find_webcam_files(model).model == model
     model.write_bytes(b"")
     assert "mien has one" not in refused(page, capsys, "--webcam-model", str(model))
-    tasks_vision()
-    model = tmp_path / "any.task"
+    model.unlink()
     monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))
     assert f"{model}: no such file; give MediaPipe's face landmarker" in refused(page, capsys)
     for content in (b"", b"PK\x03\x04 no archive"):

@@ -103,7 +103,8 @@ def test_a_run_that_is_being_trained_cannot_be_rendered_yet(other: Holder, studi
     shutil.copy(studio.root / "runs" / "alone" / "config.json", run)
     render = ["render", str(studio.root), "--run", "begun", "--out", str(tmp_path / "a.png")]
     with other.holding(run):
-        line = complaint(capsys, *render)
+        assert main(render) == 2
+        line = capsys.readouterr().err
         assert f"process {other.pid} on" in line
         assert line.endswith("; try again when it is done\n")
     assert "its training was not finished; run the same `mien train`" in complaint(capsys, *render)
