@@ -244,11 +244,6 @@ def picture(colors: np.ndarray, alpha: np.ndarray, behind: np.ndarray) -> np.nda
     return np.rint(255 * np.clip(mixed, 0, 1)).astype(np.uint8)
 
 
-def report_of(*faces: np.ndarray) -> dict:
-    measured = np.array([measure_face(face, CORNERS) for face in faces]).astype(np.float32)
-    return quality_report("clip", relative_quality(measured), measured)
-
-
 @pytest.mark.parametrize(("gains", "noise", "said"), [
     (np.ones(30), 0.01, {}),
     (np.linspace(1, 1.2, 30), 0.0, {}),
@@ -263,7 +258,8 @@ def test_exposure_darkness_and_noise_are_told_with_numbers(gains, noise, said):
     faces = [np.full((SIDE, SIDE, 3), SKIN) * gain for gain in gains]
     grain = np.random.default_rng(0)
     shown = [np.rint(255 * np.clip(one + grain.normal(0, noise, one.shape), 0, 1)).astype(np.uint8) for one in faces]
-    report = report_of(*shown)
+    measured = np.array([measure_face(face, CORNERS) for face in shown]).astype(np.float32)
+    report = quality_report("clip", relative_quality(measured), measured)
     assert {name for name in ("changing_light", "dark", "noisy", "overexposed") if report[name]} == set(said)
     assert len(report["hints"]) == len(said)
     for words in said.values():
@@ -321,7 +317,7 @@ def test_walls_are_no_screens(behind):
     assert screen_of(picture(colors, alpha, leaves if behind is None else np.array(behind))) is None
 
 
-def test_green_eyes_and_stripes_stay():
+def test_a_green_screen_leaves_no_rim_and_green_eyes_and_stripes_stay(test_data: Path, tmp_path: Path, capsys):
     colors, alpha = head()
     colors[58:62, 50:70] = (0.35, 0.55, 0.35)
     image = picture(colors, alpha, np.array(SCREENS["green"]))
@@ -329,9 +325,6 @@ def test_green_eyes_and_stripes_stay():
     matte = screen_matte(image, cv2.resize(alpha.astype(np.float32), (64, 64)), screen)
     assert matte[50:70, 45:75].min() == 255
     assert (without_screen(image, matte, screen)[58:62, 50:70] == image[58:62, 50:70]).all()
-
-
-def test_a_green_screen_leaves_no_rim(test_data: Path, tmp_path: Path, capsys):
     capture = capture_video(test_data / "cases/green_screen.mp4", tmp_path / "capture", CaptureSettings(max_frames=6))
     assert "the background is an even screen (red" in capsys.readouterr().err
     pictures, mattes = (np.asarray(part)[:, 0].astype(float) for part in (capture.images, capture.mattes))

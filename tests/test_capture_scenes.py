@@ -257,14 +257,10 @@ def drawn_shapes(person: int, turn: float, seed: int, pictures: int = 12) -> np.
     rows = [np.stack([np.cos(angles), 0 * angles, np.sin(angles)], -1), np.tile([0.0, 1, 0], (pictures, 1))]
     rows.append(np.stack([-np.sin(angles), 0 * angles, np.cos(angles)], -1))
     turned = points @ np.stack(rows, -2) + random.normal(0, 0.005, (pictures, 37, 3))
-    both = np.concatenate([turned, mirrored(turned)])
+    mirrored = turned[:, [*range(13), *(13 + (index ^ 1) for index in range(24))]] * (-1, 1, 1)
+    both = np.concatenate([turned, mirrored])
     both -= both.mean(1, keepdims=True)
     return both / np.sqrt(np.square(both).sum((1, 2), keepdims=True) / 37)
-
-
-def mirrored(points: np.ndarray) -> np.ndarray:
-    order = [*range(13), *(13 + (index ^ 1) for index in range(24))]
-    return points[:, order] * (-1, 1, 1)
 
 
 def test_people_are_told_apart_in_similar_and_in_mirrored_poses_alone() -> None:

@@ -74,14 +74,11 @@ def test_imavatar_keeps_the_masks_of_clothes(scene: Scene, tmp_path: Path) -> No
     assert not checks.read(folder, "imavatar", scene.model)[0].foreign
 
 
-def test_without_flame_the_remedy_is_told(scene: Scene, anny: FaceModel, tmp_path: Path) -> None:
+def test_what_lacks_flame_or_fits_no_pictures_is_refused_with_a_remedy(scene: Scene, anny: FaceModel, tmp_path) -> None:
     folder = writers.write_insta(tmp_path / "me", scene)
     assert checks.surveyed(folder).face_model == "FLAME 2020"
     for model in (None, anny):
         refuses(r"its tracking needs FLAME 2020 \(generic_model.pkl\)", checks.read, folder, "insta", model)
-
-
-def test_a_tracking_that_does_not_fit_its_pictures_is_refused(scene: Scene, tmp_path: Path) -> None:
     folder = writers.write_insta(tmp_path / "me", scene)
     for number in range(7):
         frame = writers.tracker_frame(scene, min(number, 5), writers.OFF_CENTRE)

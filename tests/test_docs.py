@@ -27,12 +27,16 @@ _PATH = re.compile(r"(?<![\w./])((?:docs|native|examples|benchmarks|src|tests)/[
 """Pattern of a file that the text names without a link."""
 
 
-def test_files_that_pages_name_exist() -> None:
+def test_files_and_commands_that_pages_name_exist() -> None:
+    targets = set(re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     missing = []
     for page, text in PROSE.items():
         prose = re.sub(r"^```.*?^```|^ {4,}[^\n]*$", "", text, flags=re.MULTILINE | re.DOTALL)
         prose = re.sub(r"`[^`\n]*[A-Z*{][A-Z*{]+[^`\n]*`", "", prose)  # NAME.py and patterns
         missing += [(page.name, path) for path in _PATH.findall(prose) if not (ROOT / path).exists()]
+        missing += [(page.name, name) for name in re.findall(r"`make ([a-z][a-z0-9-]*)", text) if name not in targets]
+        for names in re.findall(r"`mien ((?:[a-z][a-z-]*(?: \| )?)+)", text):
+            missing += [(page.name, name) for name in names.split(" | ") if name.split()[0] not in COMMANDS]
     assert missing == []
 
 
@@ -44,16 +48,6 @@ def test_pictures_are_small_and_described() -> None:
     assert [path.name for path in pictures if path.resolve() not in shown] == [], "a picture that no page shows"
     assert [path.name for path in pictures if path.stat().st_size > 120_000] == []
     assert sum(path.stat().st_size for path in pictures) < 1_000_000
-
-
-def test_commands_that_pages_name_exist() -> None:
-    targets = set(re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    missing = []
-    for page, text in PROSE.items():
-        missing += [(page.name, name) for name in re.findall(r"`make ([a-z][a-z0-9-]*)", text) if name not in targets]
-        for names in re.findall(r"`mien ((?:[a-z][a-z-]*(?: \| )?)+)", text):
-            missing += [(page.name, name) for name in names.split(" | ") if name.split()[0] not in COMMANDS]
-    assert missing == []
 
 
 @pytest.mark.unchecked

@@ -198,16 +198,13 @@ def test_fitted_faces_draw_the_picture_better_and_change_nothing_else(method: st
     assert experiment.face(frame).expression.equal(start.expression)
 
 
-def test_fits_do_not_depend_on_the_order_of_questions() -> None:
+def test_fits_are_a_third_figure_in_any_order_and_never_the_headline(tmp_path: Path) -> None:
     experiment = astray(make_experiment(10))
     frames = experiment.held_out_frames
     there, back = FittedFaces(experiment, 3), FittedFaces(experiment, 3)
     forward, backward = ({each: fits.face(each) for each in frames[::way]} for fits, way in ((there, 1), (back, -1)))
     assert all(forward[each].expression.equal(backward[each].expression) for each in frames)
     assert there.face(frames[0]) is forward[frames[0]]
-
-
-def test_the_third_figure_stands_beside_the_others_and_is_never_the_headline(tmp_path: Path) -> None:
     experiment = astray(make_experiment(10))
     plain = evaluate_frames(experiment, QUICK)
     partial = PartialScores(tmp_path / "partial", "one")

@@ -28,11 +28,6 @@ def jaw(motion: Motion) -> list[float]:
     return np.round(motion.coefficients[:, ARKIT_NAMES.index("jawOpen")].astype(float), 6).tolist()
 
 
-def opening(*seconds: str) -> list[list[str]]:
-    """Rows with these timecodes, whose jaw opens by a tenth from one to the next."""
-    return [row(timecode, JawOpen=index / 10) for index, timecode in enumerate(seconds)]
-
-
 def turning(*yaws: float, times: str = "0:00:00:{:02d}.0", **others: float) -> list[list[str]]:
     """Rows of a head that turns, two frames of a timecode apart."""
     return [row(times.format(2 * index), HeadYaw=yaw, **others) for index, yaw in enumerate(yaws)]
@@ -83,7 +78,7 @@ def test_fewer_than_five_rows_a_second_are_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])
 def test_encodings_of_spreadsheets_are_read(tmp_path: Path, encoding: str) -> None:
-    take = write_csv(tmp_path / "a.csv", *opening("0:0:0:0", "0:0:0:2"))
+    take = write_csv(tmp_path / "a.csv", row("0:0:0:0", JawOpen=0.0), row("0:0:0:2", JawOpen=0.1))
     plain = write_json(tmp_path / "a.json", [{"time": 0, "blendshapes": {"jawOpen": 0.5}}])
     for path in (take, plain):
         path.write_bytes(path.read_text().encode(encoding))

@@ -51,11 +51,6 @@ def camera_at(position: list[float], fov_x: float, size: int) -> Camera:
 head_camera = partial(camera_at, [0.2, 0.1, 1.2], 0.9)
 
 
-def sphere(subdivisions: int) -> tuple[Tensor, Tensor]:
-    made = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return torch.tensor(np.array(made.vertices)).float(), torch.tensor(np.array(made.faces)).long()
-
-
 def test_a_known_triangle_lands_on_known_pixels_and_the_nearest_is_seen():
     vertices = at_depth([(2, 1, 1), (6, 1, 1), (2, 5, 1)])
     fragments = rasterize_mesh(vertices, torch.tensor([[0, 1, 2]]), pixel_camera())
@@ -188,7 +183,8 @@ def test_harmonics_are_orthonormal_and_light_is_linear():
 
 
 def test_picture_of_a_sphere():
-    vertices, faces = sphere(4)
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    vertices, faces = torch.tensor(np.array(sphere.vertices)).float(), torch.tensor(np.array(sphere.faces)).long()
     camera = camera_at([0.0, 0.0, 4.0], 0.8, 64)
     radius = float(camera.K[0, 0]) / (4**2 - 1) ** 0.5
     image, alpha = render_mesh(vertices, faces, camera, background=(0.0, 0.0, 1.0), supersample=4)

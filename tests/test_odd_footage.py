@@ -72,10 +72,6 @@ def in_green_light(picture: np.ndarray) -> list[np.ndarray]:
     return [np.rint(255 * srgb_signal(light)).astype(np.uint8)] * 4
 
 
-def shaken(picture: np.ndarray) -> list[np.ndarray]:
-    return [picture] * 6 + [streak(picture, 0.07 * 0.46 * 160, 0.0)] * 2 + [picture] * 4
-
-
 def expect_unusable(capture: Capture, face: Face) -> None:
     assert capture.valid.all()
     assert np.flatnonzero(~capture.usable[:, 0]).tolist() == [6, 7]
@@ -212,7 +208,8 @@ ODD = {
         partial(filmed, partial(brighter, 1.4)), (AGAIN.format("over-exposed"),), {**PLAIN, "overexposed": True}),
     "green light": Odd(partial(filmed, in_green_light), (CAST,), {"color_cast": "green"}),
     "blurred": Odd(
-        partial(filmed, shaken), ("the face is blurred in 2 of 12 frames",), {"blurred_frames": [6, 7]},
+        partial(filmed, lambda one: [one] * 6 + [streak(one, 0.07 * 0.46 * 160, 0.0)] * 2 + [one] * 4),
+        ("the face is blurred in 2 of 12 frames",), {"blurred_frames": [6, 7]},
         check=expect_unusable),
     "interlaced": Odd(FIELDS, (DEINTERLACED,), {"frames_deinterlaced": 6, "combs": True}, WHOLE),
     "interlaced, kept": Odd(FIELDS, (), {"frames_deinterlaced": 0, "combs": True}, NEVER),
