@@ -1,28 +1,21 @@
-"""The textured mesh and PointAvatar follow their formulas: surfels, light by normals, offsets, prunes, holes."""
+"""The textured mesh follows its formulas: surfels that cover triangles, light by normals, and offsets of vertices."""
 
 import math
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from known import known
-from mien.avatar import PointAvatar, PointAvatarConfig, Progress, TexturedMesh, TexturedMeshConfig, move_avatar
-from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
-from mien.avatar.point_avatar.avatar import was_drawn
-from mien.avatar.point_avatar.networks import SurfaceNet
+from mien.avatar import Progress, TexturedMesh, TexturedMeshConfig, move_avatar
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
-from mien.face import FaceModel, FaceParams, head_poses
+from mien.face import FaceModel, FaceParams
 from mien.face.mirror import triangle_geometry
-from mien.gaussians import Gaussians
-from mien.render import close_holes, rasterize
+from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
-from mien.training import PRESETS
 from mono_avatars import pictured
-from plain_settings import plain_point_avatar, plain_textured_mesh
+from plain_settings import plain_textured_mesh
 from refusals import refuses
 from sh_colors import rgb_from_sh
 from toy_scene import toy_camera, toy_face, toy_face_model
@@ -227,112 +220,3 @@ def test_penalties_are_of_rough_offsets_and_albedo_and_of_bent_normals_and_of_li
         "light": PLAIN.light_weight * (avatar.light - white).square().mean(),
     }
     torch.testing.assert_close(losses, expected)
-
-
-SMALL = plain_point_avatar(points=30, max_points=100, face_points=30)
-
-
-def new_points(config: PointAvatarConfig = SMALL, disturbed: bool = True) -> PointAvatar:
-    torch.manual_seed(0)
-    avatar = PointAvatar(config, toy_face_model(), toy_face(5))
-    if disturbed:
-        with torch.no_grad():
-            for parameter in avatar.parameters():
-                parameter.add_(0.05 * torch.randn(parameter.shape))
-    return avatar
-
-
-def point_colors(avatar: PointAvatar, face: FaceParams) -> Tensor:
-    return rgb_from_sh(avatar.pose(face).gaussians.sh)[..., 0, :]
-
-
-def test_points_double_and_shrink_together() -> None:
-    """They are round, opaque and of one size. Children are within the radius around their parents."""
-    avatar = new_points()
-    gaussians = avatar.pose(toy_face(5)[0], Progress(0, 100)).gaussians
-    torch.testing.assert_close(gaussians.scales, torch.full((30, 3), 0.0375 * 0.75 ** np.log2(30 / 100) / 2))
-    assert gaussians.opacities.unique().tolist() == [pytest.approx(0.99)]
-    parents, noise = torch.tensor([3, 7]), torch.tensor([[0.5, -0.5, 0.0], [0.1, 0.2, 0.3]])
-    children = avatar.density().refill(avatar.store, parents, noise, 0.0)["means"]
-    torch.testing.assert_close(children - avatar.store["means"][parents], noise * avatar.radius(0.0))
-    counts = [avatar.points_at((epoch + 0.5) / 20) for epoch in (0, 3, 4, 7, 8, 19)]
-    assert counts == [30, 30, 60, 60, 100, 100]
-    assert avatar.radius(0.25) == pytest.approx(0.75 * avatar.radius(0.1))
-    settings = avatar.density().settings
-    targets = dict(zip(settings.times, settings.targets, strict=True))
-    assert len(targets) == 19
-    # The round that ends epoch 3 already fills up to the number of epoch 4.
-    assert (targets[3 / 20], targets[4 / 20], targets[19 / 20]) == (30, 60, 100)
-    paper: Any = PRESETS["paper"].config("point_avatar")
-    assert (paper.start, paper.points, paper.max_points, paper.normals) == ("sphere", 400, 100_000, "deformed")
-    # In the paper's lengths, of a head of four times life size: 400 points of radius 0.15 * 0.75^2.
-    avatar = new_points(replace(SMALL, points=400, max_points=100_000), disturbed=False)
-    assert 4 * avatar.radius(0.0) == pytest.approx(0.15 * 0.75**2)
-    torch.testing.assert_close(avatar.store["means"].norm(dim=-1), torch.full((400,), 0.125))
-
-
-def test_slopes_are_the_gradients_of_the_distance_and_losses_hold_points_where_it_is_none() -> None:
-    torch.manual_seed(0)
-    network, points = SurfaceNet(16, 3, 2).double(), torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
-    found = network(points)
-    torch.testing.assert_close(found.slope, torch.autograd.grad(found.distance.sum(), points)[0])
-    avatar = new_points()
-    posed = avatar.pose(toy_face(5)[1], Progress(4, 100))
-    rendering = rasterize(posed.gaussians.timestep(0), toy_camera(32), torch.ones(3))
-    losses = avatar.regularizers(posed, rendering, Progress(4, 100))
-    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
-    torch.testing.assert_close(losses["distance"], surface.distance.square().mean())
-    torch.testing.assert_close(losses["slope"], 0.1 * (surface.slope.norm(dim=-1) - 1).square().mean())
-    assert set(losses) >= {"skinning", "expression_directions"}
-
-
-def test_a_color_is_albedo_times_light_on_the_normal_which_turns_with_the_head() -> None:
-    avatar = new_points()
-    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
-    normals = torch.nn.functional.normalize(surface.slope, dim=-1)
-    expected = surface.albedo.sigmoid() * avatar.shading(normals)
-    torch.testing.assert_close(point_colors(avatar, toy_face(5)[2]), expected)
-    assert new_points(disturbed=False).shading(normals).unique().tolist() == [1.0]
-    avatar, still, face = new_points(replace(SMALL, normals="deformed")), new_points(), toy_face(5)[2]
-    turned = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.0, 0.0]))
-    assert (point_colors(avatar, face) - point_colors(avatar, turned)).abs().max() > 1e-3
-    refuses(r"^the setting normals deformed of point_avatar: .*export a \.ply", avatar.bake)
-    torch.testing.assert_close(point_colors(still, face), point_colors(still, turned))
-    # Points on rigid bones have normals that turn with them.
-    last = avatar.deformation.skinning
-    with torch.no_grad():
-        last.weight.zero_()
-        last.bias.copy_(10.0 * torch.eye(len(last.bias))[0])
-    points, normals = avatar.store["means"].detach() / LENGTH_UNIT, torch.randn(30, 3)
-    normals = torch.nn.functional.normalize(normals, dim=-1)
-    rest, now = (avatar.motion.transforms(one)[0, 0, :, :3] for one in (avatar.motion.canonical_face(), turned))
-    expected = normals @ (head_poses(turned)[0, :3, :3] @ now @ rest.T).T
-    torch.testing.assert_close(avatar.deformed_normals(points, normals, turned)[0], expected, atol=1e-5, rtol=0)
-
-
-def test_points_that_others_hide_are_not_drawn() -> None:
-    """A small point behind four large ones takes part in no pixel, but is within the picture."""
-    camera = toy_camera(32)
-    depths = torch.tensor([0.5, 0.5, 0.5, 0.5, 0.8])
-    means = (camera.position + depths[:, None] * camera.viewmat[2, :3]).requires_grad_()
-    scales = torch.tensor([0.2, 0.2, 0.2, 0.2, 0.01])[:, None].repeat(1, 3)
-    quats = torch.tensor([1.0, 0, 0, 0]).repeat(5, 1)
-    gaussians = Gaussians(means, quats, scales, torch.full((5,), 0.99), torch.zeros(5, 1, 3))
-    rendering = rasterize(gaussians, camera, torch.ones(3))
-    assert (rendering.radii > 0).all()
-    (rendering.image * torch.linspace(0, 1, 32)[:, None]).sum().backward()
-    seen = was_drawn(gaussians, rendering)
-    assert (seen[0], seen[4]) == (1, 0)
-
-
-def test_closing_fills_bright_specks_and_keeps_the_rest() -> None:
-    picture = torch.ones(20, 20, 3)
-    picture[5:15, 5:15] = 0.25
-    whole = picture.clone()
-    picture[9, 9] = 1.0
-    picture[12:14, 6:8] = 1.0
-    assert torch.equal(close_holes(picture, 1), whole)
-    assert torch.equal(close_holes(picture, 0), picture)
-    assert new_points().extras.closing == 1
