@@ -122,5 +122,8 @@ def test_the_mixed_half_keeps_what_is_rare() -> None:
     (mask,) = masks([sequence], found, [0, 3])
     assert mask.nonzero()[:, 0].tolist() == [0, 3]
     assert ranges(found, list(range(8)))["expression_spread"] == pytest.approx(1)
+
+
+def test_the_frontal_quarter_has_the_views_nearest_to_the_median():
     yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
     assert frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))) == [3, 7]

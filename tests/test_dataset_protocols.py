@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,7 +13,6 @@ import torch
 from torch.nn.functional import conv2d, max_pool2d
 
 from evaluation_case import make_experiment, two_cameras, write_run, write_sequence
-from mien.avatar import METHODS, MethodConfig
 from mien.capture import read_capture, read_capture_hash
 from mien.commands.evaluate import Protocol
 from mien.errors import UserError
@@ -25,10 +24,9 @@ from mien.evaluation.metrics import ssim
 from mien.files import write_json
 from mien.storage import write_arrays
 from mien.tracking import read_scoring, write_scoring
-from mien.training import OwnSplit, Sequence, TrainSettings, train, write_own_split
+from mien.training import OwnSplit, write_own_split
 from mien.training.footage import FOREIGN, Frame, packed_clothes
-from plain_settings import plain_config, plain_run
-from toy_scene import toy_sequence
+from plain_settings import plain_run
 
 pytestmark = pytest.mark.unchecked
 PLAIN = EvaluationSettings(perceptual=False, baselines=False, video_frames=0, edges="filmed")
@@ -161,52 +159,3 @@ def test_imavatar_scores_drawings_that_are_opened_and_without_clothes(root: Path
     write_arrays(folders[1] / FOREIGN, packed_clothes(np.zeros((t, height, width - 8), bool)))
     with pytest.raises(UserError, match="its masks of clothes do not fit the pictures; import the sequence again"):
         load_experiments(run, folders, "filmed", "imavatar")
-
-
-TIMESTEPS, SHOWN = 10, 8
-SETTINGS = TrainSettings(steps=6, split="tail", checkpoint_every=12)
-SMALL: dict[str, dict[str, Any]] = {
-    "gaussian_avatars": {},
-    "headgas": {"points": 60, "judged_expressions": 4, "directions": 3},
-    "mono_gaussian_avatar": {"points": 60, "max_points": 120, "pretraining": 5},
-    "point_avatar": {"points": 60, "max_points": 120, "pretraining": 5},
-    "textured_mesh": {"surfels": 300},
-}
-
-
-def absurd(sequence: Sequence) -> Sequence:
-    """The same sequence, whose held-out frames have other faces, other pixels and another matte."""
-    face = sequence.tracking.face
-    shift = torch.zeros(TIMESTEPS, 1)
-    shift[SHOWN:] = 3.0
-    strange = replace(
-        face, expression=face.expression + shift, joints=face.joints + shift[..., None],
-        head_rotation=face.head_rotation - shift, head_translation=face.head_translation + 10 * shift,
-    )  # fmt: skip
-    images, scoring = sequence.capture.images.copy(), sequence.scoring.copy()
-    images[SHOWN:], scoring[SHOWN:] = 255 - images[SHOWN:], 0
-    tracking, capture = replace(sequence.tracking, face=strange), replace(sequence.capture, images=images)
-    return replace(sequence, tracking=tracking, capture=capture, scoring=scoring)
-
-
-@pytest.mark.parametrize("plain", [True, False], ids=["plain", "default"])
-@pytest.mark.parametrize("method", [*SMALL, "timesteps that are left out"])
-def test_held_out_frames_change_no_byte_of_an_avatar(method: str, plain: bool, tmp_path: Path) -> None:
-    face_model, sequence = toy_sequence(TIMESTEPS, 32)
-    pair, settings = (sequence, absurd(sequence)), SETTINGS
-    if method not in SMALL:
-        # `mien analyze --parts diversity` trains on a part of the timesteps, and calls the others not valid.
-        method, settings, valid = "gaussian_avatars", replace(SETTINGS, split="none"), torch.arange(TIMESTEPS) < SHOWN
-        pair = tuple(replace(one, tracking=replace(one.tracking, valid=valid)) for one in pair)
-    config: MethodConfig = plain_config(method) if plain else METHODS[method].config()
-    config = replace(config, **SMALL[method])
-    first, second = (
-        train([one], face_model, config, settings, tmp_path / str(index)) for index, one in enumerate(pair)
-    )
-    for ours, theirs in (
-        (first.state_dict(), second.state_dict()), (first.subject.tensors(), second.subject.tensors()),
-        (vars(first.filmed), vars(second.filmed)),
-    ):  # fmt: skip
-        assert ours.keys() == theirs.keys()
-        for name, one in ours.items():
-            assert torch.equal(torch.as_tensor(one), torch.as_tensor(theirs[name])), name

@@ -117,7 +117,7 @@ def test_surfels_cover_the_mesh(surfels: int, least: float) -> None:
     assert narrow[inside].min() < 0.9
 
 
-def test_offsets_and_colours_are_averaged_over_neighbours_and_teeth_and_eyes_stay() -> None:
+def test_teeth_and_eyes_stay_and_offsets_and_colours_are_averaged_over_neighbours() -> None:
     model = toy_face_model()
     v = len(model.template)
     matrix = torch.zeros(v, v, dtype=torch.float64)
