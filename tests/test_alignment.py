@@ -275,7 +275,7 @@ def driven(face: FaceParams, neutral: str | None = None) -> FaceParams:
     return drive(driver.face, driver.at_rest, model().neutral())
 
 
-def test_what_is_held_throughout_reaches_the_avatar(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_held_or_turned_throughout_reaches_the_avatar(capsys: pytest.CaptureFixture[str]) -> None:
     """An open mouth, raised brows and a grin that never end are motion. The default says so, and calm is as before."""
     for held in (
         {"jawOpen": 0.6}, {"browInnerUp": 0.8, "browOuterUpLeft": 0.7}, {"mouthSmileLeft": 0.7, "mouthSmileRight": 0.7},
@@ -291,9 +291,6 @@ def test_what_is_held_throughout_reaches_the_avatar(capsys: pytest.CaptureFixtur
             assert words in told
         assert driven(face, "calm").expression[:, index].mean() < 0.1
         torch.testing.assert_close(driven(face, "model").expression[:, index], face.expression[:, index])
-
-
-def test_a_head_or_gaze_turned_throughout_reaches_the_avatar() -> None:
     head, gaze = talking({}, head=55), talking({}, eyes=26)
     for neutral in (None, "model"):
         torch.testing.assert_close(driven(head, neutral).head_rotation, head.head_rotation, atol=1e-5, rtol=0)
@@ -304,7 +301,7 @@ def test_a_head_or_gaze_turned_throughout_reaches_the_avatar() -> None:
         torch.testing.assert_close(driven(face).joints, face.joints, atol=1e-5, rtol=0)
 
 
-def test_who_rests_is_transferred_as_before() -> None:
+def test_who_rests_is_transferred_as_before_and_motion_grows_without_a_jump() -> None:
     for face in (talking({"browInnerUp": 0.2}, head=-25, eyes=24), talking({"jawOpen": 0.15}, eyes=10), talking({})):
         calm = neutral_of(face)
         rest = rest_of(calm, model())
@@ -321,9 +318,6 @@ def test_who_rests_is_transferred_as_before() -> None:
     rest = rest_of(replace(calm, head_rotation=axis_angle_from_matrix(aside)[None]), model(), ahead)
     torch.testing.assert_close(matrix_from_axis_angle(rest.face.head_rotation)[0], ahead, atol=1e-5, rtol=0)
     assert rest.moved == ("the head 57 degrees to the side",)
-
-
-def test_motion_grows_without_a_jump() -> None:
     for limits in (DRIVING.rest_expression, DRIVING.rest_head, DRIVING.rest_gaze):
         sizes = torch.linspace(0, 2 * limits[1], 2001)
         moved = sizes * (1 - kept_share(sizes, limits))

@@ -266,15 +266,12 @@ def test_what_is_announced_is_what_is_decoded(tmp_path: Path, ending: str) -> No
             assert announced_size(path.read_bytes()[:length]) in (None, (shape[1], shape[0]))
 
 
-def test_lossless_and_lossy_webp_are_read(tmp_path: Path) -> None:
+def test_webp_is_read_and_other_kinds_of_pictures_are_not_decoded(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (21, 34, 4), dtype=np.uint8)
     for channels, quality, kind in ((3, 50, b"VP8 "), (3, 101, b"VP8L"), (4, 50, b"VP8X")):
         data = cv2.imencode(".webp", picture[..., :channels], [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
         assert (announced_size(data), data[12:16]) == ((34, 21), kind)
-
-
-def test_other_kinds_of_pictures_are_not_decoded(tmp_path: Path) -> None:
-    """Other kinds of pictures are not decoded under any name, since every decoder may have faults."""
+    # Other kinds of pictures are not decoded under any name, since every decoder may have faults.
     path = tmp_path / "a.png"
     path.write_bytes(b"P5 2 2 255 abcd")
     assert cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR) is not None

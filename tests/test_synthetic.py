@@ -114,7 +114,7 @@ def ring(tmp_path_factory):
     return folder
 
 
-def test_ring_is_a_calibrated_capture_with_its_truth(ring):
+def test_a_ring_is_a_calibrated_capture_whose_truth_is_what_the_face_model_says(ring):
     capture, truth = read_capture(ring / "capture"), read_truth(ring / "truth")
     assert capture.images.shape == (8, 3, 128, 128, 3)
     assert capture.calibration is not None
@@ -130,10 +130,6 @@ def test_ring_is_a_calibrated_capture_with_its_truth(ring):
     found = capture.valid[:, 0]
     assert found.sum() >= 4
     assert np.median(np.linalg.norm(capture.landmarks[found, 0] - truth.landmarks[found, 0], axis=-1)) < 3
-
-
-def test_truth_is_what_the_face_model_says(ring):
-    truth, scene = read_truth(ring / "truth"), SyntheticScene(RING, 3)
     expected = scene.model(truth.tracking.face[5])[0][torch.from_numpy(truth.vertex_index)]
     np.testing.assert_allclose(truth.vertices_world[5], expected.numpy(), atol=2e-5)
     np.testing.assert_allclose(truth.landmarks[5, 2], scene.landmarks(2)[5], atol=0.04)

@@ -308,7 +308,7 @@ def seen_by_browser(address: str, steps: list[dict[str, Any]], size: tuple[int, 
     return told
 
 
-def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path: Path) -> None:
+def test_a_browser_shows_the_avatar_and_a_phone_the_whole_head(serving: Serving, session: Session, tmp_path) -> None:
     shots = [tmp_path / f"{index}.png" for index in range(4)]
     steps: list[dict[str, Any]] = [
         {"see": "Expressions"}, {"settled": shots[0]}, {"click": "Random face"}, {"settled": shots[1]},
@@ -327,10 +327,7 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
     visible = {name for name, slider in serving.panel.sliders.items() if slider.visible}
     assert visible & set(session.avatar.expression_names) == {"mouthSmileLeft"}
     assert (serving.loop.error, serving.failures) == (None, [])
-
-
-def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
-    """The head fits the narrow window, and the panel, which would cover half of it, is folded."""
+    # The head fits the narrow window, and the panel, which would cover half of it, is folded.
     seen_by_browser(serving.address, [{"see": "mien"}, {"settled": tmp_path / "a.png"}], (390, 844))
     drawn = np.any(read(tmp_path / "a.png")[:700] < 250, axis=-1)
     columns = np.flatnonzero(drawn.any(0))

@@ -70,15 +70,12 @@ def expect_as_in_python(built: Path, folder: Path, recording: Path, notes: int =
         np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
 
 
-def test_every_layout_is_read_as_in_python(built: Path, tmp_path: Path) -> None:
+def test_every_layout_and_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
     names = [name for pair in PAIRS for name in pair]
     for write in (write for writers in LAYOUTS.values() for write in writers):
         recording = write(tmp_path, [{}, *({name: 0.5} for name in names), {"jawOpen": 0.5}])
         expect_as_in_python(built, tmp_path, recording)
-
-
-def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
-    """Midnight, repeats, gaps, faces that are lost at first, decimal commas, transposed matrices, turns and gaze."""
+    # Midnight, repeats, gaps, faces that are lost at first, decimal commas, transposed matrices, turns and gaze.
     codes = ("23:59:59:56", "23:59:59:58", "23:59:59:58", "0:00:00:00", "0:00:00:06", "0:00:00:08")
     rows = [row(code, JawOpen=index / 8, MouthLeft=0.5, HeadYaw=0.1 * index) for index, code in enumerate(codes)]
     keep = [index for index, name in enumerate(COLUMNS) if name != "TongueOut"]
