@@ -188,8 +188,6 @@ def test_every_row_of_the_table_names_a_test_that_exists() -> None:
             assert f"def {test}(" in source, f"{file}.py has no {test}"
 
 
-# Full disks -----------------------------------------------------------------------------------------------------------
-
 USD = ("usd", "usda", "usdc", "usdz")
 ENDINGS = ("mien", "html", "packed", "glb", "ply", "spz", "sog", *(USD if importlib.util.find_spec("pxr") else ()))
 COMMANDS: dict[str, tuple[str, ...]] = {

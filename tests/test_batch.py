@@ -222,9 +222,6 @@ def check_store(batch: Batch, store: str, *steps: tuple[str, str]) -> None:
     assert not (batch.root / "begins.txt").exists()  # it ran elsewhere
 
 
-# Of strangers ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("name", "text"), [
     ("a.csv", "video,preset\nann.mp4,draft;--out;/elsewhere\n"),
     ("a.csv", "video;preset\nann.mp4;--out=/elsewhere\n"),

@@ -117,8 +117,6 @@ def test_look_at_puts_its_target_at_the_center_with_up_upwards(position: Tensor,
     close(torch.linalg.det(viewmat[:3, :3]), torch.ones((), dtype=torch.float64))
 
 
-# -- rotations -------------------------------------------------------------------------------------------------------
-
 turns = vectors_of(3, 3)
 quaternions = vectors_of(4, 3).filter(lambda q: float(q.norm()) > 1e-3)
 

@@ -330,9 +330,6 @@ def test_a_run_belongs_to_the_videos_that_it_was_trained_on(tmp_path: Path) -> N
     assert [name for name in names if is_part_of(name, "a.b")] == ["a.b", "a.b-12"]
 
 
-# Mattes ---------------------------------------------------------------------------------------------------------------
-
-
 FACE, OTHER = np.array([70.0, 60, 110, 100]), np.array([180.0, 40, 220, 80])
 NOBODY = np.full((1, 4), np.nan)
 

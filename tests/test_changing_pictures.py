@@ -77,8 +77,6 @@ def test_frames_that_are_left_out_are_counted(test_data, tmp_path, capsys):
     assert told in capsys.readouterr().err
 
 
-# Cuts -----------------------------------------------------------------------------------------------------------------
-
 FACE = np.array([0.4, 0.3, 0.6, 0.7])
 OVERLAYS = {
     "a caption": (np.s_[14:17, 3:29], False), "a band over a third": (np.s_[12:, :], False),
@@ -118,9 +116,6 @@ def test_a_person_who_leaves_another_is_no_cut() -> None:
 def test_the_case_with_captions(test_data, tmp_path):
     (capture,) = capture_video_parts(test_data / "cases" / "captions.mp4", tmp_path, CaptureSettings(size=64))
     assert capture.timesteps == 50
-
-
-# Alpha ----------------------------------------------------------------------------------------------------------------
 
 
 SIDE = 160

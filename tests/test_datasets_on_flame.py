@@ -185,9 +185,6 @@ def test_the_last_frames_are_held_out(scene: Scene, tmp_path: Path, monkeypatch:
         assert any("6 frames are too few for" in each for each in checks.surveyed(folder).missing)
 
 
-# VHAP -----------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.unchecked
 def test_a_union_reads_nothing_beside_its_exports(scene: Scene, tmp_path: Path) -> None:
     (tmp_path / "all").mkdir()

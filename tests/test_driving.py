@@ -206,9 +206,6 @@ def test_each_coefficient_moves_its_side_of_a_face() -> None:
         assert way * irises[:, 0].sum() > 0, name
 
 
-# -- times of frames --------------------------------------------------------------------------------------------------
-
-
 def test_pauses_and_dropped_and_odd_frames_do_not_change_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
     """A pause of 20 s in a clip at 30 frames a second leaves 30, however the file states its rate."""
     times = np.concatenate([np.arange(30), 600 + np.arange(30)]) / 30

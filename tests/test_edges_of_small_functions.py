@@ -127,9 +127,6 @@ def test_a_guided_filter_is_locally_affine_and_the_matte_beside_the_head_whole_w
     assert (cut[150, 253], cut[150, 254]) == (255, 128)
 
 
-# Places and files -----------------------------------------------------------------------------------------------------
-
-
 def test_places_that_can_and_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "there.png").write_bytes(b"old")
     for name, folder in (

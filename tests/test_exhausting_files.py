@@ -181,8 +181,6 @@ def test_a_stage_that_names_other_files_is_refused(tmp_path: Path) -> None:
     pytest.raises(UserError, read_usd, path)
 
 
-# Motion ---------------------------------------------------------------------------------------------------------------
-
 START = [row(f"0:00:00:0{frame}.0") for frame in range(6)]
 MATRIX = {"facialTransformationMatrixes": [{"data": [*([0] * 15), DIGITS]}], "faceBlendshapes": []}
 CSV = (

@@ -237,9 +237,6 @@ def test_cameras_sway_around_the_head_and_come_from_a_file(tmp_path: Path) -> No
         refuses(part, read_cameras, path)
 
 
-# As other programs write them -----------------------------------------------------------------------------------------
-
-
 def written(path: Path, types: dict[str, str], newline: str, coefficients: int = 4) -> dict[str, np.ndarray]:
     """Write a .ply of 5 Gaussians with these columns, or others, of these numpy types, and return the columns."""
     names = {"float32": "float", "float64": "double", "uint8": "uchar", "int16": "short", "uint32": "uint"}

@@ -145,8 +145,6 @@ def test_impossible_changes_are_refused() -> None:
         assert part in known(baked_fault(replace(baked, changes=replace(changes, **wrong))))
 
 
-# -- features on Gaussians --------------------------------------------------------------------------------------------
-
 RANK, DIRECTIONS = 3, 5
 CONFIG = plain_gaussian_avatars(
     expression_rank=RANK, expression_color_rate=Rate(0.0), appearance="features", appearance_directions=DIRECTIONS,

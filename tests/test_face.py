@@ -205,8 +205,6 @@ def _seen_of_eyes(model: FaceModel, vertices: Tensor) -> int:
     return int(torch.isin(found, eyes.to(found.dtype)).sum())
 
 
-# Principal components of people ---------------------------------------------------------------------------------------
-
 DIRECTIONS = 4
 
 

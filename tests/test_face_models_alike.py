@@ -277,9 +277,6 @@ def test_choices_that_lead_nowhere(added, tmp_path, capsys):
     assert f"{tmp_path}: is a folder, and not ICT-FaceKit's FaceXModel; give a file in it: " in capsys.readouterr().err
 
 
-# Tracking -------------------------------------------------------------------------------------------------------------
-
-
 QUICKLY = (
     "--tracking.keyframes", "4", "--tracking.photometric.keyframes", "4", "--tracking.photometric.sizes", "64",
     "--tracking.photometric.texture-size", "64", "--tracking.photometric.shared-steps", "1",
@@ -341,9 +338,6 @@ def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path
     tracking = track(capture, load_face_model("my_head"), settings)
     assert tracking.face.vertex_offsets is not None
     assert tracking.residuals.nanmedian() < 1.0
-
-
-# By the real detector -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.unchecked

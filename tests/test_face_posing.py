@@ -113,8 +113,6 @@ def test_more_blendshapes_than_the_core_takes_are_posed_by_the_reference() -> No
     assert torch.equal(model(face), model.vertices_reference(face))
 
 
-# Boxes of eyes and mouth ----------------------------------------------------------------------------------------------
-
 CAMERA = camera_from_fov(0.5, 200, 160, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
 
 
@@ -158,9 +156,6 @@ def test_parts_that_face_away_or_are_outside_are_missing(face_model: FaceModel) 
     left, _, width, _ = part_boxes(face_model, placed(face_model, shift=(0.14, 0, -0.6)), CAMERA)["mouth"]
     assert left + width == CAMERA.width, "it is cut at the border"
     assert part_boxes(replace(face_model, region_names=("skin", "a", "b")), placed(face_model), CAMERA) == {}
-
-
-# Landmarks ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_point_on_the_surface_is_found_again():

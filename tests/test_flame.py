@@ -34,9 +34,6 @@ def model(arrays, tmp_path_factory) -> FaceModel:
     return replace(bare, landmarks=flame_like.exact_landmarks(load_face_model("anny")))
 
 
-# Posing ---------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "moved", ["nothing", "root", "neck", "jaw", "eyes", "identity", "expression", "offsets", "all"]
 )
@@ -95,9 +92,6 @@ def test_it_is_posed_by_number_on_the_command_line(model):
     assert torch.all(layout.units[: len(layout.expression_index)] > 1)
     eyes = [layout.names.index(f"{side}_eye_y") for side in ("left", "right")]
     assert layout.precision[eyes[0], eyes[1]] < 0
-
-
-# Files ----------------------------------------------------------------------------------------------------------------
 
 
 class _Harm:
@@ -160,9 +154,6 @@ def test_what_is_missing_is_named_with_a_remedy(arrays, tmp_path):
         read_flame(flame_like.write_npz(path, {"lmk_face_idx": np.zeros(3)}))
     np.savez(path, allow_pickle=True, weights=np.array([_Harm(os.system, "true")], dtype=object))
     refuses(r"numpy\.savez", read_flame, path)
-
-
-# Regions and texture --------------------------------------------------------------------------------------------------
 
 
 def test_regions_by_landmarks_are_about_the_true_ones(model):

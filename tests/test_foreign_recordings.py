@@ -146,9 +146,6 @@ def test_pieces_of_azures_speech(tmp_path: Path) -> None:
         refuses(words, read_blendshape_json, write_json(path, content))
 
 
-# Folders that users give ----------------------------------------------------------------------------------------------
-
-
 LEFT = ("._{}", ".{}", ".DS_Store", "Thumbs.db", "desktop.ini", "__MACOSX/{}", "__MACOSX/._{}")
 """Names of files that systems leave beside a file."""
 

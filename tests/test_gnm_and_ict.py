@@ -88,8 +88,6 @@ def test_what_does_not_fit_gnm_is_named_with_a_remedy(arrays: dict[str, Any], tm
     refuses("without --teeth", read_model_file, write_gnm(tmp_path / "gnm_head.npz", arrays), "gnm_head", teeth=True)
 
 
-# ICT-FaceKit ----------------------------------------------------------------------------------------------------------
-
 SMALL = b"# a comment\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0.5\nvt 0 0\nf 1/1/1 2/1/1 3/1/1 4/1/1\nf 1 2 3\n"
 
 

@@ -139,8 +139,6 @@ def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     assert run("still", hair_rate=0.0)[0] != whole[0]
 
 
-# -- hidden Gaussians ------------------------------------------------------------------------------------------------
-
 _COLOR = 0.3
 
 

@@ -27,8 +27,6 @@ from mien.face.npz import MAX_MODEL_BYTES
 from refusals import refuses
 from toy_scene import toy_face_model
 
-# Pickles --------------------------------------------------------------------------------------------------------------
-
 
 def test_a_pickle_takes_no_more_than_its_own_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Arrays that repeat or unpack one text count in full, such as many names for one array, or a sparse matrix."""
@@ -64,9 +62,6 @@ def test_texts_of_python_2_and_ordered_dictionaries_are_read(tmp_path: Path) -> 
         found = read_inert_pickle(path)
         np.testing.assert_array_equal(found["a"], np.arange(6.0).reshape(2, 3).T)
         assert found.keys() == {"a", "c"}
-
-
-# Archives -------------------------------------------------------------------------------------------------------------
 
 
 def header(kind: str, shape: object, version: tuple[int, int] = (1, 0)) -> bytes:
@@ -142,9 +137,6 @@ def test_odd_arrays_are_told_and_others_are_the_same(tmp_path: Path) -> None:
     found = read_flame(path)
     np.testing.assert_array_equal(found.template, expected.template)
     np.testing.assert_array_equal(found.faces, expected.faces)
-
-
-# Files of datasets ---------------------------------------------------------------------------------------------------
 
 
 def frame() -> dict[str, dict[str, np.ndarray]]:

@@ -202,9 +202,6 @@ def test_a_deep_tree_is_told(tmp_path: Path) -> None:
     refuses("cannot be searched", check_tree, tmp_path)
 
 
-# What does not fit together -------------------------------------------------------------------------------------------
-
-
 def test_partial_figures_of_other_kinds_are_dropped(workspace: Path) -> None:
     """Partial figures with impossible content are dropped, although their first line is right."""
     run, clip = workspace / "runs/toy", workspace / "sequences/clip"

@@ -283,9 +283,6 @@ def test_a_run_may_begin_at_a_later_epoch() -> None:
         plain_mono_gaussian_avatar(epochs=60, first_epoch=60).check()
 
 
-# -- networks --------------------------------------------------------------------------------------------------------
-
-
 def softplus(values: Tensor) -> Tensor:
     return torch.nn.functional.softplus(values, beta=100)
 

@@ -115,9 +115,6 @@ def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:
         assert "\n" not in str(told.value)
 
 
-# -- the command line -------------------------------------------------------------------------------------------------
-
-
 first = pytest.fixture(scope="module")(lambda tmp_path_factory: _write_sequence(tmp_path_factory.mktemp("first"), "08"))
 
 

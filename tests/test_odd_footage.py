@@ -51,9 +51,6 @@ class Odd:
     """Asserts what is in the capture."""
 
 
-# Light ----------------------------------------------------------------------------------------------------------------
-
-
 def wide(face: Face) -> np.ndarray:
     return np.pad(face(160), ((20, 20), (40, 40), (0, 0)), mode="edge")
 
@@ -80,8 +77,6 @@ def expect_unusable(capture: Capture, face: Face) -> None:
 AGAIN = "warning: clip: the face is {}.*record the video again"
 CAST = "warning: clip: the skin is green \\(red .*white balance"
 PLAIN = {"dark": False, "overexposed": False, "color_cast": None, "frames_blurred": 0, "combs": False}
-
-# Fields ---------------------------------------------------------------------------------------------------------------
 
 
 def woven_heads(face: Face) -> list[np.ndarray]:
@@ -122,7 +117,6 @@ DEINTERLACED = "clip.m..: interlaced; 6 of 6 frames are deinterlaced, each to on
 WHOLE = ("--capture.crop", "none")
 NEVER, ALWAYS = ((*WHOLE, "--capture.deinterlace", mode) for mode in ("never", "always"))
 
-# Times, sizes and turns -----------------------------------------------------------------------------------------------
 
 TICKS = [0, 33, 66, 166, 200, 233]
 
@@ -246,9 +240,6 @@ def test_what_is_said_of_odd_footage(kind: str, test_data: Path, tmp_path: Path,
     hints = [remark.removeprefix("warning: clip: ") for remark in remarks if remark.startswith("warning: clip: ")]
     assert report["hints"] == hints
     odd.check(read_capture(folder), face)
-
-
-# Several streams ------------------------------------------------------------------------------------------------------
 
 
 Track = tuple[int, int, bool]

@@ -175,9 +175,6 @@ def test_what_lies_around_the_video_is_no_obstacle(tmp_path: Path) -> None:
             refuses("has a cover picture, but no video stream", probe_video, path)
 
 
-# Memory ---------------------------------------------------------------------------------------------------------------
-
-
 def test_huge_pictures_inside_of_a_video_are_not_decoded(tmp_path: Path) -> None:
     """Files of 64x48 pixels announce or unpack to 300 megapixels and more."""
     loud, screen, inside, alone = (tmp_path / name for name in ("loud.mov", "screen.gif", "inside.mov", "alone.png"))

@@ -38,8 +38,6 @@ TABLE: dict[str, Any] = tomllib.loads((HERE / "paper_preset.toml").read_text(enc
 PAPER: Any = PRESETS["paper"].config("gaussian_avatars")
 STEPS = 600_000
 
-# -- the table --------------------------------------------------------------------------------------------------------
-
 
 def plain(text: str) -> str:
     """A text in one line, with each number written in one way."""
@@ -184,9 +182,6 @@ def test_the_run_of_every_method_has_the_settings_of_the_first_table() -> None:
         assert settings == replace(default, steps=settings.steps, **PRESETS["paper"].changes)
 
 
-# -- schedules and rates ----------------------------------------------------------------------------------------------
-
-
 def test_schedule() -> None:
     assert rounds(PAPER, STEPS) == list(range(12_000, 600_000, 2_000))
     assert resets(PAPER, STEPS) == [10_000, *range(60_000, 600_000, 60_000)]
@@ -194,9 +189,6 @@ def test_schedule() -> None:
     assert resets(PAPER, 3_000) == [50, *range(300, 3_000, 300)]
     headgas: Any = PRESETS["paper"].config("headgas")
     assert rounds(headgas, PRESETS["paper"].settings_of("headgas").steps) == list(range(600, 15_000, 100))
-
-
-# -- MonoGaussianAvatar ------------------------------------------------------------------------------------------------
 
 
 def test_mono_gaussian_avatar_has_the_papers_sizes_rates_and_schedules() -> None:
@@ -219,9 +211,6 @@ def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_po
     assert replace(config, max_points=100_000) == paper.config(method)
     assert replace(settings, steps=300_000) == paper.settings_of(method)
     assert [name for name in METHODS if "paper-cpu" in METHODS[name].presets] == [method]
-
-
-# -- the extent of the cameras ----------------------------------------------------------------------------------------
 
 
 def camera_at(*center: float) -> Camera:

@@ -149,9 +149,6 @@ def test_missing_features_are_told_before_the_run_begins(scene, tmp_path, monkey
     assert not (tmp_path / "run").exists()
 
 
-# L1 + SSIM ------------------------------------------------------------------------------------------------------------
-
-
 WHOLE_AND_PARTS = [
     (64, 48, None), (37, 53, (5, 7, 20, 11)), (40, 40, (-3, 8, 10, 20)), (40, 64, (60, 39, 1, 1)), (120, 6, None),
     (3, 300, None), (200, 101, (90, 150, 100, 100)), (5, 3, None),

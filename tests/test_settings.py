@@ -71,9 +71,6 @@ def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-# -- options ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_without_options_a_run_has_the_defaults(method: str, choices: Any) -> None:
     config = METHODS[method].config()
@@ -164,9 +161,6 @@ def test_options_that_make_no_sense_are_refused_before_any_work(line: str, words
         assert words in complaint(capsys, [*command, *line.split()])
     assert not (workspace / "runs").exists()
     assert not new.exists()
-
-
-# -- files ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

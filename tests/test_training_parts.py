@@ -205,8 +205,6 @@ def test_first_colors_come_from_training_frames_only() -> None:
         assert torch.equal(first(black, first_colors="pictures"), painted) == same
 
 
-# -- targets that a worker prepares ----------------------------------------------------------------------------------
-
 SETTINGS = plain_run(steps=40, split="none", background="random")
 
 
