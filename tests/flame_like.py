@@ -34,15 +34,13 @@ def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
     expression = _expression_basis(anny, order)
     identity = anny.identity_basis.double().numpy()[:IDENTITIES, order]
     return {
-        "v_template": template + _SHIFT,
-        "f": faces.astype(np.uint32),
+        "v_template": template + _SHIFT, "f": faces.astype(np.uint32),
         "shapedirs": np.moveaxis(np.concatenate([identity, expression]), 0, 2).astype(np.float32),
         "posedirs": np.moveaxis(posedirs.reshape(36, -1, 3), 0, 2).astype(np.float32),
-        "J_regressor": _regressor(template, weights, hinge),
-        "weights": weights,
+        "J_regressor": _regressor(template, weights, hinge), "weights": weights,
         "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]], np.int64),
         "identities": np.array(IDENTITIES),
-    }
+    }  # fmt: skip
 
 
 def _cut(anny: FaceModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

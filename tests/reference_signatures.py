@@ -42,12 +42,10 @@ def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     index, vertices, landmarks = surface_of(scene)
     vertices = vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
     parts = {
-        "means": _blocks(images).mean((2, 4)),
-        "spreads": _blocks(images).std((2, 4)),
+        "means": _blocks(images).mean((2, 4)), "spreads": _blocks(images).std((2, 4)),
         "mattes": _blocks(mattes[..., None]).mean((2, 4)),
-        "landmarks": landmarks[timesteps][:, cameras][:, :, list(_LANDMARKS)],
-        "vertices": 1000 * vertices,
-    }
+        "landmarks": landmarks[timesteps][:, cameras][:, :, list(_LANDMARKS)], "vertices": 1000 * vertices,
+    }  # fmt: skip
     return {name: np.round(values.astype(np.float64), 3).ravel().tolist() for name, values in parts.items()}
 
 

@@ -220,10 +220,8 @@ def test_cells_with_yes_and_no_are_flags(table: Path, column: tuple[str, str], t
 
 
 MISTAKES = [
-    ("video,stepz\nann.mp4,3", "did you mean 'steps'"),
-    ("video\ngone.mp4", "gone.mp4: no such file"),
-    ("video,method\nann.mp4,nerf", "nerf"),
-    ("video,steps\nann.mp4,-3", "row 1: "),
+    ("video,stepz\nann.mp4,3", "did you mean 'steps'"), ("video\ngone.mp4", "gone.mp4: no such file"),
+    ("video,method\nann.mp4,nerf", "nerf"), ("video,steps\nann.mp4,-3", "row 1: "),
     ("video,steps\nann.mp4,many", "row 1: --steps: give a whole number instead of 'many'; see mien create"),
     ("video,preset\nann.mp4,best", "row 1: --preset: give one of 'draft', "),
     ("video,capture.sizes\nann.mp4,9", "did you mean --capture.size"),
@@ -238,13 +236,11 @@ MISTAKES = [
     ("video,methods\nann.mp4,headgas;headgas", "method 'headgas' is there twice"),
     ("video\nann.mp4;ann.mp4", "two videos have the name 'ann'"),
     ("video,calibration\nann.mp4,rig.json", "rig.json: no such file"),
-    ("video\nann.mp4,3", "more cells than the heading"),
-    ("video,memory_gb\nann.mp4,lots", "gigabytes above 0"),
-    ("", "has no rows"),
-    ("video,protocol\nann.mp4,insta", "column 'protocol' is for datasets"),
+    ("video\nann.mp4,3", "more cells than the heading"), ("video,memory_gb\nann.mp4,lots", "gigabytes above 0"),
+    ("", "has no rows"), ("video,protocol\nann.mp4,insta", "column 'protocol' is for datasets"),
     ("dataset,capture.size\nann.mp4,256", "column 'capture.size' is for videos"),
     ("dataset,video\nann.mp4,bob.mp4", "a video or a dataset, and not both"),
-]
+]  # fmt: skip
 
 
 def test_mistakes_in_a_table_are_named_before_any_work(table: Path):

@@ -164,13 +164,11 @@ def test_bad_options_are_told_in_one_line(workspace: Path, tmp_path: Path, capsy
     for more, told in (
         ([], "nothing to compare on"),
         ([str(workspace), "--minutes", "-1"], "--minutes -1: give a number from 0"),
-        ([str(workspace), "--steps", "-1"], "--steps -1"),
-        ([str(workspace.parent / "gone")], "no such folder"),
+        ([str(workspace), "--steps", "-1"], "--steps -1"), ([str(workspace.parent / "gone")], "no such folder"),
         ([str(workspace), "--steps", "5", "--minutes", "1"], "give one of them"),
         ([str(workspace), str(workspace)], "two captures have this name"),
-        ([str(workspace), "--methods", "nerf"], "instead of 'nerf'"),
-        (["--captures", "mono"], "mono-short"),
-    ):
+        ([str(workspace), "--methods", "nerf"], "instead of 'nerf'"), (["--captures", "mono"], "mono-short"),
+    ):  # fmt: skip
         assert main(["bench", "compare", *more, "--out", str(tmp_path / "out")]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert told in line, line

@@ -87,13 +87,10 @@ def test_bad_videos_are_named_and_nothing_is_written_of_nothing_or_nowhere(tmp_p
         sound.setparams((1, 2, 8000, 0, "NONE", ""))
         sound.writeframes(bytes(1600))
     for name, message in (
-        ("text.mp4", "cannot be read as a video"),
-        ("empty.mp4", "is empty"),
+        ("text.mp4", "cannot be read as a video"), ("empty.mp4", "is empty"),
         ("half.mp4", "cannot be read as a video .* incomplete[?] copy it again"),
-        ("sound.wav", "no video stream"),
-        ("missing.mp4", "no such file"),
-        (".", "is not a file"),
-    ):
+        ("sound.wav", "no video stream"), ("missing.mp4", "no such file"), (".", "is not a file"),
+    ):  # fmt: skip
         error = refuses(message, next, read_video_frames(tmp_path / name))
         assert str(tmp_path / name) in error
     before = sorted(tmp_path.iterdir())
@@ -147,16 +144,13 @@ WEIGHTS = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627
 SILENT = Colors()
 LIMITED, FULL = 1, 2
 KINDS = {
-    "prores.mov": ("prores_ks", "yuv422p10le", {}),
-    "prores.mkv": ("prores_ks", "yuv422p10le", {}),
-    "h264.mov": ("libx264", "yuv420p", {"crf": "1"}),
-    "h264.mp4": ("libx264", "yuv420p", {"crf": "1"}),
+    "prores.mov": ("prores_ks", "yuv422p10le", {}), "prores.mkv": ("prores_ks", "yuv422p10le", {}),
+    "h264.mov": ("libx264", "yuv420p", {"crf": "1"}), "h264.mp4": ("libx264", "yuv420p", {"crf": "1"}),
     "hevc.mp4": ("libx265", "yuv420p10le", {"x265-params": "log-level=none:crf=1"}),
     "hevc.mkv": ("libx265", "yuv420p10le", {"x265-params": "log-level=none:crf=1"}),
     "vp9.webm": ("libvpx-vp9", "yuv420p", {"crf": "1", "b": "0"}),
-    "vp9.mp4": ("libvpx-vp9", "yuv420p", {"crf": "1", "b": "0"}),
-    "ffv1.mkv": ("ffv1", "yuv422p10le", {}),
-}
+    "vp9.mp4": ("libvpx-vp9", "yuv420p", {"crf": "1", "b": "0"}), "ffv1.mkv": ("ffv1", "yuv422p10le", {}),
+}  # fmt: skip
 
 
 def numbers_of(colors: Colors, bits: int) -> list[int]:

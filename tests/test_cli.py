@@ -201,21 +201,17 @@ def place(tmp_path_factory: pytest.TempPathFactory, made_once: MadeOnce) -> Path
 
 
 ODD = [
-    ("rendr W --out a.png", "did you mean render?"),
-    ("--helpp", "did you mean --help?"),
+    ("rendr W --out a.png", "did you mean render?"), ("--helpp", "did you mean --help?"),
     ("render W --out ''", "argument 3 after render is empty"),
     ("render W --out a.png --width 0", "--width 0 --height 512: give numbers from 16 to 8192"),
-    ("render W --out a.png --size 1e3", "--size"),
-    ("render W --out a.txt", "cannot write .txt; use .png"),
+    ("render W --out a.png --size 1e3", "--size"), ("render W --out a.txt", "cannot write .txt; use .png"),
     ("render W --out text.txt/a.png", "text.txt is a file, not a folder"),
     ("render W --out folder.png", "is a folder, but a file is to be written there"),
-    ("render W --out link/a.png", "is a link to nowhere"),
-    ("render W --out /proc/a.png", "cannot be written"),
+    ("render W --out link/a.png", "is a link to nowhere"), ("render W --out /proc/a.png", "cannot be written"),
     (f"render W --out {'a' * 300}.png", "cannot be written"),
     ("render W --out a.mp4 --background transparent", "an .mp4 cannot be transparent"),
     ("render W --out a.png --background #12", "--background #12"),
-    ("render W --out a.mp4 --fps nan", "--fps nan"),
-    ("render W --out a.mp4 --path loop", "'loop'"),
+    ("render W --out a.mp4 --fps nan", "--fps nan"), ("render W --out a.mp4 --path loop", "'loop'"),
     ("render W --out a.png --set drop=nan", "--set drop=nan: drop goes from 0 to 1"),
     ("render W --out a.png --set drop=0,5", "'0,5' is not a number"),
     ("render W --out a.png --set drop 0.5", "--set drop 0.5: write drop=0.5"),
@@ -238,8 +234,7 @@ ODD = [
     ("view W --host 256.1.1.1", "--host 256.1.1.1: is no address of this machine"),
     ("export W --out a.obj", "cannot write .obj; use .mien, .html, .packed, .glb, .vrm, .ply, .spz, .sog,"),
     ("export W --out a.ply --series none", "--series none: no such sequence, file or folder; "),
-    ("evaluate", "nothing to evaluate"),
-    ("evaluate W W", "2 workspaces"),
+    ("evaluate", "nothing to evaluate"), ("evaluate W W", "2 workspaces"),
     ("evaluate W --perceptual-frames -1", "--perceptual-frames -1"),
     ("train W --run a/b", "'a/b' cannot be the name of a folder"),
     ("track W --face-model none", "no face model 'none'"),
@@ -249,7 +244,7 @@ ODD = [
     ("capture /dev/null --out new", "/dev/null: is not a file"),
     ("create empty.mp4 --out new --capture.landmarks none.csv", "--capture.landmarks none.csv: no such file"),
     ("demo --out new --seconds nan", "--seconds nan"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("line", "words"), ODD, ids=[line[:60] for line, _ in ODD])

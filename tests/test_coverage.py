@@ -285,9 +285,7 @@ def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
     zeros, angles = np.zeros(1, np.float32), np.array([[-0.3, 0.1], [-0.2, 0.2]], np.float32)
     filmed, degrees = Filmed(zeros, zeros, zeros[:, None], zeros, angles), np.degrees(angles)
     for coverage, expected in (
-        (left, [[degrees[0, 0], 60], [-30, 30]]),
-        (everything, [[-60, 60], [-30, 30]]),
-        (nothing, degrees),
-    ):
+        (left, [[degrees[0, 0], 60], [-30, 30]]), (everything, [[-60, 60], [-30, 30]]), (nothing, degrees),
+    ):  # fmt: skip
         found = np.degrees(with_shown_angles(filmed, model, vertices, coverage).head_angles)
         np.testing.assert_allclose(found, expected, atol=1e-4)

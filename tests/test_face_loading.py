@@ -71,12 +71,9 @@ def test_damaged_or_old_files_are_baked_again(bakes, tmp_path):
     for ending, damage in (
         ("json", lambda content: content[:-100]),
         ("json", lambda content: content.replace(b'"version": 1', b'"version": 0')),
-        ("json", lambda content: b'{"format": "mien.face_model", "version": 1}'),
-        ("json", None),
-        ("safetensors", lambda content: content[:-100]),
-        ("safetensors", flip_a_bit),
-        ("safetensors", None),
-    ):
+        ("json", lambda content: b'{"format": "mien.face_model", "version": 1}'), ("json", None),
+        ("safetensors", lambda content: content[:-100]), ("safetensors", flip_a_bit), ("safetensors", None),
+    ):  # fmt: skip
         path = tmp_path / f"face_models/small-r1-0.0.1.{ending}"
         bakes.clear()
         if damage is None:

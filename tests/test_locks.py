@@ -125,11 +125,9 @@ with hold(place):
 STRANGERS: dict[str, Callable[[Path, Path], object]] = {
     "link": lambda file, mine: file.symlink_to(mine),
     "link to nowhere": lambda file, mine: file.symlink_to(mine.with_name("nowhere")),
-    "pipe": lambda file, mine: os.mkfifo(file),
-    "second name": lambda file, mine: file.hardlink_to(mine),
-    "other content": lambda file, mine: file.write_text("mine"),
-    "folder": lambda file, mine: file.mkdir(),
-}
+    "pipe": lambda file, mine: os.mkfifo(file), "second name": lambda file, mine: file.hardlink_to(mine),
+    "other content": lambda file, mine: file.write_text("mine"), "folder": lambda file, mine: file.mkdir(),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", STRANGERS)

@@ -123,19 +123,17 @@ def test_face_landmarker_results(tmp_path: Path) -> None:
 def test_bad_json_files(tmp_path: Path) -> None:
     good = {"timestamp_ms": 0, "blendshapes": {}}
     for content, part in (
-        ([], "is not a list of frames"),
-        ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
+        ([], "is not a list of frames"), ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
         ([good, good], "frame 1: its timestamp_ms does not come after"),
         ([good, {"blendshapes": {}}], "frame 1: timestamp_ms is None"),
         ([{**good, "timestamp_ms": 5}, good], "frame 1: its timestamp_ms does not come after"),
         ([{"blendshapes": {"jawopen": 1}}], "did you mean jawOpen"),
         ([{"blendshapes": {"jawOpen": float("nan")}}], "jawOpen is nan"),
-        ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"),
-        ([{"blendshapes": None}], "no frame has a face"),
+        ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"), ([{"blendshapes": None}], "no frame has a face"),
         ([{"faceBlendshapes": [{"categories": [{}]}]}], "layout of a FaceLandmarker"),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}], "layout of a FaceLandmarker"),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
-    ):
+    ):  # fmt: skip
         refuses(part, read_blendshape_json, write_json(tmp_path / "a.json", content))
     (tmp_path / "a.json").write_text("[{")
     refuses("cannot be read as json", read_blendshape_json, tmp_path / "a.json")

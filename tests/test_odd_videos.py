@@ -132,11 +132,9 @@ KINDS = {
     "alpha in .mov": ("a.mov", {"codec": "png", "pixels": "rgba"}),
     "ten bits": ("a.mov", {"codec": "prores_ks", "pixels": "yuv422p10le"}),
     "grey": ("a.mkv", {"codec": "ffv1", "pixels": "gray"}),
-    "gif": ("a.gif", {"codec": "gif", "pixels": "rgb8"}),
-    "no duration": ("a.h264", {}),
-    "transport stream": ("a.ts", {}),
-    "avi": ("a.avi", {"codec": "mjpeg", "pixels": "yuvj420p"}),
-}
+    "gif": ("a.gif", {"codec": "gif", "pixels": "rgb8"}), "no duration": ("a.h264", {}),
+    "transport stream": ("a.ts", {}), "avi": ("a.avi", {"codec": "mjpeg", "pixels": "yuvj420p"}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -114,11 +114,9 @@ def test_footage_is_imported_an_avatar_trained_and_exported(cached: Mien, fork_s
     for line in (
         imports,
         ("train", out, "--method", "mesh_points9", "--method.start-scale", "0.01", "--steps", "2", "--split", "tail"),
-        (*export, str(me)),
-        (*export, str(tmp_path / "me.mien")),
-        (*export, str(tmp_path / "talk.xyz9"), "--series", "me"),
-        (*of_file, str(tmp_path / "again.xyz9")),
-    ):
+        (*export, str(me)), (*export, str(tmp_path / "me.mien")),
+        (*export, str(tmp_path / "talk.xyz9"), "--series", "me"), (*of_file, str(tmp_path / "again.xyz9")),
+    ):  # fmt: skip
         done = cached(*line)
         assert done.returncode == 0, done.stderr
         assert line != imports or "me.puppet9: a puppet" in done.stderr
@@ -211,10 +209,8 @@ def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
 DATASET = "from mien.datasets import Dataset\nIT = Dataset({!r}, 'twice', 'avatar', lambda path: {}, print)\n"
 ENGINE = "from mien.batch import Engine\nIT = Engine('mien_none9:run', packages={})\n"
 EXPORT, IMPORT, BATCH = (
-    "export {run} --out {here}/a.none9",
-    "import {here}/F --out {here}/O",
-    "batch {table} --on none9",
-)
+    "export {run} --out {here}/a.none9", "import {here}/F --out {here}/O", "batch {table} --on none9",
+)  # fmt: skip
 METHOD = "from mien.avatar import Method\nIT = Method('mien_none9:Toy', 'mien_none9:TypoConfig')\n"
 TRAIN = "train {run} --method none9 --run new --steps 2"
 WRONG = (

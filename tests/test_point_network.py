@@ -167,11 +167,8 @@ def test_other_avatars_keep_the_path_of_numpy() -> None:
     assert posing.has_native_activations(baked)
     network = known(baked.network)
     for change in (
-        {"network": None},
-        {"network": replace(network, activation="softplus")},
-        {"network": replace(network, outputs=("sh",))},
-        {"scale_activation": "exp"},
-        {"color_activation": "sh"},
+        {"network": None}, {"network": replace(network, activation="softplus")},
+        {"network": replace(network, outputs=("sh",))}, {"scale_activation": "exp"}, {"color_activation": "sh"},
         {"attributes": replace(baked.attributes, sh=np.zeros((20, 4, 3), np.float32))},
-    ):
+    ):  # fmt: skip
         assert not posing.has_native_activations(replace(baked, **change)), change

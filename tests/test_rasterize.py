@@ -207,13 +207,11 @@ def test_means2d_gradient_is_per_pixel_of_motion(backend: Backend) -> None:
 def test_nothing_to_see_is_background(backend: Backend) -> None:
     background = torch.tensor([0.1, 0.2, 0.3])
     for name, gaussians in {
-        "behind": one_gaussian(depth=-1),
-        "at the near plane": one_gaussian(depth=0.01),
-        "transparent": one_gaussian(opacity=0),
-        "below 1/255": one_gaussian(opacity=1 / 256),
+        "behind": one_gaussian(depth=-1), "at the near plane": one_gaussian(depth=0.01),
+        "transparent": one_gaussian(opacity=0), "below 1/255": one_gaussian(opacity=1 / 256),
         "beside the picture": replace(one_gaussian(), means=torch.tensor([[10.0, 0, 1]])),
         "none": one_gaussian().select(torch.zeros(1, dtype=torch.bool)),
-    }.items():
+    }.items():  # fmt: skip
         means = gaussians.means.clone().requires_grad_()
         rendering = rasterize(replace(gaussians, means=means), front_camera(), background, backend)
         assert torch.equal(rendering.image, background.expand(15, 21, 3)), name

@@ -59,15 +59,11 @@ def test_no_package_has_changed_the_kind_of_its_licence_and_kinds_are_read_from_
     assert changed == {}, "look at these licences, and record their kinds in tests/licence_kinds.json"
     assert "unknown" not in {*found.values(), *(kind_of(part.licence) for part in PARTS)}
     for expression, kind in {
-        "MIT": "permissive",
-        "MIT-0": "public domain",
-        "MIT OR GPL-2.0-or-later": "permissive",
-        "BSD-3-Clause AND LGPL-2.1-or-later": "weak copyleft",
-        "MPL-2.0 AND MIT": "weak copyleft",
+        "MIT": "permissive", "MIT-0": "public domain", "MIT OR GPL-2.0-or-later": "permissive",
+        "BSD-3-Clause AND LGPL-2.1-or-later": "weak copyleft", "MPL-2.0 AND MIT": "weak copyleft",
         "Apache-2.0 AND (MIT OR LicenseRef-NVIDIA-Proprietary)": "permissive",
-        "GPL-2.0-or-later": "strong copyleft",
-        "MIT AND CC-BY-NC-4.0": "unknown",
-    }.items():
+        "GPL-2.0-or-later": "strong copyleft", "MIT AND CC-BY-NC-4.0": "unknown",
+    }.items():  # fmt: skip
         assert kind_of(expression) == kind, expression
 
 

@@ -60,13 +60,11 @@ def test_messages_and_bars_are_harmless(is_terminal: bool, monkeypatch, capsys) 
 
 
 COMPLAINTS = {
-    "missing": ["capture", NASTY, "--out", "out"],
-    "command": [NASTY],
+    "missing": ["capture", NASTY, "--out", "out"], "command": [NASTY],
     "option": ["capture", "--out", NASTY, NASTY, "--bogus", NASTY],
     "choice": ["capture", "a.mp4", "--out", "out", "--capture.turn", NASTY],
-    "workspace": ["render", NASTY, "--out", NASTY],
-    "model": ["face-models", "--bake", NASTY],
-}
+    "workspace": ["render", NASTY, "--out", NASTY], "model": ["face-models", "--bake", NASTY],
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", COMPLAINTS.values(), ids=COMPLAINTS)

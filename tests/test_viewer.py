@@ -242,17 +242,14 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, made_once: MadeOnce, caps
     runtime.write_portable(file, drawn_head(10))
     cut.write_bytes(file.read_bytes()[:5000])
     for words, *arguments in (
-        ("no such file", tmp_path / "gone.mien"),
-        ("is no .mien file", __file__),
-        ("cut.mien: is damaged", cut),
-        ("leave --run out", file, "--run", "toy"),
-        ("no run 'x'", workspace, "--run", "x"),
+        ("no such file", tmp_path / "gone.mien"), ("is no .mien file", __file__), ("cut.mien: is damaged", cut),
+        ("leave --run out", file, "--run", "toy"), ("no run 'x'", workspace, "--run", "x"),
         ("from 1 to 65535", workspace, "--port", "65536"),
         ("gone.csv: no such file", workspace, "--play", "gone.csv"),
         ("--no-token: other machines can reach --host 0.0.0.0", file, "--host", "0.0.0.0", "--no-token"),
         ("--host nowhere.invalid: is no address of this machine", workspace, "--host", "nowhere.invalid"),
         ("--follow: needs a .mien file", workspace, "--follow"),
-    ):
+    ):  # fmt: skip
         capsys.readouterr()
         assert main(["view", *map(str, arguments)]) == 2
         (line,) = capsys.readouterr().err.splitlines()

@@ -247,11 +247,9 @@ def run(site: Path, scripts: list[str], webgpu: bool = True) -> dict[str, Any]:
 
 HEADS = {
     "gaussian_avatars": lambda: drawn_head(4000, rank=2, sh=4, sh_frame="world"),
-    "some columns": lambda: drawn_head(10_011, rank=5, columns=2),
-    "headgas": lambda: web.painted_head(1500),
-    "mono_gaussian_avatar": skinned_head,
-    "colors that depend on the view": lambda: points(1500)["points"],
-}
+    "some columns": lambda: drawn_head(10_011, rank=5, columns=2), "headgas": lambda: web.painted_head(1500),
+    "mono_gaussian_avatar": skinned_head, "colors that depend on the view": lambda: points(1500)["points"],
+}  # fmt: skip
 
 
 @pytest.mark.unchecked
