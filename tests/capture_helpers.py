@@ -27,17 +27,12 @@ def random_capture(timesteps: int = 3, cameras: int = 2, height: int = 20, width
     valid[1, 0] = False
     landmarks[1, 0] = np.nan
     return Capture(
-        name="noise",
-        camera_ids=tuple(f"camera{index}" for index in range(cameras)),
-        fps=29.97,
+        name="noise", camera_ids=tuple(f"camera{index}" for index in range(cameras)), fps=29.97,
         timestamps=np.arange(timesteps) / 29.97,
         images=random.integers(0, 256, (timesteps, cameras, height, width, 3), dtype=np.uint8),
-        mattes=random.integers(0, 256, (timesteps, cameras, height, width), dtype=np.uint8),
-        landmarks=landmarks,
-        valid=valid,
-        principal_point=np.full((cameras, 2), 10.5),
-        source={"recipe": "noise", "seed": seed},
-    )
+        mattes=random.integers(0, 256, (timesteps, cameras, height, width), dtype=np.uint8), landmarks=landmarks,
+        valid=valid, principal_point=np.full((cameras, 2), 10.5), source={"recipe": "noise", "seed": seed},
+    )  # fmt: skip
 
 
 def assert_same_capture(one: Capture, other: Capture) -> None:

@@ -79,7 +79,6 @@ def test_a_clip_is_trimmed_and_other_settings_replace_the_capture(face_clip, tmp
     capture = capture_video(face_clip, out, CaptureSettings(size=64, start=0.08, end=0.32))
     assert capture.source["first_frame"] == 2
     np.testing.assert_allclose(capture.timestamps, np.arange(6) / 25, atol=1e-6)
-
     capture = capture_video(face_clip, out, CaptureSettings(size=96, max_frames=2, stride=3, start=0.04))
     assert capture.images.shape[:3] == (2, 1, 96)
     np.testing.assert_allclose(capture.timestamps, [0, 0.12], atol=1e-6)

@@ -47,7 +47,6 @@ def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
     header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
     path = tmp_path / "other.ply"
     path.write_bytes(header.encode() + struct.pack(f"<{len(row)}f", *row))
-
     read = read_ply(path)
     assert read.means.tolist() == [[1, 2, 3]]
     assert read.sh[0].tolist() == [[10, 20, 30], [11, 21, 31], [12, 22, 32], [13, 23, 33]]
@@ -55,7 +54,6 @@ def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
     torch.testing.assert_close(read.scales[0], torch.tensor([-1.0, -2.0, -3.0]).exp())
     torch.testing.assert_close(read.quats[0], torch.tensor([0, 0.6, 0, 0.8]))
     assert read.T_world_local is None
-
     ours = tmp_path / "ours.ply"
     write_ply(ours, read)
     content = ours.read_bytes()

@@ -115,11 +115,10 @@ def _moving(model: FaceModel, timesteps: int) -> FaceParams:
     face, _ = _faces_of(coefficients, model)
     random = torch.Generator().manual_seed(5)
     return replace(
-        face,
-        identity=0.4 * torch.randn(face.identity.shape, generator=random),
+        face, identity=0.4 * torch.randn(face.identity.shape, generator=random),
         head_rotation=torch.stack([0.1 * (5 * time).sin(), 0.3 * (4 * time).cos(), 0.05 * time], 1),
         head_translation=torch.tensor([0.0, 0.0, -0.9]).expand(timesteps, 3),
-    )
+    )  # fmt: skip
 
 
 def _as_detected(model: FaceModel, face: FaceParams) -> Tensor:

@@ -57,13 +57,11 @@ def test_poses_as_flame_does(moved, arrays, model):
     turn_root, turn_neck = matrix_from_axis_angle(torch.from_numpy(pose[:2])).numpy()
     rotation = axis_angle_from_matrix(torch.from_numpy(turn_root @ turn_neck)[None])
     face = FaceParams(
-        identity=torch.from_numpy(shape[:identities]),
-        expression=torch.from_numpy(shape[None, identities:]),
-        joints=torch.from_numpy(np.concatenate([-pose[1:2], pose[2:]]))[None],
-        head_rotation=rotation,
+        identity=torch.from_numpy(shape[:identities]), expression=torch.from_numpy(shape[None, identities:]),
+        joints=torch.from_numpy(np.concatenate([-pose[1:2], pose[2:]]))[None], head_rotation=rotation,
         head_translation=torch.from_numpy(turn_root @ (turn_neck @ (origin - neck) + neck - root) + root + shift)[None],
         vertex_offsets=torch.from_numpy(offsets),
-    )
+    )  # fmt: skip
     double = torch.zeros((), dtype=torch.float64)
     expected = flame_like.posed_as_flame(arrays, pose, shape, shift, offsets)
     assert np.abs(model.to(double)(face)[0].numpy() - expected).max() < 2e-6

@@ -168,7 +168,6 @@ def test_three_vrm_opens_the_file_and_moves_the_face(folder: Path) -> None:
     assert 1.4 < bones["head"][1] < 1.7
     assert 0 < bones["rightFoot"][1] < 0.15
     np.testing.assert_allclose(bones["leftHand"] * [-1, 1, 1], bones["rightHand"], atol=1e-6)
-
     rest, aa, wink, brows, happy, left, right, turned = (255 * picture(address)[..., :3] for address in addresses)
     assert middle(aa, rest)[0] > 0.55, "the mouth is below the middle"
     row, column = middle(wink, rest)

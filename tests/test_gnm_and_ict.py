@@ -42,12 +42,11 @@ def test_poses_as_gnm_does(moved: str, arrays: dict[str, Any], model: FaceModel)
     turn_neck, turn_head = matrix_from_axis_angle(torch.from_numpy(rotations[:2])).numpy()
     place = turn_neck @ (turn_head @ (origin - head) + head - neck) + neck + shift
     face = FaceParams(
-        identity=torch.from_numpy(identity),
-        expression=torch.from_numpy(expression[None]),
+        identity=torch.from_numpy(identity), expression=torch.from_numpy(expression[None]),
         joints=torch.from_numpy(np.stack([-rotations[1], *rotations[2:]]))[None],
         head_rotation=axis_angle_from_matrix(torch.from_numpy(turn_neck @ turn_head)[None]),
         head_translation=torch.from_numpy(place)[None],
-    )
+    )  # fmt: skip
     expected = posed_as_gnm(arrays, rotations, identity, expression, shift)
     assert np.abs(model.to(torch.zeros((), dtype=torch.float64))(face)[0].numpy() - expected).max() < 2e-6
 

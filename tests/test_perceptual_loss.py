@@ -249,7 +249,6 @@ def test_parts_count_again_as_pictures_of_their_own(isa: str, bytes_given: bool)
         cut = photometric_loss_reference(wanted[rows, columns], goal[rows, columns])
         by_hand = by_hand + 1.5 * cut * wanted[rows, columns].numel() / wanted.numel()
     assert float(loss.detach()) == pytest.approx(float(by_hand.detach()), rel=1e-12)
-
     parts = parts[:2]  # the third is too narrow for the native path
     loss = photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
     found = image.clone().requires_grad_()

@@ -236,7 +236,6 @@ def reference(seen: Sighting, skin: SkinTexture) -> tuple[Tensor, Tensor, Tensor
     image = seen.picture.image.double()
     by_x, by_y = torch.zeros_like(image), torch.zeros_like(image)
     by_x[:, 1:-1], by_y[1:-1] = (image[:, 2:] - image[:, :-2]) / 2, (image[2:] - image[:-2]) / 2
-
     assert seen.posed.jacobian is not None
     apart = 1e-4 * seen.posed.jacobian.permute(2, 0, 1).double()
     exact, ahead = CAMERA.to(apart), vertices.double()

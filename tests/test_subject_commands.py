@@ -84,7 +84,6 @@ def test_a_third_clip_gives_all_a_new_identity(workspace: Path, clips: dict[str,
     assert f"Trained on the previous tracking: {DEFAULT_METHOD}" in shown
     assert torch.equal(_identity(workspace, "one"), _identity(workspace, "three"))
     assert not torch.equal(_identity(workspace, "one"), before)
-
     assert "tracked again after this run was trained" in complaint(capsys, "evaluate", str(workspace))
     train = ["train", str(workspace), *TRAINING]
     assert f"{DEFAULT_METHOD}: holds a run with other settings" in complaint(capsys, *train)

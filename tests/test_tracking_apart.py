@@ -188,7 +188,6 @@ def test_the_command_tracks_apart(case, shaping, apart, workspace, capsys):
         found = read_tracking(workspace / "sequences" / capture.name / "tracking")
         assert torch.equal(found.face.head_rotation, tracking.face.head_rotation)
         assert found.settings["held_out"] == ["apart"]
-
     assert main(["track", str(workspace), "--hold-out", "apart", *QUICKLY]) == 0
     assert "the tracking is current, nothing to do" in capsys.readouterr().err
     assert main(["track", str(workspace), *QUICKLY]) == 0

@@ -100,7 +100,6 @@ def test_chain_solver_matches_the_dense_solution(timesteps):
     held = torch.zeros(timesteps, p, dtype=torch.bool)
     held[1, 2] = True
     step = fitting.solve_chain(fitting.NormalEquations(gradient[:, 0], gradient, hessian), smoothness, state, held)
-
     weights, second = smoothness.weights(state), torch.zeros(timesteps, timesteps, dtype=torch.float64)
     for t in range(1, timesteps - 1):
         second[t, t - 1 : t + 2] = torch.tensor([1.0, -2.0, 1.0])
