@@ -128,8 +128,7 @@ def _frame_of(given: np.ndarray | list[np.ndarray] | av.VideoFrame, pixels: str)
 
 
 def write_planes(path: Path, pictures: list[np.ndarray], pixels: str, colors: Codes = (1, 1, 1, 1), ticks=None) -> None:
-    """Write a lossless .mkv (FFV1) of exactly these Y'CbCr planes [3, h, w], 4:4:4, at 25 frames a second or at ticks
-    of milliseconds."""
+    """Write a lossless .mkv (FFV1) of these Y'CbCr planes [3, h, w], 4:4:4, at 25 frames a second or at ticks in ms."""
     encode(path, list(map(list, pictures)), "ffv1", pixels, rate=1000 if ticks else 25, colors=colors, ticks=ticks)
 
 

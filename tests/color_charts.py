@@ -1,5 +1,4 @@
-"""Corrections of a camera's colours by the formula of Cheung 2004, and what a camera films that needs one.
-Nothing here calls mien."""
+"""Corrections of colours by the formula of Cheung 2004, and what a camera films that needs one, without mien."""
 
 import numpy as np
 

@@ -46,8 +46,7 @@ def rasterize_anywhere(
 
 
 def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int = 61, height: int = 45) -> Scene:
-    """Return Gaussians of all shapes around a tilted camera.
-    Some are behind it, outside of the picture or transparent."""
+    """Return Gaussians of all shapes around a tilted camera, some behind it, outside of the picture or transparent."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:

@@ -65,8 +65,7 @@ def test_options_that_pages_name_exist(capsys: pytest.CaptureFixture[str]) -> No
 
 API = PROSE[ROOT / "docs" / "api.md"]
 STABLE: dict[str, list[str] | None] = json.loads((ROOT / "tests/public_api.json").read_text(encoding="utf-8"))
-"""Full name -> the parameters of a function, in their order, with "=" after those that may be left out; None for what
-is no function."""
+"""Full name -> the parameters of a function in order, "=" after those that may be left out; None for other things."""
 
 
 def parameters(value: Any) -> list[str] | None:

@@ -98,8 +98,7 @@ def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path
 
 CHANNELS = {"lpips-alex": (64, 192, 384, 256, 256), "lpips-vgg": (64, 128, 256, 512, 512)}
 COMPARED = {"lpips-alex": (1, 4, 7, 9, 11), "lpips-vgg": (3, 8, 15, 22, 29)}
-"""The layers of torchvision's networks whose maps LPIPS compares. Of VGG16 they are relu1_2, relu2_2, relu3_3, relu4_3
-and relu5_3."""
+"""Layers of torchvision's networks whose maps LPIPS compares. Of VGG16: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3."""
 TRUNKS = {trunk.backbone: trunk for trunk in lpips.TRUNKS}
 
 
