@@ -36,7 +36,7 @@ from mien.face.flame import flame_face_model, read_flame
 from mien.limits import camera_fault
 from mien.training import read_own_split, read_sequence
 from mien.workspace import Workspace
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
 
 SIDE = 32
 _BY_COMMAND, _RETRACKED = 5, 7

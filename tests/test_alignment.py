@@ -29,10 +29,10 @@ from mien.tracking import read_tracking
 from mien.training import AlignmentSettings, TrainSettings, align, train
 from mien.training.alignment import TRAINING, FaceDescent, align_faces, steadier
 from refusals import complaint, refuses
+from shared_things import write_sequence, write_toy_workspace
 from small_face_model import make_small_face_model
 from test_motion import row, write_csv
 from toy_scene import toy_face_model, toy_sequence
-from toy_workspace import write_sequence, write_toy_workspace
 
 QUICK = AlignmentSettings(template_steps=6, template_gaussians=400, resolution=32, iterations=2)
 OPTIONS = (

@@ -24,9 +24,8 @@ from mien.lab.analysis.headgas.basis import start_of_bases
 from mien.lab.analysis.headgas.trained import Trained, busy_face, trained_range, with_expression
 from mien.lab.analysis.views import head_camera, labeled, mouth_camera
 from mien.runtime.filmed import head_angles
-from shared_things import MadeOnce
+from shared_things import MadeOnce, write_toy_workspace
 from toy_scene import toy_camera, toy_face, toy_face_model
-from toy_workspace import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
 _GROWTH = GradientSettings(start=0.2, stop=0.8, rounds=3, grow_gradient=1e-4, opacity_resets=(), max_gaussians=150)

@@ -28,9 +28,9 @@ from mien.tracking import Tracking
 from mien.training import PRESETS, read_run_config, read_training_summary, trainer
 from mien.workspace import Workspace
 from refusals import complaint
+from shared_things import write_toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 from tracking_case import still_camera
 
 pytestmark = pytest.mark.unchecked

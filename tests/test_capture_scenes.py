@@ -27,7 +27,7 @@ from mien.lab.synthetic import SyntheticRecipe, SyntheticScene
 from mien.training.run import check_videos, is_part_of
 from mien.workspace import Workspace
 from refusals import refuses
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
 
 FPS, FRAMES = 10.0, 11
 WIDTH, HEIGHT = 400, 240

@@ -23,8 +23,7 @@ from mien.training.whole_head.constants import WHOLE_HEAD
 from mien.training.whole_head.unseen import Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
 from refusals import refuses
-from sh_colors import rgb_from_sh
-from toy_scene import surface_of, toy_face, toy_sequence
+from toy_scene import rgb_from_sh, surface_of, toy_face, toy_sequence
 
 Toy = tuple[FaceModel, Sequence]
 SETTINGS = plain_run(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)

@@ -35,9 +35,9 @@ from mien.tracking import Tracking
 from mien.workspace import Workspace
 from recordings import LAYOUTS, row, write_csv
 from refusals import refuses
+from shared_things import write_sequence, write_toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model, toy_sequence
-from toy_workspace import write_sequence, write_toy_workspace
 
 
 def _face(timesteps: int, seed: int = 0, expressions: int = 6) -> FaceParams:

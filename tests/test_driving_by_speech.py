@@ -17,8 +17,8 @@ from mien.driving.speech import FPS, motion_of_sound, read_speech
 from mien.face import load_face_model
 from mien.viewer import Session
 from refusals import refuses
+from shared_things import write_toy_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 
 SECONDS = 6.0
 BLACK = np.zeros((32, 32, 3), np.uint8)

@@ -23,8 +23,8 @@ from mien.capture.video import probe_video
 from mien.cli import COMMANDS, main
 from mien.face import add_face_model
 from mien.tracking import PhotometricSettings, TrackingSettings
+from shared_things import write_toy_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 from viewer_alone import page_of
 from web_case import chromium, drawn_head, violations
 

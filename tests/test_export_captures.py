@@ -35,7 +35,7 @@ from mien.tracking import Scoring, write_scoring, write_tracking
 from mien.training import Sequence, TrainSettings
 from mien.workspace import Workspace
 from refusals import refuses
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
 

@@ -42,10 +42,9 @@ from mien.training import read_coverage
 from mien.training.footage.filmed import FILE
 from plain_settings import plain_config
 from refusals import complaint, refuses
-from shared_things import toy_workspace
+from shared_things import toy_workspace, write_toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera, toy_face_model, toy_sequence
-from toy_workspace import write_toy_workspace
 from web_case import drawn_head
 
 EYE = np.array([0.0, 0.0, 1.0])

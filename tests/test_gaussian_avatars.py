@@ -21,8 +21,7 @@ from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
 from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
-from sh_colors import rgb_from_sh
-from toy_scene import surface_of, toy_camera, toy_face, toy_face_model
+from toy_scene import rgb_from_sh, surface_of, toy_camera, toy_face, toy_face_model
 
 
 def new_avatar(config: GaussianAvatarsConfig | None = None, face_model: FaceModel | None = None) -> GaussianAvatars:

@@ -26,8 +26,7 @@ from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
 from mien.training.whole_head.outline_fit import fit_to_outlines
 from plain_settings import plain_config, plain_run
-from sh_colors import rgb_from_sh
-from toy_scene import surface_of, toy_sequence
+from toy_scene import rgb_from_sh, surface_of, toy_sequence
 
 _HAIR = 0.02
 _SIZE, _TIMESTEPS = 160, 7

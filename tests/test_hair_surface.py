@@ -32,9 +32,8 @@ from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.part import prepare_whole_head
 from mien.training.whole_head.unseen import Unseen
 from plain_settings import plain_run
-from sh_colors import rgb_from_sh
 from test_training_resume import RESULTS
-from toy_scene import surface_of, toy_sequence
+from toy_scene import rgb_from_sh, surface_of, toy_sequence
 from train_toy import stopped_at
 
 _HAIR, _RATE = 0.02, 1e-3

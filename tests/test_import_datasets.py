@@ -38,8 +38,7 @@ from mien.training import (
 )
 from mien.training.footage.frames import training_frames
 from refusals import complaint
-from shared_things import MadeOnce, toy_workspace
-from toy_workspace import write_toy_workspace
+from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 
 CLIPS = ("MVI_1810", "MVI_1812")
 

@@ -20,8 +20,7 @@ from mien.training.footage.sequence import Targets
 from mien.training.whole_head.mouth_interior import Inside, cover_hidden, covered_reference
 from mien.training.whole_head.unseen import unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
-from sh_colors import rgb_from_sh
-from toy_scene import surface_of, toy_face, toy_sequence
+from toy_scene import rgb_from_sh, surface_of, toy_face, toy_sequence
 
 pytestmark = pytest.mark.unchecked
 SETTINGS = plain_run(steps=120, split="none", inside="covered", checkpoint_every=60, record_every=60)

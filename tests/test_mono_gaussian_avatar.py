@@ -23,8 +23,7 @@ from mien.face.mirror import triangle_geometry
 from mien.training import PRESETS
 from mono_avatars import SMALL, new_avatar, pictured
 from plain_settings import plain_mono_gaussian_avatar
-from sh_colors import rgb_from_sh
-from toy_scene import toy_face, toy_face_model
+from toy_scene import rgb_from_sh, toy_face, toy_face_model
 
 
 def with_pose_correctives() -> FaceModel:

@@ -18,8 +18,7 @@ from mien.render import close_holes, rasterize
 from mien.training import PRESETS
 from plain_settings import plain_point_avatar
 from refusals import refuses
-from sh_colors import rgb_from_sh
-from toy_scene import toy_camera, toy_face, toy_face_model
+from toy_scene import rgb_from_sh, toy_camera, toy_face, toy_face_model
 
 SMALL = plain_point_avatar(points=30, max_points=100, face_points=30)
 

@@ -25,7 +25,7 @@ from mien.cli import main
 from mien.commands.stages import pictures
 from mien.evaluation.partial import PartialScores
 from mien.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Terminated, orderly_stops, stops_put_off
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
 from two_commands import RANK, Studio, run, toy_studio
 
 KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated, signal.SIGHUP: HungUp}

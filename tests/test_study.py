@@ -24,8 +24,8 @@ from mien.lab.analysis.study.files import QUESTIONS, read_all_answers
 from mien.lab.analysis.study.shuffling import shuffled
 from mien.training import read_sequence, train
 from refusals import refuses
+from shared_things import write_toy_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 from web_case import browse, expect_usable, picture
 
 pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]

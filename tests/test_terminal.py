@@ -28,7 +28,7 @@ from mien.tracking import TrackingSettings
 from mien.training import TrainSettings
 from needs import find_test_data
 from refusals import refuses
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
 
 NASTY = "\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\udcff.mp4"
 SHOWN = r"\x1b[2J\x07\n[red]x[/red][/]:smile:\u202e\x9b\xff.mp4"

@@ -17,8 +17,7 @@ from mien.rotation import matrix_from_quaternion
 from mono_avatars import pictured
 from plain_settings import plain_textured_mesh
 from refusals import refuses
-from sh_colors import rgb_from_sh
-from toy_scene import toy_camera, toy_face, toy_face_model
+from toy_scene import rgb_from_sh, toy_camera, toy_face, toy_face_model
 
 PLAIN = plain_textured_mesh()
 

@@ -25,8 +25,7 @@ from mien.training.settings import Split
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
 from refusals import refuses
-from sh_colors import rgb_from_sh
-from toy_scene import toy_sequence
+from toy_scene import rgb_from_sh, toy_sequence
 from train_toy import stopped_at
 
 

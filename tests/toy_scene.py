@@ -11,6 +11,7 @@ from mien.avatar.gaussian_avatars.surface import GaussianSurface
 from mien.camera import Camera
 from mien.capture import Capture
 from mien.face import FaceModel, FaceParams
+from mien.gaussians import SH_C0
 from mien.runtime import Face
 from mien.tracking import Tracking
 from mien.training import Sequence
@@ -19,6 +20,11 @@ from mien.training import Sequence
 def random(*shape: int, seed: int = 0) -> Tensor:
     """Standard normal numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def rgb_from_sh(dc: Tensor) -> Tensor:
+    """Colours of constant SH coefficients [..., 3], clamped to 0 from below as in the renderers."""
+    return torch.clamp_min(dc * SH_C0 + 0.5, 0)
 
 
 def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:

@@ -55,8 +55,8 @@ from mien.training import read_face_track
 from photometric_case import make_photometric_case, make_textured_model
 from plain_settings import plain_config
 from recordings import LAYOUTS
+from shared_things import write_toy_workspace
 from toy_scene import sphere, toy_camera, toy_face_model, toy_sequence
-from toy_workspace import write_toy_workspace
 from what_users_give import write_what_users_give
 
 RUN, SEQUENCE, ANALYSIS, PIECES = "W/runs/toy", "W/sequences/clip", "W/analysis/toy", "pieces"
