@@ -266,9 +266,7 @@ def test_exposure_darkness_and_noise_are_told_with_numbers(gains, noise, said):
         assert any(words in hint for hint in report["hints"]), report["hints"]
 
 
-def test_light_is_measured_where_faces_are_and_is_in_the_report(test_data: Path, tmp_path: Path, capsys):
-    assert not is_light_changing(np.full(5, np.nan))
-    assert is_light_changing(np.array([np.nan, 0.2, 0.4, np.nan, 0.3]))
+def test_exposure_of_a_video_is_in_its_report(test_data: Path, tmp_path: Path, capsys):
     capture_video(test_data / "cases" / "exposure.mp4", tmp_path / "capture", CaptureSettings(size=96, stride=5))
     report = read_json(tmp_path / "capture" / "report.json", "mien.capture_report", 1)
     assert report["face_brightness_change"] == pytest.approx(2.43, abs=0.3)
@@ -317,7 +315,9 @@ def test_walls_are_no_screens(behind):
     assert screen_of(picture(colors, alpha, leaves if behind is None else np.array(behind))) is None
 
 
-def test_a_green_screen_leaves_no_rim_and_green_eyes_and_stripes_stay(test_data: Path, tmp_path: Path, capsys):
+def test_green_eyes_and_stripes_stay_and_light_is_measured_where_faces_are():
+    assert not is_light_changing(np.full(5, np.nan))
+    assert is_light_changing(np.array([np.nan, 0.2, 0.4, np.nan, 0.3]))
     colors, alpha = head()
     colors[58:62, 50:70] = (0.35, 0.55, 0.35)
     image = picture(colors, alpha, np.array(SCREENS["green"]))
@@ -325,6 +325,9 @@ def test_a_green_screen_leaves_no_rim_and_green_eyes_and_stripes_stay(test_data:
     matte = screen_matte(image, cv2.resize(alpha.astype(np.float32), (64, 64)), screen)
     assert matte[50:70, 45:75].min() == 255
     assert (without_screen(image, matte, screen)[58:62, 50:70] == image[58:62, 50:70]).all()
+
+
+def test_a_green_screen_leaves_no_rim(test_data: Path, tmp_path: Path, capsys):
     capture = capture_video(test_data / "cases/green_screen.mp4", tmp_path / "capture", CaptureSettings(max_frames=6))
     assert "the background is an even screen (red" in capsys.readouterr().err
     pictures, mattes = (np.asarray(part)[:, 0].astype(float) for part in (capture.images, capture.mattes))
