@@ -1,7 +1,5 @@
 """Cases of the fuzzer of datasets: a small dataset of each layout, one fault in it, and what may come of that.
-
-A case is a layout and a number; the number decides the fault and the way in which the dataset is read.
-"""
+A case is a layout and a number; the number decides the fault and the way in which the dataset is read."""
 
 import shutil
 import time
@@ -38,7 +36,7 @@ from mien.face.flame import flame_face_model, read_flame
 from mien.limits import camera_fault
 from mien.training import read_own_split, read_sequence
 from mien.workspace import Workspace
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
 
 SIDE = 32
 _BY_COMMAND, _RETRACKED = 5, 7
@@ -213,8 +211,7 @@ class Campaign:
         """Read and write a dataset as `mien import` does.
 
         Raises:
-            UserError: it is damaged.
-        """
+            UserError: it is damaged."""
         known = [each for each in datasets() if each.recognises(path) is not None]
         if not known:
             raise UserError(f"{path}: is no dataset")

@@ -3,8 +3,7 @@
 `make lint` runs this file in the repository's root. No file names a method but those of the method and those in
 `MAY_NAME`. No class in src/mien overrides a method that a base class in src/mien implements. What may be overridden:
 abstract methods, methods of protocols, methods with two underscores, and methods of other packages' classes, such as
-torch's `forward`. No test uses a private name of mien: a test that does breaks with every change of what it tests.
-"""
+torch's `forward`. No test uses a private name of mien: a test that does breaks with every change of what it tests."""
 
 import ast
 import importlib
@@ -42,10 +41,8 @@ OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}
 
 def naming_faults(texts: Mapping[str, str]) -> Iterator[str]:
     """Yield a message for each file that names a method and may not, and for each of `MAY_NAME` that names none.
-
     A method's name counts anywhere in a file, also in comments. Its classes count in code alone, since papers that
-    docstrings cite are written like them.
-    """
+    docstrings cite are written like them."""
     idle = set(MAY_NAME)
     for place, text in texts.items():
         for name, method in METHODS.items():

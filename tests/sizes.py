@@ -1,8 +1,7 @@
 """Limits that no other tool checks: lines of functions in Python and C++, parameters in C++, lines of a file of tests.
 
 `make lint` runs this file in the repository's root; ruff (PLR0913) counts the parameters of Python's functions. C++ is
-not parsed: the layout that clang-format gives it tells where a function begins and ends.
-"""
+not parsed: the layout that clang-format gives it tells where a function begins and ends."""
 
 import ast
 import re

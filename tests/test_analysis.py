@@ -25,8 +25,7 @@ from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, with
 from mien.plots import Axes, Series
 from mien.storage import write_tensors
 from mien.training import read_curves
-from shared_things import MadeOnce, toy_workspace
-from toy_workspace import write_toy_workspace
+from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 from web_case import violations
 
 pytestmark = pytest.mark.unchecked

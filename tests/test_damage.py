@@ -2,8 +2,7 @@
 
 The readers are the table `fuzzing.targets`, the damage is `fuzzing.faults`, `formats` and `values`, and the judge is
 `fuzzing.judge`: no traceback, no hang, no memory beyond a bound, no byte outside. `make fuzz` draws from these tables.
-Cases run in other processes, so that a crashing decoder spares the tests.
-"""
+Cases run in other processes, so that a crashing decoder spares the tests."""
 
 import os
 from collections import Counter
@@ -63,9 +62,7 @@ def check_damage(folder: str, material: str, kind: str) -> None:
 
 def check_values(folder: str, material: str, name: str) -> None:
     """Put values that the reader must refuse into each file with such a place. Its checksum is right, or there is none.
-
-    Whoever makes a file can make its checksum.
-    """
+    Whoever makes a file can make its checksum."""
     files = list(enumerate(sorted(path for path in Path(material).glob(TARGETS[name].files) if path.is_file())))
     cases = [
         f"{name}:{row}/{index}:{number}"

@@ -14,11 +14,11 @@ from mien.commands.stages import driving, viewing, viewing_motions
 from mien.driving import Driver
 from mien.driving.motion import ARKIT_NAMES
 from mien.driving.speech import FPS, motion_of_sound, read_speech
-from mien.errors import UserError
 from mien.face import load_face_model
 from mien.viewer import Session
+from refusals import refuses
+from shared_things import write_toy_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 
 SECONDS = 6.0
 BLACK = np.zeros((32, 32, 3), np.uint8)
@@ -88,9 +88,7 @@ def smooth(values: np.ndarray, seconds: float) -> np.ndarray:
 
 def synthesised(seed: int, syllables: int, even: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return speech made of a buzz through three formants, with the jaw of each sample, and whether lips are closed.
-
-    If it is `even`, all vowels are equally loud: i and u, behind a closed jaw, as loud as a.
-    """
+    If it is `even`, all vowels are equally loud: i and u, behind a closed jaw, as loud as a."""
     random, rows = np.random.default_rng(seed), []
     for _ in range(syllables):
         rows += [CLOSED[consonant]] * round(0.09 * RATE) if (consonant := random.choice(["p", "b", "m", ""])) else []
@@ -171,8 +169,7 @@ def test_files_without_sound_and_odd_rates_are_refused(tmp_path: Path) -> None:
         ("film.mp4", "has no sound; give a file with sound"), ("0.wav", r"\.wav: .*convert it to \.wav"),
         ("999.wav", r"\.wav: .*convert it to \.wav"), ("2000000.wav", r"\.wav: .*convert it to \.wav"),
     ):  # fmt: skip
-        with pytest.raises(UserError, match=message):
-            read_speech(tmp_path / name)
+        refuses(message, read_speech, tmp_path / name)
 
 
 @pytest.mark.unchecked

@@ -1,7 +1,5 @@
 """A run's folder becomes metrics.json and report.html, through the files that the earlier stages write.
-
-Runs are scored by time, by sequence and by camera; tables compare them.
-"""
+Runs are scored by time, by sequence and by camera; tables compare them."""
 
 import json
 import re
@@ -19,7 +17,6 @@ from evaluation_case import SIZE, make_experiment, two_cameras, write_run, write
 from mien.capture import read_capture_hash
 from mien.capture.video import probe_video, read_video_frames
 from mien.cli import main
-from mien.errors import UserError
 from mien.evaluation import EvaluationSettings, evaluate, protocols, read_metrics
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.compare import compare_runs
@@ -37,6 +34,7 @@ from mien.tracking import write_scoring
 from mien.training import read_sequence
 from mien.training.footage.frames import Frame, spread_frames
 from plain_settings import plain_run
+from refusals import refuses
 
 pytestmark = pytest.mark.usefixtures("short_films")
 STEPS = 6
@@ -133,15 +131,11 @@ def test_held_out_frames_are_those_training_left_out_and_said_to_be_corrected(wo
 
 def test_wrong_sequences_and_unfinished_runs(made: tuple[Path, Path], tmp_path: Path) -> None:
     folder, run_dir = made
-    with pytest.raises(UserError, match="was trained on clip"):
-        evaluate(run_dir, [folder.with_name("other")])
-    with pytest.raises(UserError, match="missing"):
-        evaluate(tmp_path, [folder])
-    with pytest.raises(UserError, match="missing"):
-        read_metrics(tmp_path)
+    refuses("was trained on clip", evaluate, run_dir, [folder.with_name("other")])
+    refuses("missing", evaluate, tmp_path, [folder])
+    refuses("missing", read_metrics, tmp_path)
     shutil.copy(run_dir / "config.json", tmp_path)
-    with pytest.raises(UserError, match="was not finished; run the same `mien train` or `mien create` again"):
-        evaluate(tmp_path, [folder])
+    refuses("was not finished; run the same `mien train` or `mien create` again", evaluate, tmp_path, [folder])
 
 
 def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path]) -> None:
@@ -149,8 +143,7 @@ def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path]) -> No
     shutil.rmtree(folder / "scoring")
     write_scoring(folder / "scoring", make_experiment(20).scorings[0], capture_hash="of another capture")
     for read in (lambda: evaluate(run_dir, [folder]), lambda: read_sequence(folder)):
-        with pytest.raises(UserError, match=r"scoring: its masks belong to other pictures .* run `mien track` again"):
-            read()
+        refuses(r"scoring: its masks belong to other pictures .* run `mien track` again", read)
 
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=16)
@@ -261,8 +254,7 @@ def test_evaluation_goes_on_where_it_was(root: Path, scored: dict[str, dict], mo
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(protocols, "drawn_frames", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(run_dir, [folder], quick)
+    pytest.raises(KeyboardInterrupt, evaluate, run_dir, [folder], quick)
     partial = run_dir / ".self_reenactment.partial"
     kept = len(partial.read_text().splitlines()) - 1
     assert kept >= 2
@@ -307,8 +299,7 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(root: Path, tmp
     assert len(comparison.tables) == 2
     warnings = "\n".join(comparison.warnings)
     write_json(other / "metrics.json", "mien.metrics", 99, {})
-    with pytest.raises(UserError, match=r"version 99.*version 1"):
-        read_metrics(other)
+    refuses(r"version 99.*version 1", read_metrics, other)
     if other_in == "mask":
         assert "because they were scored on other frames, pictures or masks: short | other" in warnings
     else:
@@ -316,8 +307,7 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(root: Path, tmp
         assert [table.edges for table in comparison.tables] == ["cleaned", "filmed"]
         assert "blocks, soft edges as filmed)" in comparison_text(comparison)
     assert "never: was not evaluated" in warnings
-    with pytest.raises(UserError, match="no evaluated run"):
-        compare_runs({"never": tmp_path / "never"})
+    refuses("no evaluated run", compare_runs, {"never": tmp_path / "never"})
 
 
 @pytest.mark.unchecked

@@ -16,12 +16,10 @@ TIMESTEPS, SHOWN = 10, 8
 SETTINGS = TrainSettings(steps=6, split="tail", checkpoint_every=12)
 pytestmark = pytest.mark.unchecked
 SMALL: dict[str, dict[str, Any]] = {
-    "gaussian_avatars": {},
-    "headgas": {"points": 60, "judged_expressions": 4, "directions": 3},
+    "gaussian_avatars": {}, "headgas": {"points": 60, "judged_expressions": 4, "directions": 3},
     "mono_gaussian_avatar": {"points": 60, "max_points": 120, "pretraining": 5},
-    "point_avatar": {"points": 60, "max_points": 120, "pretraining": 5},
-    "textured_mesh": {"surfels": 300},
-}
+    "point_avatar": {"points": 60, "max_points": 120, "pretraining": 5}, "textured_mesh": {"surfels": 300},
+}  # fmt: skip
 
 
 def absurd(sequence: Sequence) -> Sequence:

@@ -100,7 +100,6 @@ def test_chain_solver_matches_the_dense_solution(timesteps):
     held = torch.zeros(timesteps, p, dtype=torch.bool)
     held[1, 2] = True
     step = fitting.solve_chain(fitting.NormalEquations(gradient[:, 0], gradient, hessian), smoothness, state, held)
-
     weights, second = smoothness.weights(state), torch.zeros(timesteps, timesteps, dtype=torch.float64)
     for t in range(1, timesteps - 1):
         second[t, t - 1 : t + 2] = torch.tensor([1.0, -2.0, 1.0])
@@ -165,9 +164,6 @@ def test_priors_weigh_as_much_in_the_cost_as_in_the_equations(case):
     torch.testing.assert_close(equations.cost, wanted)
     torch.testing.assert_close(equations.gradient, own.state @ precision)
     torch.testing.assert_close(equations.hessian, precision.expand_as(equations.hessian))
-
-
-def test_shared_parameters_have_one_prior_in_the_cost_and_in_the_equations(case):
     term, own, subject = case
     fit = fitting.Fit(subject, (own,))
     precision = precision_of_shared(fit, [0], TrackingSettings())

@@ -1,7 +1,5 @@
 """The native parts of posing and of training steps agree with their plain PyTorch twins, on every instruction set.
-
-A table has them all. tests/test_feature_network.py, tests/test_point_network.py and others hold what is special.
-"""
+A table has them all. tests/test_feature_network.py, tests/test_point_network.py and others hold what is special."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -191,9 +189,7 @@ def skinned(given: Tensors, native: bool) -> Tensors:
 
 def bound_inputs(size: tuple[tuple[int, ...], int]) -> Tensors:
     """Vertices at timesteps, faces, and the face, mean, quaternion and scales of Gaussians.
-
-    They are turned in every way, so that each of the four quaternion formulas is used; quaternions have any length.
-    """
+    They are turned in every way, so that each of the four quaternion formulas is used; quaternions have any length."""
     timesteps, count = size
     faces = torch.stack([torch.randperm(20, generator=torch.Generator().manual_seed(i))[:3] for i in range(30)])
     index = torch.randint(0, 30, (count,), generator=torch.Generator().manual_seed(1))

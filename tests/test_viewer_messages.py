@@ -144,8 +144,7 @@ def test_one_browser_cannot_end_the_viewer_for_others(serving: Serving) -> None:
 
     asyncio.run(talk())
     assert np.isfinite(session.face.joints).all()
-    assert session.height == 1080
-    assert control(serving, "Search").value == "x" * MOST_TEXT
+    assert (session.height, control(serving, "Search").value) == (1080, "x" * MOST_TEXT)
     assert serving.server.gui._current_file_upload_states == {}
     assert (serving.loop.error, serving.failures) == (None, [])
 
@@ -201,9 +200,7 @@ def test_files_wait_until_a_browser_takes_them(serving: Serving, monkeypatch: py
     assert serving.failures == []
 
 
-def test_a_failure_is_told_and_the_viewer_goes_on(
-    serving: Serving, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failure_is_told_and_the_viewer_goes_on(serving: Serving, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def fail(*arguments: object) -> None:
         raise ArithmeticError("a bug")
 
@@ -237,5 +234,4 @@ def test_hostile_messages_do_no_harm() -> None:
     """A real viewer and a real WebSocket client; `make fuzz` does the same at length."""
     figures = campaign(30, 1)
     gc.collect()  # connections that the campaign has cut, which warn in whatever test comes next otherwise
-    assert figures.findings == []
-    assert figures.messages == 30
+    assert (figures.findings, figures.messages) == ([], 30)

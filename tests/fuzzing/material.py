@@ -58,8 +58,8 @@ from mien.training import GAINS, read_face_track
 from photometric_case import make_photometric_case, make_textured_model
 from plain_settings import plain_config
 from recordings import LAYOUTS
+from shared_things import write_toy_workspace
 from toy_scene import sphere, toy_camera, toy_face_model, toy_sequence
-from toy_workspace import write_toy_workspace
 from what_users_give import write_what_users_give
 
 RUN, SEQUENCE, ANALYSIS, PIECES = "W/runs/toy", "W/sequences/clip", "W/analysis/toy", "pieces"
@@ -75,9 +75,7 @@ _WEB = Path(__file__).parents[2] / "web"
 
 def make_material(root: Path, whole: bool = True) -> None:
     """Write everything below `root`, with the same bytes every time on one machine.
-
-    What takes seconds is only there if it is to be `whole`: the pieces of a tracking, and the runtime of pages.
-    """
+    What takes seconds is only there if it is to be `whole`: the pieces of a tracking, and the runtime of pages."""
     torch.set_num_threads(1)
     root.mkdir(parents=True, exist_ok=True)
     write_toy_workspace(root / "W")

@@ -1,8 +1,7 @@
 """Single values that a reader must refuse, whatever the checksums say, by target: in json, and in arrays.
 
 A row is the place of a value and the value; `GONE` takes it away. Files are edited with correct checksums around them.
-In arrays, a value may be a function that returns another array.
-"""
+In arrays, a value may be a function that returns another array."""
 
 import itertools
 import json
