@@ -11,7 +11,7 @@ import torch
 from evaluation_case import drawn_sequence, make_experiment
 from mien.avatar import METHODS
 from mien.cli import main
-from mien.evaluation import EvaluationSettings
+from mien.evaluation import EvaluationSettings, protocols
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.fitting import FittedFaces, fit_face
 from mien.evaluation.metrics import l1
@@ -78,6 +78,9 @@ def test_fits_do_not_depend_on_the_order_of_questions() -> None:
     forward, backward = ({each: fits.face(each) for each in frames[::way]} for fits, way in ((there, 1), (back, -1)))
     assert all(forward[each].expression.equal(backward[each].expression) for each in frames)
     assert there.face(frames[0]) is forward[frames[0]]
+    for fits, shown in ((there, FITTED), (None, AVATAR)):
+        ((_, drawn, _),) = protocols.drawn_frames(experiment, [frames[0]], {protocols.OPENED}, None, fits)
+        assert drawn[protocols.OPENED].equal(protocols.opened(drawn[shown])), "the picture of the fitted face, if any"
 
 
 def test_the_third_figure_stands_beside_the_others_and_is_never_the_headline(tmp_path: Path) -> None:
