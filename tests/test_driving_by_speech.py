@@ -129,6 +129,27 @@ def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(seed: int, eve
     assert press[~inside].mean() < 0.1 * press[inside].max(), "lips are not pressed in vowels"
 
 
+@pytest.mark.parametrize(("between", "pressed"), [(0.0, True), (5000.0, False)])
+def test_a_hiss_between_vowels_keeps_the_lips_open_and_a_pause_does_not(between: float, pressed: bool) -> None:
+    """A drop of the level for a tenth of a second is a p, unless it hisses like an s."""
+    seconds = np.arange(3 * RATE) / RATE
+    vowel, hiss = (0.3 * np.sin(2 * np.pi * frequency * seconds) for frequency in (700.0, between))
+    sound = np.where(np.abs(seconds - 1.5) < 0.05, hiss, vowel).astype(np.float32)
+    press = column(motion_of_sound(sound).coefficients, "mouthPressLeft")[30:60].max()
+    assert (press > 0.2) == pressed
+    assert pressed or press < 0.02
+
+
+def test_a_quiet_vowel_opens_the_mouth_if_nothing_else_hisses() -> None:
+    """The noise floor is that of the recording, not a fixed distance from the loud voice."""
+    tones = np.concatenate([np.zeros(RATE), tone(700.0, 0.5)[0], tone(700.0, 0.02)[0]]).astype(np.float32)
+    most = {}
+    for floor in (1e-6, 0.02):
+        jaw = column(motion_of_sound(tones + noise(len(tones), floor)).coefficients, "jawOpen")
+        most[floor] = jaw[round((2 + SECONDS) * FPS) :].max()
+    assert most[1e-6] > 0.02 > most[0.02]
+
+
 def test_low_sounds_round_the_lips_and_high_ones_stretch_them() -> None:
     most = {}
     for name, frequency in (("low", 200.0), ("high", 5000.0)):

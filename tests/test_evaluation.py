@@ -122,6 +122,8 @@ def test_eyes_have_figures_of_their_own(experiment: Experiment, evaluation: Eval
     assert content["per_frame"]["eyes_psnr"][0] == pytest.approx(psnr(image, target, box), abs=1e-4)
     cut, goal = (enlarged(crop_to(picture, box), PART_SIDE) for picture in (image, target))
     assert min(cut.shape[:2]) == PART_SIDE
+    for shape, larger in (((10, 20, 3), (15, 30, 3)), ((20, 10, 3), (30, 15, 3)), ((20, 15, 3), (20, 15, 3))):
+        assert enlarged(torch.zeros(shape), 15).shape == larger, "by the shorter side, in its proportions"
     assert content["per_frame"]["eyes_perceptual"][0] == pytest.approx(load_perceptual()(cut, goal), abs=1e-4)
     assert content["eyes"]["psnr"] == pytest.approx(np.mean(content["per_frame"]["eyes_psnr"]), abs=1e-4)
     assert content["baselines"]["mesh"]["eyes"]["psnr"] < content["eyes"]["psnr"]

@@ -14,7 +14,7 @@ from evaluation_case import drawn_sequence, make_experiment, write_run, write_se
 from mien.avatar import METHODS
 from mien.capture.video import write_video
 from mien.cli import main
-from mien.evaluation import EvaluationSettings, evaluate
+from mien.evaluation import EvaluationSettings, evaluate, protocols
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.fitting import FittedFaces, fit_face
 from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
@@ -205,6 +205,9 @@ def test_fits_are_a_third_figure_in_any_order_and_never_the_headline(tmp_path: P
     forward, backward = ({each: fits.face(each) for each in frames[::way]} for fits, way in ((there, 1), (back, -1)))
     assert all(forward[each].expression.equal(backward[each].expression) for each in frames)
     assert there.face(frames[0]) is forward[frames[0]]
+    for fits, shown in ((there, FITTED), (None, AVATAR)):
+        ((_, drawn, _),) = protocols.drawn_frames(experiment, [frames[0]], {protocols.OPENED}, None, fits)
+        assert drawn[protocols.OPENED].equal(protocols.opened(drawn[shown])), "the picture of the fitted face, if any"
     experiment = astray(make_experiment(10))
     plain = evaluate_frames(experiment, QUICK)
     partial = PartialScores(tmp_path / "partial", "one")

@@ -22,7 +22,7 @@ from mien.evaluation.baselines import make_baselines
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.evaluate import is_evaluated
 from mien.evaluation.experiment import Experiment, head_box, target_image
-from mien.evaluation.load import load_experiments
+from mien.evaluation.load import held_out_by_protocol, load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.protocols import evaluate_frames
 from mien.evaluation.scoring import METRICS
@@ -185,6 +185,12 @@ def test_protocols_hold_what_training_left_out(experiments: dict[str, Experiment
     }
     assert set(experiments["novel_view"].training_frames) == {Frame(0, t, 0) for t in range(16)}
     assert {one.split for one in experiments.values()} == {"blocks", "sequences", "cameras"}
+    # A timestep that no training camera saw is no novel view: its face is not known.
+    talk, valid = experiments["novel_view"].sequences[0], np.arange(40).reshape(20, 2) != 6
+    (_, views) = held_out_by_protocol(
+        [replace(talk, capture=replace(talk.capture, valid=valid))], plain_run(held_out_cameras=("side",))
+    )["novel_view"]
+    assert views == tuple(Frame(0, t, 1) for t in range(16) if t != 3)
     assert {one.face_source for one in experiments.values()} == {"as_tracked"}
     # Figures say what they are of.
     sequence, view = (scored["held"]["protocols"][name] for name in ("self_reenactment_sequence", "novel_view"))

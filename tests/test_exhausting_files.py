@@ -319,5 +319,11 @@ def test_poses_of_mien_files() -> None:
     weights = np.full(len(baked.attributes.quats), 0.1, np.float32)
     posed = replace(baked, still_weights=weights, still_pose=TURN.astype(np.float32))
     check(replace(portable, baked=posed), "a.mien")
+    for wrong, words in (
+        (weights[1:], "weights of the bone that"), (np.append(weights, weights[:1]), "weights of the bone that"),
+        (None, "weights or a pose, but not both"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=words):
+            check(replace(portable, baked=replace(posed, still_weights=wrong)), "a.mien")
     for matrix, words in BAD[:4]:
         refuses(words, check, replace(portable, baked=replace(posed, still_pose=matrix.astype(np.float32))), "a.mien")

@@ -153,6 +153,21 @@ def test_corrections_that_follow_the_turns_are_taken_away(keeps: bool, mean: boo
     assert float(tuned[20] - tuned[19]) == pytest.approx(0.02, abs=1e-3), "a timestep's own correction stays"
 
 
+def test_what_is_not_trained_on_moves_no_other_pose_and_loses_the_same() -> None:
+    """The last head is not trained on, and is then turned and corrected in another way."""
+    angles, found = torch.linspace(-0.35, 0.35, 21), []
+    for last, slope in ((0.35, 0.05), (2.0, -0.5)):
+        heads = torch.cat([angles[:20], torch.tensor([last])])
+        tracked = still_face(len(heads), head_rotation=torch.stack([2 * heads**2, heads, 0 * heads], 1))
+        track = FaceTrack(tracked, FaceTuning(enabled=True, keep_mean_pose=True, keep_turns=True), trained=range(20))
+        for index, angle in enumerate(heads.tolist()):
+            correct(track, tracked, index, torch.zeros(3), 0.01 + (0.05 if index < 20 else slope) * angle)
+        track.steady_pose()
+        found.append(torch.cat([track.face(index).head_rotation.detach() for index in range(21)])[:, 1] - heads)
+    assert found[0][:20].equal(found[1][:20])
+    assert float(found[0].abs().max()) < 1e-3, "the last one followed its turn as well"
+
+
 def test_aligned_faces_are_corrected_more_slowly() -> None:
     _, sequence = toy_sequence(2, 16)
     aligned = replace(sequence, tracking=replace(sequence.tracking, settings={"aligned": {"iterations": 2}}))

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from mien.avatar import METHODS, MethodConfig
-from mien.training import Sequence, TrainSettings, train
+from mien.training import Sequence, TrainSettings, read_face_track, train
+from mien.training.constants import TRAINING
 from plain_settings import plain_config
 from toy_scene import toy_sequence
 
@@ -39,7 +40,8 @@ def absurd(sequence: Sequence) -> Sequence:
 
 @pytest.mark.parametrize("plain", [True, False], ids=["plain", "default"])
 @pytest.mark.parametrize("method", [*SMALL, "timesteps that are left out"])
-def test_held_out_frames_change_no_byte_of_an_avatar(method: str, plain: bool, tmp_path: Path) -> None:
+def test_held_out_frames_change_no_byte_of_an_avatar(method: str, plain: bool, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("mien.training.trainer.TRAINING", replace(TRAINING, steady_every=2))
     face_model, sequence = toy_sequence(TIMESTEPS, 32)
     pair, settings = (sequence, absurd(sequence)), SETTINGS
     if method not in SMALL:
@@ -51,9 +53,10 @@ def test_held_out_frames_change_no_byte_of_an_avatar(method: str, plain: bool, t
     first, second = (
         train([one], face_model, config, settings, tmp_path / str(index)) for index, one in enumerate(pair)
     )
+    face, other = (read_face_track(tmp_path / str(index), face_model)[:SHOWN] for index in range(2))
     for ours, theirs in (
         (first.state_dict(), second.state_dict()), (first.subject.tensors(), second.subject.tensors()),
-        (vars(first.filmed), vars(second.filmed)),
+        (vars(first.filmed), vars(second.filmed)), (face.tensors(), other.tensors()),
     ):  # fmt: skip
         assert ours.keys() == theirs.keys()
         for name, one in ours.items():

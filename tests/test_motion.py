@@ -291,14 +291,14 @@ def test_transposed_matrices_are_read_and_others_refused(tmp_path: Path) -> None
 
     def read(*matrices: np.ndarray) -> Motion:
         frames: list[dict[str, Any]] = [
-            {"time": index / 30, "face_blendshapes": [], "facial_transformation_matrixes": [one.tolist()]}
+            {"time": index / 30, "face_blendshapes": [[]], "facial_transformation_matrixes": [one.tolist()]}
             for index, one in enumerate(matrices)
         ]
-        frames[0]["face_blendshapes"] = [[]]
         return read_blendshape_json(write_json(path, frames))
 
     plain, other = read(turn, moved, moved), read(turn.T, moved.T, moved.T)
     np.testing.assert_allclose(plain.head_rotation[:, 2], np.arccos(0.8), atol=1e-6)
+    np.testing.assert_allclose(plain.head_translation, [[0, 0, 0], [0, 0, -0.4], [0, 0, -0.4]], atol=1e-6)
     for name in ("head_rotation", "head_translation"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(other, name))
     assert plain.notes == ()

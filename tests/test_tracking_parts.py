@@ -115,6 +115,22 @@ def test_chain_solver_matches_the_dense_solution(timesteps):
     torch.testing.assert_close(2 * smoothness.gradient(state.detach()), state.grad)
 
 
+def test_frames_and_what_they_share_are_solved_as_one_dense_system():
+    random, damping = torch.Generator().manual_seed(0), 0.1
+    root = torch.randn(8, 8, generator=random, dtype=torch.float64)  # two frames of three parameters, and two shared
+    dense, gradient = root @ root.T + torch.eye(8), torch.randn(8, generator=random, dtype=torch.float64)
+    dense[:3, 3:6] = dense[3:6, :3] = 0
+    own = torch.stack([dense[:3, :3], dense[3:6, 3:6]])
+    frames = fitting.NormalEquations(torch.zeros(2), gradient[:6].reshape(2, 3), own)
+    shared = fitting.SharedEquations(dense[:6, 6:].reshape(2, 3, 2), dense[6:, 6:], gradient[6:])
+    held = torch.tensor([[False, False, True], [False, False, False]])
+    steps = fitting.solve_arrow(frames, shared, held, damping)
+    moving, expected = torch.cat([~held.flatten(), torch.ones(2, dtype=torch.bool)]), torch.zeros(8).double()
+    damped = dense + torch.diag(damping * dense.diagonal())
+    expected[moving] = -torch.linalg.solve(damped[moving][:, moving], gradient[moving])
+    torch.testing.assert_close(torch.cat([step.flatten() for step in steps]), expected)
+
+
 def test_landmark_groups_are_mediapipes():
     connections = pytest.importorskip("mediapipe.python.solutions.face_mesh_connections")
     for group, names in (

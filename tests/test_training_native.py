@@ -15,7 +15,7 @@ import test_point_network as points
 from instruction_sets import by_threads
 from mien import _native
 from mien.adam import FactoredMoments
-from mien.avatar import GaussianStore, Moments
+from mien.avatar import GaussianStore, Moments, ParameterGroup, Progress, Rate
 from mien.avatar.gaussian_avatars.settings import SurfaceLimits
 from mien.avatar.gaussian_avatars.surface_limits import (
     keep_on_surface,
@@ -29,6 +29,7 @@ from mien.avatar.ops.skin_points import skin_points, skin_points_reference
 from mien.avatar.ops.triangle_frames import bind_to_world
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
 from mien.training.adam import (
+    Adam,
     FactoredAdamUpdate,
     FactoredUpdate,
     Update,
@@ -325,6 +326,10 @@ def test_adam_takes_another_epsilon_and_what_is_not_dense_by_the_reference() -> 
         values = torch.zeros(4, 3)
         update_all([Update(values, torch.full((1, 3), 1e-9).expand(4, 3), Moments.zeros(values), 0.1, epsilon)])
         torch.testing.assert_close(values, torch.full((4, 3), -moved), rtol=1e-4, atol=0)
+        of_a_group = torch.zeros(4, 3, requires_grad=True)
+        of_a_group.grad = torch.full((4, 3), 1e-9)
+        Adam().step([ParameterGroup("one", {"one": of_a_group}, Rate(0.1), epsilon=epsilon)], Progress(0, 1))
+        torch.testing.assert_close(of_a_group.detach(), values, rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])

@@ -102,6 +102,7 @@ def test_cameras_are_checked_and_clamped() -> None:
     for name, value in (
         ("wxyz", [0, 0, 0, 0]), ("wxyz", [1, 0, 0]), ("wxyz", [math.nan, 0, 0, 1]), ("wxyz", [1e300, 0, 0, 0]),
         ("position", [1e300, 0, 0]), ("position", [math.inf, 0, 0]), ("look_at", [0, math.nan, 0]),
+        *((name, [0, at, 0]) for name in ("position", "look_at", "up_direction") for at in (1.1e5, -1.1e5, math.nan)),
         ("up_direction", "up"), ("fov", math.nan), ("fov", None), ("image_width", math.inf),
     ):  # fmt: skip
         assert camera(**{name: value}) is None, (name, value)

@@ -37,16 +37,18 @@ def test_only_loopback_goes_without_a_token_and_strange_hosts_and_origins_are_re
     for host in ("127.0.0.1", "::1", "localhost"):
         assert is_loopback(host), host
         assert Door.of(host, with_token=False).token is None
-    for host in ("0.0.0.0", "example.org", "192.168.1.2"):
+    for host in ("0.0.0.0", "example.org", "192.168.1.2", "localhost.evil.example", "127.0.0.1.evil.example"):
         assert not is_loopback(host), host
         assert Door.of(host).token is not None
         refuses(f"--no-token: other machines can reach --host {host}", Door.of, host, with_token=False)
     door = Door.of("127.0.0.1", with_token=False)
     assert door.answer("/", {"Host": "127.0.0.1:80"}) is None
     assert door.answer("/", {"Host": "localhost:80", "Origin": "http://localhost:80"}) is None
-    origins = ("http://evil.example", "http://127.0.0.1:81", "null", "http://[", "http://[v1.\udc80]")
+    ports = ("81", "8", "80.evil.example")
+    origins = ("http://evil.example", *(f"http://127.0.0.1:{port}" for port in ports), "null", "http://[v1.\udc80]")
     from_elsewhere = ({"Host": "127.0.0.1:80", "Origin": origin} for origin in origins)
-    for headers in ({}, {"Host": "rebound.example:80"}, {"Host": "[::1"}, *from_elsewhere):
+    strange = ("rebound.example:80", "[::1", "localhost.evil.example", "127.0.0.1.evil.example:80", "evil-localhost:80")
+    for headers in ({}, *({"Host": host} for host in strange), {"Origin": "http://["}, *from_elsewhere):
         answer = door.answer("/", headers)
         assert answer is not None, headers
         assert answer.status == 403
