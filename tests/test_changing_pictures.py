@@ -164,7 +164,7 @@ def test_alpha_is_read_and_hides_what_lies_under_it(kind: str, premultiplied: bo
     share = ALPHA[..., None] / 255
     for hidden in (0, 255):  # the colour under alpha 0, which counts nowhere
         given = colors * share if premultiplied else np.where(share > 0, colors, hidden)
-        pixels = np.dstack([np.rint(given).astype(np.uint8), ALPHA])
+        pixels: Pixels = np.dstack([np.rint(given).astype(np.uint8), ALPHA])
         if kind in VIDEOS:
             path = tmp_path / kind
             codec, layout, options = VIDEOS[kind]

@@ -236,12 +236,12 @@ def test_extent_is_that_of_the_training_cameras_and_reaches_rates_in_its_unit_on
     assert (PAPER.density.split_size, PAPER.density.prune_size) == (0.005 / FOOTAGE.least_extent, 0.05 / 0.5)
     for config, factor in ((plain_gaussian_avatars(), 1), (plain_gaussian_avatars(means_times_extent=True), 3)):
         moved = []
-        for extent in (1.0, 3.0):
+        for width in (1.0, 3.0):
             torch.manual_seed(0)
             avatar = GaussianAvatars(config, toy_face_model(), toy_face(5))
             store = avatar.gaussian_store()
             (store["means"].sum() + store["log_scales"].sum()).backward()
-            Adam().step(avatar.parameter_groups(), Progress(0, 10, extent=extent))
+            Adam().step(avatar.parameter_groups(), Progress(0, 10, extent=width))
             moved.append([float(store[name].detach().abs().max()) for name in ("means", "log_scales")])
         assert moved[1] == [pytest.approx(factor * moved[0][0]), moved[0][1]]
 
